@@ -1,0 +1,131 @@
+"""Bird's-eye-view images of point clouds (equation 1), and rotations about the vertical axis.
+
+Points are metres in the LiDAR frame: x forward, y left, z up. Images are `image[v, u]`: x grows with the column u, y
+against the row v. Functions on clouds take any leading batch axes; a padded cloud says how many of its points count.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.ndimage import map_coordinates
+from jaxtyping import Array, Float, Int
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The image plane of equation 1: cells of `resolution_m` metres, the sensor at the corner of the middle four."""
+
+    resolution_m: float = 0.2
+    height: int = 224
+    width: int = 224
+
+    def __post_init__(self):
+        if not self.resolution_m > 0:
+            raise ValueError(f"a grid's resolution must be a positive number of metres, found {self.resolution_m}")
+        for name, size in (("height", self.height), ("width", self.width)):
+            if size <= 0 or size % 2:
+                raise ValueError(f"a grid's {name} must be a positive even number of cells, found {size}")
+
+
+def _cell_of_point(
+    points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array, "*b"] | None
+) -> Int[Array, "*b n"]:
+    """The flat cell of every point; one past the last cell for a point that is outside, not finite or padding."""
+    # A multiplication, because XLA compiles a division by a constant to one; tiny values would flush to zero there.
+    scale = np.float32(1.0 / grid.resolution_m)
+    planar = jnp.where(jnp.abs(points[..., :2]) < 1e-30, 0.0, points[..., :2])
+    x, y = jnp.moveaxis(jnp.floor(planar * scale), -1, 0)
+    inside = (x >= -grid.width // 2) & (x < grid.width // 2) & (y >= -grid.height // 2) & (y < grid.height // 2)
+    inside &= jnp.isfinite(points).all(-1)
+    if count is not None:
+        inside &= jax.lax.broadcasted_iota(jnp.int32, inside.shape, inside.ndim - 1) < count[..., None]
+    u = grid.width // 2 + jnp.where(inside, x, 0).astype(jnp.int32)
+    v = grid.height // 2 - jnp.where(inside, y, 0).astype(jnp.int32) - 1
+    return jnp.where(inside, v * grid.width + u, grid.height * grid.width)
+
+
+def _scatter(cells: Int[Array, "*b n"], values: Int[Array, "*b n"], grid: Grid, *, operation: str, start: int):
+    """One image per cloud, each cell the sum or maximum of the values that fall into it."""
+    cells_per_image = grid.height * grid.width + 1  # the last one collects what is outside
+    batch, n = cells.shape[:-1], cells.shape[-1]
+    clouds = int(np.prod(batch))
+    offsets = cells_per_image * jnp.arange(clouds, dtype=jnp.int32)[:, None]
+    flat = jnp.full(clouds * cells_per_image, start, jnp.int32)
+    scatter = getattr(flat.at[(cells.reshape(clouds, n) + offsets).reshape(-1)], operation)
+    images = scatter(values.reshape(-1)).reshape(*batch, cells_per_image)
+    return images[..., :-1].reshape(*batch, grid.height, grid.width)
+
+
+@functools.partial(jax.jit, static_argnames="grid")
+def rasterize(
+    points: Float[Array, "*b n 3"], *, grid: Grid, count: Int[Array, "*b"] | None = None
+) -> Int[Array, "*b {grid.height} {grid.width}"]:
+    """The image B^I of equation 1: how many points fall into each cell, as int32.
+
+    Points outside the window or not finite are dropped (`count_outside` counts them). `count` is the number of valid
+    points at the front of each padded cloud; without it all are.
+    """
+    cells = _cell_of_point(points, grid, count)
+    return _scatter(cells, jnp.ones_like(cells), grid, operation="add", start=0)
+
+
+@functools.partial(jax.jit, static_argnames="grid")
+def rasterize_labels(
+    points: Float[Array, "*b n 3"],
+    labels: Int[Array, "*b n"],
+    *,
+    grid: Grid,
+    count: Int[Array, "*b"] | None = None,
+) -> Int[Array, "*b {grid.height} {grid.width}"]:
+    """The map B^S of equation 1: the label of the last point that falls into each cell, 0 where none does."""
+    cells = _cell_of_point(points, grid, count)
+    order = jnp.broadcast_to(jnp.arange(points.shape[-2], dtype=jnp.int32), cells.shape)
+    # The order of duplicate writes is undefined, that of a maximum is not.
+    last = _scatter(cells, order, grid, operation="max", start=-1)
+    found = jnp.take_along_axis(labels.astype(jnp.int32), last.reshape(*last.shape[:-2], -1).clip(0), axis=-1)
+    return jnp.where(last >= 0, found.reshape(last.shape), 0)
+
+
+@functools.partial(jax.jit, static_argnames="grid")
+def count_outside(
+    points: Float[Array, "*b n 3"], *, grid: Grid, count: Int[Array, "*b"] | None = None
+) -> Int[Array, "*b"]:
+    """How many valid points of each cloud `rasterize` drops, because they are outside the window or not finite."""
+    total = points.shape[-2] if count is None else count
+    return total - rasterize(points, grid=grid, count=count).sum((-2, -1), dtype=jnp.int32)
+
+
+@jax.jit
+def rotate_points(points: Float[Array, "*b n 3"], angle: Float[Array, "*b"]) -> Float[Array, "*b n 3"]:
+    """Turn clouds about the z axis by `angle` radians, counter-clockwise seen from above."""
+    x, y, z = jnp.moveaxis(points, -1, 0)
+    cos, sin = jnp.cos(angle)[..., None], jnp.sin(angle)[..., None]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+
+@jax.jit
+def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Float[Array, "*b h w"]:
+    """Turn images about their centre as `rotate_points` turns the points: bilinear, zero from beyond the border."""
+    *batch, height, width = image.shape
+    down, right = np.mgrid[:height, :width].astype(np.float32)
+    down, right = down - (height - 1) / 2, right - (width - 1) / 2
+
+    def turn(image, angle):
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        source_down, source_right = cos * down + sin * right, cos * right - sin * down
+        source = [source_down + (height - 1) / 2, source_right + (width - 1) / 2]
+        return map_coordinates(image, source, order=1, mode="constant", cval=0.0)
+
+    turned = jax.vmap(turn)(image.reshape(-1, height, width), jnp.reshape(angle, -1))
+    return turned.reshape(*batch, height, width)
+
+
+def centre_crop(image: Float[Array, "*b h w"], *, height: int, width: int) -> Float[Array, "*b {height} {width}"]:
+    """The middle `height` x `width` cells of larger images; the odd cell of an uneven margin is cut at the far side."""
+    if image.shape[-2] < height or image.shape[-1] < width:
+        raise ValueError(f"a crop of {height} x {width} cells needs a larger image, found {image.shape[-2:]}")
+    top, left = (image.shape[-2] - height) // 2, (image.shape[-1] - width) // 2
+    return image[..., top : top + height, left : left + width]

@@ -1,0 +1,100 @@
+"""A batch of training tuples: read from files on the host, rotated and rasterised on the device."""
+
+from collections.abc import Sequence as Many
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
+from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data.tuples import TuplePool
+from sglpr_jax.labels import to_classes
+
+
+@flax.struct.dataclass
+class Batch:
+    """Tuples as arrays; t tuples of k = 1 + k_p + k_n places, flattened to b = t k where not said otherwise.
+
+    Either `images` (b, h, w), or `points` (b, n, 3) with `count` (b,) valid ones each and their `classes` (b, n) (None
+    where no drive has labels). `labelled` (b,) says which places have labels, `far` (t, b) which places can serve an
+    anchor as negatives, `positives` how many places after an anchor are its positives.
+    """
+
+    labelled: Any
+    far: Any
+    positives: int = flax.struct.field(pytree_node=False)
+    images: Any = None
+    points: Any = None
+    count: Any = None
+    classes: Any = None
+
+
+def read_batch(
+    drives: Many[ScanSequence] | Many[ImageSequence],
+    pool: TuplePool,
+    frames: Int[np.ndarray, "t k"],
+    *,
+    max_points: int,
+    share_negatives: bool,
+) -> Batch:
+    """Read the frames of some tuples.
+
+    With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
+    of its own tuple. Clouds of more than `max_points` points are thinned evenly.
+    """
+    flat = frames.reshape(-1)
+    places = [(drives[pool.drive[f]], int(pool.frame[f])) for f in flat]
+    far = pool.far_apart(frames[:, :1], flat[None, :])
+    if not share_negatives:
+        far &= _own_negatives(frames.shape, positives=pool.config.positives)
+    if isinstance(drives[0], ImageSequence):
+        images = np.stack([drive.image(frame) for drive, frame in places])
+        return Batch(np.zeros(len(flat), bool), far, pool.config.positives, images=images)
+    points, count, classes, labelled = _padded([_read_scan(*place) for place in places], max_points)
+    has_labels = any(drive.has_labels for drive in drives)
+    return Batch(
+        labelled, far, pool.config.positives, points=points, count=count, classes=classes if has_labels else None
+    )
+
+
+def views(
+    batch: Batch, angles: Float[Array, "b"], grid: Grid
+) -> tuple[Float[Array, "b h w"], Int[Array, "b h w"] | None]:
+    """The images of a batch after turning each place by its angle, and their semantic maps if there are labels.
+
+    Runs on the device, inside jit.
+    """
+    if batch.images is not None:
+        return centre_crop(rotate_image(batch.images, angles), height=grid.height, width=grid.width), None
+    points = rotate_points(batch.points, angles)
+    maps = None
+    if batch.classes is not None:
+        maps = rasterize_labels(points, batch.classes, grid=grid, count=batch.count)
+    return rasterize(points, grid=grid, count=batch.count).astype(jnp.float32), maps
+
+
+def _own_negatives(shape: tuple[int, int], *, positives: int) -> Bool[np.ndarray, "t b"]:
+    tuples, places = shape
+    is_negative = np.arange(places) > positives
+    return np.kron(np.eye(tuples, dtype=bool), is_negative)
+
+
+def _read_scan(drive: ScanSequence, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+    labels = drive.labels(frame)
+    return drive.points(frame), None if labels is None else to_classes(labels)
+
+
+def _padded(scans: list[tuple[np.ndarray, np.ndarray | None]], max_points: int) -> tuple[np.ndarray, ...]:
+    points = np.zeros((len(scans), max_points, 3), np.float32)
+    classes = np.zeros((len(scans), max_points), np.int32)
+    count = np.zeros(len(scans), np.int32)
+    for row, (cloud, cloud_classes) in enumerate(scans):
+        kept = slice(None) if len(cloud) <= max_points else np.linspace(0, len(cloud) - 1, max_points).astype(int)
+        count[row] = len(cloud[kept])
+        points[row, : count[row]] = cloud[kept]
+        if cloud_classes is not None:
+            classes[row, : count[row]] = cloud_classes[kept]
+    return points, count, classes, np.array([scan_classes is not None for _, scan_classes in scans])

@@ -1,0 +1,64 @@
+"""Sequences of ready-made BEV images in BEVPlace's layout.
+
+    00/imgs/000000.png   8-bit density images; the number is the frame, and frames may be left out
+    00/pose.txt          12 numbers a line, LiDAR frame, one line per frame
+
+In such an image the row runs backwards and the column to the right; eq. 1 has x (forward) to the right and y (left) up.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+from PIL import Image
+
+from sglpr_jax.data.pose_files import read_poses, rows_of
+from sglpr_jax.data.sequence import ImageSequence
+
+RESOLUTION_M = 0.4
+"""The edge of a pixel in metres."""
+MAX_COUNT = 10
+"""The number of points at which the images were capped; it became 255."""
+
+
+def sequence_names(root: Path) -> tuple[str, ...]:
+    """Return the names of the sequences in `root`, in order."""
+    return tuple(sorted(folder.parent.name for folder in root.glob("*/imgs") if folder.is_dir()))
+
+
+def open_sequence(root: Path, name: str) -> ImageSequence:
+    """Open `root/<name>`. Raises FileNotFoundError without images or poses, ValueError on malformed poses."""
+    folder = root / name
+    image_paths = tuple(sorted((folder / "imgs").glob("*.png")))
+    if not image_paths:
+        raise FileNotFoundError(f"{folder / 'imgs'}: expected images (*.png), found none")
+    ids = tuple(path.stem for path in image_paths)
+    world_from_lidar = read_poses(folder / "pose.txt")
+    rows = rows_of(ids, rows=len(world_from_lidar), path=folder / "pose.txt")
+    return ImageSequence(
+        name=name,
+        ids=ids,
+        positions=world_from_lidar[rows, :, 3],
+        times=None,
+        pose_source=f"{name}/pose.txt",
+        image_paths=image_paths,
+        resolution_m=RESOLUTION_M,
+        read_image=read_image,
+    )
+
+
+def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
+    """Return an image (h, w) in eq. 1's orientation, its grey values 0..255 scaled to counts 0..10.
+
+    Raises FileNotFoundError, and ValueError where the file is no whole 8-bit grey image.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with Image.open(path) as image:
+            mode, grey = image.mode, np.asarray(image)
+    except (OSError, SyntaxError) as error:  # what Pillow raises for a cut-off or broken PNG
+        raise ValueError(f"{path}: expected an 8-bit grey PNG, found no such image ({error})") from error
+    if mode != "L":
+        raise ValueError(f"{path}: expected an 8-bit grey PNG (mode L), found mode {mode}")
+    return np.ascontiguousarray(np.rot90(grey, -1)) * np.float32(MAX_COUNT / 255)

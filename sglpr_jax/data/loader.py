@@ -1,0 +1,47 @@
+"""Reading ahead: the next batches are read by a thread while the device works on this one."""
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 2) -> Iterator[T]:
+    """Yield make(start), ..., make(stop - 1) in order, up to `depth` of them made ahead by a thread.
+
+    An exception of `make` is raised here, at its turn. Closing the iterator ends the thread.
+    """
+    ready: queue.Queue = queue.Queue(maxsize=depth)
+    ended = threading.Event()
+
+    def put(item) -> bool:
+        while not ended.is_set():
+            try:
+                ready.put(item, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def work():
+        for step in range(start, stop):
+            try:
+                item = (make(step), None)
+            except BaseException as error:  # carried over to the consumer, whoever interrupts or fails
+                item = (None, error)
+            if not put(item) or item[1] is not None:
+                return
+
+    thread = threading.Thread(target=work, name="read-ahead", daemon=True)
+    thread.start()
+    try:
+        for _ in range(start, stop):
+            value, error = ready.get()
+            if error is not None:
+                raise error
+            yield value
+    finally:
+        ended.set()
+        thread.join()

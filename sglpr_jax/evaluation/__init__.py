@@ -1,0 +1,1 @@
+"""From a descriptor file to numbers and pictures: protocols, report, figures, and baselines to compare with."""

@@ -1,0 +1,144 @@
+"""The pictures of an evaluation, as matplotlib figures that nothing global knows of (extra `viz`)."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.labels import CATEGORIES, COLORS
+from sglpr_jax.metrics import PrecisionRecallCurve
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+    import matplotlib.figure
+
+DOTS_PER_INCH = 150
+
+DECISIONS = {
+    Decision.NOT_A_QUERY: ("not a query", "#c8c8c8", 4),
+    Decision.TRUE_NEGATIVE: ("true negative", "#2b5fc4", 5),
+    Decision.UNCOUNTED: ("not counted", "#8ab6e8", 5),
+    Decision.TRUE_POSITIVE: ("true positive", "#d62728", 12),
+    Decision.FALSE_NEGATIVE: ("false negative", "#000000", 12),
+    Decision.FALSE_POSITIVE: ("false positive", "#f0a000", 12),
+}
+"""Name, colour (red, black, blue as in figure 6) and size in square points of each decision's dots; mistakes on top."""
+
+
+def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
+    """Write the figure, whole or not at all, in the format that the ending of `path` names."""
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        figure.savefig(temporary, dpi=DOTS_PER_INCH)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
+    """Draw precision over recall, a line for each named curve with a dot where F1 is highest (figure 5)."""
+    figure = _figure(5.2, 4.8)
+    axes = figure.add_subplot(title=title, xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
+    _draw_equal_f1(axes)
+    for name, curve in curves.items():
+        (line,) = axes.plot(curve.recall, curve.precision, linewidth=1.8, label=f"{name} {curve.f1_max:.3f}")
+        axes.plot(curve.recall[curve.best], curve.precision[curve.best], "o", color=line.get_color(), markersize=6)
+    axes.set_aspect("equal")
+    axes.legend(title="dot: highest F1", loc="lower left", framealpha=0.95)
+    return figure
+
+
+def trajectory(
+    positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
+) -> "matplotlib.figure.Figure":
+    """Draw every frame where it was taken, seen from above, coloured by its `Decision` (figure 6)."""
+    figure = _figure(7.0, 5.6)
+    axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
+    for decision, (name, colour, size) in DECISIONS.items():
+        x, y = positions[decisions == decision, :2].T
+        if len(x):
+            axes.scatter(x, y, s=size, color=colour, linewidths=0, label=f"{name} ({len(x)})")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    dots, names = axes.get_legend_handles_labels()
+    figure.legend(dots, names, loc="outside lower center", ncols=3, markerscale=2.5, frameon=False)
+    return figure
+
+
+def learning_curve(
+    curves: Mapping[str, Sequence[tuple[int, float]]],
+    *,
+    ylabel: str,
+    xlabel: str = "step",
+    references: Mapping[str, float] | None = None,
+    title: str = "",
+) -> "matplotlib.figure.Figure":
+    """Draw named curves of (step, value), and named values to compare with as dashed lines."""
+    figure = _figure(6.4, 4.2)
+    axes = figure.add_subplot(title=title, xlabel=xlabel, ylabel=ylabel)
+    for name, points in curves.items():
+        steps, values = np.array(points, dtype=np.float64).reshape(-1, 2).T
+        axes.plot(steps, values, "o-", markersize=3.5, linewidth=1.8, label=name)
+    references = references or {}
+    greys = np.linspace(0.2, 0.65, len(references))
+    for grey, (name, value) in zip(greys, references.items(), strict=True):
+        axes.axhline(value, color=str(grey), linestyle="--", linewidth=1.2, label=f"{name} {value:.3f}")
+    axes.grid(color="0.92")
+    axes.legend(loc="best", framealpha=0.95)
+    return figure
+
+
+def segmentation_panel(
+    bev: Num[np.ndarray, "h w"],
+    truth: Int[np.ndarray, "h w"],
+    prediction: Int[np.ndarray, "h w"],
+    *,
+    resolution_m: float,
+    title: str = "",
+) -> "matplotlib.figure.Figure":
+    """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7)."""
+    figure = _figure(11.0, 4.9)
+    figure.suptitle(title)
+    brightness = np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
+    pictures = {
+        "point counts": np.repeat(brightness[..., None], 3, axis=-1),
+        "true classes": COLORS[truth],
+        "predicted classes": COLORS[prediction],
+    }
+    height, width = np.array(bev.shape) * resolution_m / 2
+    for axes, (name, picture) in zip(figure.subplots(1, 3, sharey=True), pictures.items(), strict=True):
+        axes.imshow(picture, extent=(-width, width, -height, height), interpolation="nearest")
+        axes.set(title=name, xlabel="x [m]")
+    figure.axes[0].set_ylabel("y [m]")
+    _add_class_legend(figure, np.union1d(truth, prediction))
+    return figure
+
+
+def _figure(width: float, height: float) -> "matplotlib.figure.Figure":
+    """Return an empty figure of this size in inches; ImportError with the remedy where matplotlib is missing."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("pictures need matplotlib: pip install 'sglpr-jax[viz]'") from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:
+    """Draw thin lines through the points of equal F1."""
+    for f1 in (0.2, 0.4, 0.6, 0.8):
+        recall = np.linspace(f1 / (2 - f1), 1, 100)
+        axes.plot(recall, f1 * recall / (2 * recall - f1), color="0.85", linewidth=0.8, zorder=0)
+        axes.text(f1, f1, f"F1 = {f1}", color="0.6", fontsize=7, ha="center", backgroundcolor="white", zorder=0)
+
+
+def _add_class_legend(figure: "matplotlib.figure.Figure", classes: Int[np.ndarray, " k"]) -> None:
+    """Name the colour of each of these classes under the pictures."""
+    from matplotlib.patches import Patch
+
+    patches = [Patch(facecolor=tuple(COLORS[c] / 255), edgecolor="0.6", label=CATEGORIES[c]) for c in classes]
+    figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 8), frameon=False)

@@ -1,0 +1,83 @@
+"""The training losses, equations 5 to 8. Sums that span a batch are kept apart, so that a batch can come in chunks."""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+DICE_EPSILON = 1e-5
+
+
+def descriptor_distance(
+    a: Float[Array, "*b d"], b: Float[Array, "*b d"], *, squared: bool = False
+) -> Float[Array, "*b"]:
+    """Euclidean distance between descriptors, or its square; the gradient at distance zero is zero, not NaN."""
+    square = jnp.square(a - b).sum(-1)
+    if squared:
+        return square
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def lazy_triplet(
+    positive: Float[Array, "*t p"],
+    negative: Float[Array, "*t n"],
+    *,
+    margin: float,
+    closest_positive: bool = True,
+    reduction: Literal["max", "sum"] = "max",
+    where: Bool[Array, "*t n"] | None = None,
+) -> Float[Array, "*t"]:
+    """Equation 5 for each tuple, from the distances of its anchor to its k_p positives and k_n negatives.
+
+    `where` masks negatives; a tuple left with none costs nothing. `reduction="sum"` is the triplet loss that is not
+    lazy: every negative inside the margin counts. `closest_positive=False` takes the farthest positive.
+    """
+    pull = positive.min(-1) if closest_positive else positive.max(-1)
+    hinge = jax.nn.relu(margin + pull[..., None] - negative)
+    if where is not None:
+        hinge = jnp.where(where, hinge, 0.0)
+    return hinge.max(-1) if reduction == "max" else hinge.sum(-1)
+
+
+def cross_entropy(logits: Float[Array, "*b h w k"], labels: Int[Array, "*b h w"]) -> Float[Array, "*b"]:
+    """Equation 6: cross-entropy of each image, averaged over its pixels."""
+    return optax.softmax_cross_entropy_with_integer_labels(logits, labels).mean((-2, -1))
+
+
+def dice_sums(
+    logits: Float[Array, "b h w k"], labels: Int[Array, "b h w"], where: Bool[Array, "b"] | None = None
+) -> Float[Array, "3 k"]:
+    """What equation 7 sums over the pixels, per class: p t, p^2 and t^2. Adding chunks' sums gives the batch's."""
+    probability = jax.nn.softmax(logits)
+    truth = jax.nn.one_hot(labels, logits.shape[-1], dtype=logits.dtype)
+    if where is not None:
+        probability, truth = (jnp.where(where[:, None, None, None], x, 0.0) for x in (probability, truth))
+    return jnp.stack([(x * y).sum((0, 1, 2)) for x, y in ((probability, truth), (probability,) * 2, (truth,) * 2)])
+
+
+def dice_from_sums(sums: Float[Array, "3 k"], *, weights: Float[Array, "k"] | None = None) -> Float[Array, ""]:
+    """Equation 7 from the sums of the whole batch: the weighted mean over the classes of one minus Dice."""
+    product, probability, truth = sums
+    per_class = 1 - (2 * product + DICE_EPSILON) / (probability + truth + DICE_EPSILON)
+    return (per_class if weights is None else per_class * weights).mean()
+
+
+def dice(
+    logits: Float[Array, "b h w k"],
+    labels: Int[Array, "b h w"],
+    *,
+    where: Bool[Array, "b"] | None = None,
+    weights: Float[Array, "k"] | None = None,
+) -> Float[Array, ""]:
+    """Equation 7 over a whole batch; `where` leaves out images without labels."""
+    return dice_from_sums(dice_sums(logits, labels, where), weights=weights)
+
+
+def joint(
+    triplet: Float[Array, ""], ce: Float[Array, ""], dice: Float[Array, ""], *, ce_weight: float, dice_weight: float
+) -> Float[Array, ""]:
+    """Equation 8: the triplet loss plus the weighted segmentation losses (0.4 and 0.6 in the paper)."""
+    return triplet + ce_weight * ce + dice_weight * dice

@@ -1,0 +1,73 @@
+"""Precision, recall and F1max from scores and decisions (eq. 9)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionRecallCurve:
+    """Precision and recall at every distinct score, taken as threshold: accepted is what scores no less than it."""
+
+    thresholds: np.ndarray
+    """(k,) float64, rising."""
+    precision: np.ndarray
+    """(k,) float64."""
+    recall: np.ndarray
+    """(k,) float64."""
+
+    @property
+    def f1(self) -> Float[np.ndarray, " k"]:
+        """The harmonic mean of precision and recall; 0 where both are 0."""
+        return _ratio(2 * self.precision * self.recall, self.precision + self.recall)
+
+    @property
+    def best(self) -> int:
+        """Where F1 is highest; of equal ones the highest threshold."""
+        return len(self.thresholds) - 1 - int(np.argmax(self.f1[::-1]))
+
+    @property
+    def f1_max(self) -> float:
+        """The highest F1 over all thresholds."""
+        return float(self.f1[self.best])
+
+
+def decision_curve(
+    scores: Float[np.ndarray, " n"],
+    *,
+    true_if_accepted: Bool[np.ndarray, " n"],
+    false_if_accepted: Bool[np.ndarray, " n"],
+    missed_if_rejected: Bool[np.ndarray, " n"],
+) -> PrecisionRecallCurve:
+    """Return the curve of n >= 1 decisions to accept or reject; equal scores are accepted together.
+
+    An accepted item is a true positive, a false positive or, flagged as neither, counts for nothing; a rejected one is
+    a false negative or a true negative. Where no item could be missed, recall is 1, as scikit-learn has it; elsewhere
+    0 / 0 is 0. Raises ValueError where a score is not finite.
+    """
+    if not np.all(np.isfinite(scores)):
+        raise ValueError(f"expected finite scores, found {np.sum(~np.isfinite(scores))} of {len(scores)} that are not")
+    thresholds, group = np.unique(scores, return_inverse=True)
+
+    def count(flags):
+        return np.bincount(group, weights=flags, minlength=len(thresholds))
+
+    def accepted(flags):
+        return np.cumsum(count(flags)[::-1])[::-1]
+
+    true_positives = accepted(true_if_accepted)
+    false_negatives = np.sum(missed_if_rejected) - accepted(missed_if_rejected)
+    precision = _ratio(true_positives, true_positives + accepted(false_if_accepted))
+    recall = _ratio(true_positives, true_positives + false_negatives)
+    return PrecisionRecallCurve(thresholds, precision, recall if np.any(missed_if_rejected) else np.ones_like(recall))
+
+
+def classification_curve(scores: Float[np.ndarray, " n"], positive: Bool[np.ndarray, " n"]) -> PrecisionRecallCurve:
+    """Return the curve of n >= 1 items that are positive or negative: accepting one is right just if it is positive."""
+    return decision_curve(scores, true_if_accepted=positive, false_if_accepted=~positive, missed_if_rejected=positive)
+
+
+def _ratio(part: Float[np.ndarray, " k"], whole: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """Return part / whole, 0 where whole is 0."""
+    return np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)

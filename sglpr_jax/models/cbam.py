@@ -1,0 +1,47 @@
+"""CBAM: re-weights a feature map by channel, then by place (Woo et al. 2018)."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sglpr_jax.models.layers import Linear, torch_uniform
+
+
+class ChannelGate(nn.Module):
+    """x * sigmoid(mlp(mean of x) + mlp(maximum of x)), pooled over the image; one shared two-layer MLP."""
+
+    reduction: int = 16
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+        """The MLP's hidden layer has max(1, c // reduction) units."""
+        c = x.shape[-1]
+        pooled = jnp.stack([x.mean((1, 2)), x.max((1, 2))], axis=1)
+        hidden = nn.relu(Linear(max(1, c // self.reduction), name="mlp_in")(pooled))
+        logits = Linear(c, name="mlp_out")(hidden).sum(1)
+        return x * nn.sigmoid(logits)[:, None, None]
+
+
+class SpatialGate(nn.Module):
+    """x * sigmoid(convolution of [maximum, mean] over channels), 7 x 7.
+
+    The convolution has a bias in place of the original's batch norm, which folds into it.
+    """
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+        """One weight per pixel."""
+        pooled = jnp.stack([x.max(-1), x.mean(-1)], axis=-1)
+        logits = nn.Conv(1, (7, 7), padding=3, kernel_init=torch_uniform, name="convolution")(pooled)
+        return x * nn.sigmoid(logits)
+
+
+class CBAM(nn.Module):
+    """The channel gate, then the spatial gate."""
+
+    reduction: int = 16
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+        """The map re-weighted; there is no residual connection."""
+        return SpatialGate(name="spatial")(ChannelGate(self.reduction, name="channel")(x))

@@ -1,0 +1,58 @@
+"""What a model is, as plain values: the static part of its parameters."""
+
+import dataclasses
+from typing import Literal
+
+from sglpr_jax.bev import Grid
+
+
+@dataclasses.dataclass(frozen=True)
+class HeadConfig:
+    """The place head: CBAM, three convolutions, NetVLAD (section 4.1.2).
+
+    The paper names no kernels, strides or channels; candidates A to D are compared in docs/decisions.md.
+    """
+
+    tap: Literal["pixels", "tokens"] = "pixels"
+    """`pixels`: the x4-expanded map before the last linear layer. `tokens`: the patch map it is expanded from."""
+    channels: tuple[int, ...] = (128, 256, 512)
+    kernels: tuple[int, ...] = (3, 3, 3)
+    strides: tuple[int, ...] = (2, 2, 2)
+    cbam_reduction: int = 16
+    clusters: int = 64
+    descriptor_size: int = 256
+
+    def __post_init__(self):
+        if not len(self.channels) == len(self.kernels) == len(self.strides):
+            raise ValueError(
+                "the head needs as many kernels and strides as channels, found "
+                f"channels {self.channels}, kernels {self.kernels}, strides {self.strides}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """A Swin-Unet with a place head and a segmentation head, over images of `grid`."""
+
+    grid: Grid = Grid()
+    counts: Literal["raw", "log1p", "clipped"] = "log1p"
+    """How point counts become network input: as they are, log(1 + n), or min(n, 10) / 10."""
+    field: Literal["square", "circle"] = "square"
+    """`circle` blanks the cells outside the largest circle, so that a rotation moves nothing in or out of view."""
+    patch: int = 4
+    embed_dim: int = 96
+    depths: tuple[int, ...] = (2, 2, 2, 2)
+    heads: tuple[int, ...] = (3, 6, 12, 24)
+    window: int = 7
+    mlp_ratio: int = 4
+    drop_path: float = 0.2
+    classes: int = 20
+    head: HeadConfig = HeadConfig()
+
+    def __post_init__(self):
+        if len(self.depths) != len(self.heads):
+            raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
+        step = self.patch * 2 ** (len(self.depths) - 1)
+        for name, size in (("height", self.grid.height), ("width", self.grid.width)):
+            if size % step:
+                raise ValueError(f"the grid's {name} must be a multiple of {step}, found {size}")

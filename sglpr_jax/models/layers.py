@@ -1,0 +1,29 @@
+"""The linear layer, layer norm and initial values that all modules share, set as the PyTorch reference has them."""
+
+from functools import partial
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Linear = partial(nn.Dense, kernel_init=nn.initializers.normal(0.02))
+"""A dense layer with weights N(0, 0.02) and bias 0."""
+
+LayerNorm = partial(nn.LayerNorm, epsilon=1e-5)
+"""Layer norm over channels with PyTorch's epsilon (Flax's default is 1e-6)."""
+
+torch_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+"""PyTorch's default for convolutions, U(-1/sqrt(fan_in), 1/sqrt(fan_in))."""
+
+NORM_FLOOR = 1e-12
+
+
+def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:
+    """Scales vectors along `axis` to length 1.
+
+    A vector shorter than 1e-12 has no direction: it becomes 0, with gradient 0 (the plain quotient's is NaN at 0).
+    """
+    square = jnp.sum(x * x, axis=axis, keepdims=True)
+    has_direction = square > NORM_FLOOR**2
+    return x * jnp.where(has_direction, jax.lax.rsqrt(jnp.where(has_direction, square, 1.0)), 0.0)

@@ -1,0 +1,39 @@
+"""NetVLAD: pools a set of local features into one vector, in the form of PointNetVLAD (Uy and Lee 2018)."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sglpr_jax.models.layers import l2_normalize
+
+
+class NetVLAD(nn.Module):
+    """Soft assignment of features to clusters, residuals summed per cluster, then a linear layer and context gating.
+
+        a[n, k] = softmax over k of (x W + bias)
+        vlad[d, k] = sum over n of a[n, k] * (x[n, d] - centre[d, k]), L2-normalised over d, then as a whole
+        y = vlad * hidden + bias;  output = y * sigmoid(y G + bias)
+
+    Biases stand where PointNetVLAD has batch norm, so that an output never depends on the rest of its batch.
+    """
+
+    clusters: int
+    output: int
+    gating: bool = True
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
+        """The vector before its final L2 normalisation."""
+        d = features.shape[-1]
+        weights_init = nn.initializers.normal(d**-0.5)
+        logits = nn.Dense(self.clusters, kernel_init=weights_init, name="assignment")(features)
+        assignment = nn.softmax(logits)
+        centres = self.param("centres", weights_init, (d, self.clusters))
+        residuals = jnp.einsum("bnd,bnk->bdk", features, assignment)
+        residuals = residuals - assignment.sum(1)[:, None, :] * centres[None]
+        vlad = l2_normalize(residuals, axis=1).reshape(len(features), -1)
+        y = nn.Dense(self.output, kernel_init=weights_init, name="hidden")(l2_normalize(vlad))
+        if not self.gating:
+            return y
+        gate_init = nn.initializers.normal(self.output**-0.5)
+        return y * nn.sigmoid(nn.Dense(self.output, kernel_init=gate_init, name="gate")(y))

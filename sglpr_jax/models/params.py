@@ -1,0 +1,104 @@
+"""Weights on disk: a folder with config.json and model.safetensors, so that weights never travel without their model."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import flax.traverse_util
+import jax
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.sglpr import SGLPR, Params
+
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "model.safetensors"
+
+
+def save(params: Params, folder: Path | str) -> Path:
+    """Write the weights and their configuration; a reader never sees one file without the other's content."""
+    folder = Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    flat = {name: np.asarray(leaf) for name, leaf in _flatten(params.weights).items()}
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
+        safetensors.numpy.save_file(flat, Path(scratch) / WEIGHTS_FILE)
+        (Path(scratch) / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
+        folder.mkdir(exist_ok=True)
+        for name in (WEIGHTS_FILE, CONFIG_FILE):
+            os.replace(Path(scratch) / name, folder / name)
+    return folder
+
+
+def load(folder: Path | str) -> Params:
+    """Read what `save` wrote.
+
+    A training run's directory works too: its `weights` folder is read. Raises FileNotFoundError when a file is
+    missing, ValueError when it is damaged or the weights are not those of the configuration.
+    """
+    folder = Path(folder)
+    if (folder / "weights").is_dir():
+        folder = folder / "weights"
+    for name in (CONFIG_FILE, WEIGHTS_FILE):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing")
+    config = config_from_dict(_read_json(folder / CONFIG_FILE), source=folder / CONFIG_FILE)
+    try:
+        flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    except safetensors.SafetensorError as error:
+        raise ValueError(f"{folder / WEIGHTS_FILE}: not a whole safetensors file ({error})") from error
+    return Params(_match(flat, config, source=folder / WEIGHTS_FILE), config)
+
+
+def config_from_dict(values: dict[str, Any], *, source: Path | str) -> ModelConfig:
+    """The model configuration that `dataclasses.asdict` made, tuples restored. Errors name `source`."""
+    try:
+        grid, head = Grid(**values["grid"]), HeadConfig(**_tuples(values["head"]))
+        return ModelConfig(**_tuples({**values, "grid": grid, "head": head}))
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{source}: expected the fields of a ModelConfig, found {sorted(values)} ({error})") from error
+
+
+def weights_hash(params: Params) -> str:
+    """SHA-256 over names, shapes and values of all weights, so that a result can say which weights made it."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(_flatten(params.weights).items()):
+        digest.update(f"{name} {leaf.shape} {leaf.dtype}".encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _flatten(weights: Any) -> dict[str, Any]:
+    return flax.traverse_util.flatten_dict(weights, sep="/")
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: expected JSON ({error})") from error
+
+
+def _match(flat: dict[str, np.ndarray], config: ModelConfig, *, source: Path) -> Any:
+    """The tree of weights, after checking it against the shapes that the configuration asks for."""
+    image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, 1), np.float32)
+    init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=True), jax.random.key(0), image)
+    expected = {name: leaf.shape for name, leaf in _flatten(init["params"]).items()}
+    found = {name: leaf.shape for name, leaf in flat.items()}
+    if expected != found:
+        name = sorted(set(expected.items()) ^ set(found.items()))[0][0]
+        raise ValueError(
+            f"{source}: not the weights of its configuration: {name} should have shape "
+            f"{expected.get(name, 'none (no such weight)')}, found {found.get(name, 'none (missing)')}"
+        )
+    return flax.traverse_util.unflatten_dict(flat, sep="/")

@@ -1,0 +1,45 @@
+"""Named model sizes, so that `init(key, preset="small")` works wherever the package is installed."""
+
+import dataclasses
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+
+_HEAD_B = HeadConfig(tap="pixels", channels=(128, 256, 512), kernels=(4, 3, 3), strides=(4, 2, 2))
+_PAPER = ModelConfig()
+
+MODELS: dict[str, ModelConfig] = {
+    # The paper's model, its head read literally: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
+    "paper": _PAPER,
+    # A third of that head's cost: the first convolution undoes the x4 expansion in one step.
+    "paper-head-b": dataclasses.replace(_PAPER, head=_HEAD_B),
+    # The paper says "projection radius 11.2 m", which its own eq. 1 gives only with cells of 0.1 m.
+    "paper-11m": dataclasses.replace(_PAPER, grid=Grid(resolution_m=0.1)),
+    # Trains on two CPU cores within the hour; its window is that of the ready-made KITTI images (+-25.6 m).
+    "small": ModelConfig(
+        grid=Grid(resolution_m=0.4, height=128, width=128),
+        field="circle",
+        embed_dim=32,
+        heads=(1, 2, 4, 8),
+        window=4,
+        drop_path=0.0,
+        head=HeadConfig(tap="pixels", channels=(64, 128, 256), kernels=(4, 3, 3), strides=(4, 2, 2)),
+    ),
+    # For tests: every part of the model, next to no arithmetic.
+    "tiny": ModelConfig(
+        grid=Grid(resolution_m=1.6, height=32, width=32),
+        embed_dim=8,
+        depths=(1, 1),
+        heads=(1, 2),
+        window=4,
+        drop_path=0.1,
+        head=HeadConfig(channels=(8, 8, 16), kernels=(4, 3, 3), strides=(4, 2, 1), clusters=4, descriptor_size=256),
+    ),
+}
+
+
+def model_preset(name: str) -> ModelConfig:
+    """The model of that name. Raises ValueError with the names there are."""
+    if name not in MODELS:
+        raise ValueError(f"no model preset {name!r}; there are {', '.join(MODELS)}")
+    return MODELS[name]

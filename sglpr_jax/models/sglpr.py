@@ -1,0 +1,124 @@
+"""SG-LPR whole (figure 2): shared Swin-Unet features, the place head, and the segmentation head of training time."""
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.place_head import PlaceHead
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.swin import FinalPatchExpand
+from sglpr_jax.models.swin_unet import SwinUnet
+
+CLIP_COUNT = 10.0
+
+
+@flax.struct.dataclass
+class Params:
+    """Weights together with the model they belong to: a pytree whose static part is `config`."""
+
+    weights: Any
+    config: ModelConfig = flax.struct.field(pytree_node=False)
+
+
+class Outputs(NamedTuple):
+    """What one pass gives: descriptors (b, 256), logits (b, h, w, classes) if asked for, and every named map."""
+
+    descriptor: Array
+    logits: Array | None
+    intermediates: dict[str, Array]
+
+
+class SGLPR(nn.Module):
+    """The network on prepared images. A pure function of (weights, image): no part of it sees the rest of the batch."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, image: Float[Array, "b h w c"], *, segment: bool = False, train: bool = False) -> Outputs:
+        config = self.config
+        tokens, intermediates = SwinUnet(
+            embed_dim=config.embed_dim,
+            depths=config.depths,
+            heads=config.heads,
+            window=config.window,
+            mlp_ratio=config.mlp_ratio,
+            patch=config.patch,
+            drop_path=config.drop_path,
+            name="backbone",
+        )(image, train=train)
+        pixels = logits = None
+        if segment or config.head.tap == "pixels":
+            pixels = FinalPatchExpand(config.patch, name="expand")(tokens)
+            intermediates["pixels"] = pixels
+        descriptor, head = PlaceHead(config.head, name="place_head")(tokens if config.head.tap == "tokens" else pixels)
+        if segment:
+            logits = nn.Dense(config.classes, use_bias=False, name="segmentation_head")(pixels)
+        return Outputs(descriptor, logits, intermediates | head)
+
+
+def prepare(bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w 1"]:
+    """Point counts as network input: rescaled as `config.counts` says, blank outside the circle if `config.field` is."""
+    image = jnp.asarray(bev, jnp.float32)
+    if config.counts == "log1p":
+        image = jnp.log1p(image)
+    elif config.counts == "clipped":
+        image = jnp.minimum(image, CLIP_COUNT) / CLIP_COUNT
+    if config.field == "circle":
+        image = image * _circle(config.grid)[None]
+    return image[..., None]
+
+
+def _circle(grid: Grid) -> Float[np.ndarray, "h w"]:
+    down, right = np.mgrid[: grid.height, : grid.width]
+    down, right = down - (grid.height - 1) / 2, right - (grid.width - 1) / 2
+    return (np.hypot(down, right) < min(grid.height, grid.width) / 2).astype(np.float32)
+
+
+def _batched(params: Params, bev: Array) -> Array:
+    grid = params.config.grid
+    if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
+        raise ValueError(f"expected images of {grid.height} x {grid.width} cells as [..., H, W], found shape {bev.shape}")
+    return prepare(bev.reshape(-1, grid.height, grid.width), params.config)
+
+
+def describe(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b d"]:
+    """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
+
+    Any leading axes; works under jit, vmap and grad; computes nothing of the segmentation head. The distance between
+    two descriptors is the dissimilarity of their places (equation 2). Raises ValueError for images of another size
+    than `params.config.grid`.
+    """
+    outputs = SGLPR(params.config).apply({"params": params.weights}, _batched(params, bev))
+    return outputs.descriptor.reshape(*bev.shape[:-2], -1)
+
+
+def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
+    """The semantic logits of each image, from the head that training uses."""
+    outputs = SGLPR(params.config).apply({"params": params.weights}, _batched(params, bev), segment=True)
+    return outputs.logits.reshape(*bev.shape, -1)
+
+
+def forward(params: Params, bev: Array, *, key: Array | None = None, segment: bool = True) -> Outputs:
+    """Everything at once, for training and pictures: (b, h, w) counts in, descriptors, logits and named maps out.
+
+    With a `key` it is the training pass, in which stochastic depth drops residual branches.
+    """
+    rngs = None if key is None else {"drop_path": key}
+    return SGLPR(params.config).apply(
+        {"params": params.weights}, _batched(params, bev), segment=segment, train=key is not None, rngs=rngs
+    )
+
+
+def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None) -> Params:
+    """Fresh weights for a named preset, or for a `config` of your own."""
+    config = model_preset(preset) if config is None else config
+    image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
+    weights = jax.jit(SGLPR(config).init, static_argnames="segment")(key, image, segment=True)["params"]
+    return Params(weights, config)

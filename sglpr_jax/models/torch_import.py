@@ -1,0 +1,186 @@
+"""Weights of the published PyTorch Swin-Unet and Swin-T, by their names."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import flax.traverse_util
+import jax
+import numpy as np
+
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.sglpr import SGLPR, Params
+
+_RULES = (
+    (r"^backbone/", ""),
+    (r"^encoder_(\d+)_merge/", r"layers.\1.downsample/"),
+    (r"^encoder_(\d+)/block_(\d+)/", r"layers.\1.blocks.\2/"),
+    (r"^decoder_0_expand/", "layers_up.0/"),
+    (r"^decoder_(\d+)_expand/", r"layers_up.\1.upsample/"),
+    (r"^decoder_(\d+)_fuse/", r"concat_back_dim.\1/"),
+    (r"^decoder_(\d+)/block_(\d+)/", r"layers_up.\1.blocks.\2/"),
+    (r"^expand/", "up/"),
+    (r"^segmentation_head/", "output/"),
+    (r"/attention_norm/", "/norm1/"),
+    (r"/mlp_norm/", "/norm2/"),
+    (r"/mlp_in/", "/mlp.fc1/"),
+    (r"/mlp_out/", "/mlp.fc2/"),
+    (r"/attention/position_bias$", "/attn.relative_position_bias_table"),
+    (r"/attention/", "/attn/"),
+    (r"/projection/", "/proj/"),
+    (r"/(kernel|scale)$", "/weight"),
+    (r"/", "."),
+)
+"""Our names to PyTorch's, each rule applied in turn."""
+
+_BUFFERS = ("relative_position_index", "attn_mask")
+"""Tables that PyTorch stores with the weights; here they follow from the configuration."""
+
+_PREFIXES = ("module.", "swin_unet.")
+"""Of a data-parallel model, and of Swin-Unet's outer class."""
+
+_SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsample)\..+")
+"""What ImageNet's Swin-T has and a Swin-Unet may lack: the classifier, and a deeper third stage."""
+
+
+class SwinTImport(NamedTuple):
+    """Parameters after an import of Swin-T, and what became of every weight.
+
+    `copied` and `kept` are our names: taken from the checkpoint, and left as they were. `unused` are the checkpoint's.
+    """
+
+    params: Params
+    copied: tuple[str, ...]
+    kept: tuple[str, ...]
+    unused: tuple[str, ...]
+
+
+def import_swin_unet(params: Params, path: Path | str) -> Params:
+    """`params` with backbone, expansion and segmentation head from a Swin-Unet checkpoint; the place head stays.
+
+    Raises ImportError without PyTorch, FileNotFoundError, or ValueError where names or shapes are not the model's.
+    """
+    try:
+        weights = from_torch_names(read_checkpoint(path), params.config)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return dataclasses.replace(params, weights={**params.weights, **weights})
+
+
+def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
+    """`params` with the encoder from an ImageNet Swin-T, its blocks copied to the mirrored decoder stages as well.
+
+    So Swin-Unet's own code does it. Weights of another shape, and those Swin-T has no counterpart of, stay as they
+    were. Raises ImportError without PyTorch, FileNotFoundError, or ValueError where nothing fits.
+    """
+    try:
+        return from_swin_t(read_checkpoint(path), params)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
+    """The weights of a `.pth` file by name, without buffers, wrapper keys and prefixes."""
+    try:
+        import torch
+    except ImportError as error:
+        raise ImportError("reading a .pth file needs PyTorch: pip install 'sglpr-jax[torch]'") from error
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such checkpoint")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises a different type for each way a file can be damaged
+        raise ValueError(f"expected a PyTorch checkpoint of plain tensors ({error})") from error
+    for wrapper in ("model", "state_dict"):
+        content = content.get(wrapper, content) if isinstance(content, Mapping) else content
+    if not isinstance(content, Mapping) or not all(hasattr(value, "numpy") for value in content.values()):
+        raise ValueError("expected a PyTorch checkpoint with a dictionary of tensors")
+    named = {_without_prefixes(name): value.numpy() for name, value in content.items()}
+    return {name: value for name, value in named.items() if not name.endswith(_BUFFERS)}
+
+
+def from_torch_names(
+    state: Mapping[str, np.ndarray], config: ModelConfig, *, input_channels: int = 1
+) -> dict[str, Any]:
+    """A whole Swin-Unet by its PyTorch names, as the tree of weights without the place head.
+
+    An embedding of 3 channels is summed into 1 where `input_channels` is 1: PyTorch repeats a grey image 3 times.
+    Raises ValueError naming the first weight that is missing, unknown or of the wrong shape.
+    """
+    expected = _expected_shapes(config, input_channels)
+    unknown = set(state) - {torch_name(name) for name in expected}
+    if unknown:
+        raise ValueError(f"not a weight of Swin-Unet: {min(unknown)} ({len(unknown)} such names)")
+    weights = {}
+    for name, shape in expected.items():
+        source = torch_name(name)
+        if source not in state:
+            raise ValueError(f"expected a weight {source}, found none")
+        weights[name] = _flax_layout(name, state[source], input_channels)
+        if weights[name].shape != shape:
+            raise ValueError(f"{source}: expected shape {shape} (in Flax's order), found {weights[name].shape}")
+    return flax.traverse_util.unflatten_dict(weights, sep="/")
+
+
+def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
+    """A Swin-T by its PyTorch names into `params`; see `import_swin_t`."""
+    last = len(params.config.depths) - 1
+    weights = flax.traverse_util.flatten_dict(params.weights, sep="/")
+    copied, used, misshapen = [], set(), set()
+    for name in _expected_shapes(params.config, 1):
+        source = re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
+        if source not in state:
+            continue
+        weight = _flax_layout(name, state[source], 1)
+        if weight.shape != weights[name].shape:
+            misshapen.add(source)
+            continue
+        weights[name] = weight
+        copied.append(name)
+        used.add(source)
+    unused = sorted(set(state) - used)
+    _check_swin_t(copied, [name for name in unused if name not in misshapen and not _SWIN_T_ONLY.fullmatch(name)])
+    kept = tuple(sorted(set(weights) - set(copied)))
+    tree = flax.traverse_util.unflatten_dict(weights, sep="/")
+    return SwinTImport(dataclasses.replace(params, weights=tree), tuple(copied), kept, tuple(unused))
+
+
+def torch_name(name: str) -> str:
+    """PyTorch's name of a weight: `backbone/encoder_0/block_1/mlp_in/kernel` is `layers.0.blocks.1.mlp.fc1.weight`."""
+    for pattern, replacement in _RULES:
+        name = re.sub(pattern, replacement, name)
+    return name
+
+
+def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of all weights that a Swin-Unet shares with the model: all but the place head's."""
+    image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, input_channels), np.float32)
+    init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=True), jax.random.key(0), image)
+    flat = flax.traverse_util.flatten_dict(init["params"], sep="/")
+    return {name: leaf.shape for name, leaf in flat.items() if not name.startswith("place_head/")}
+
+
+def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarray:
+    """PyTorch's (out, in, ...) as Flax's (..., in, out); the bias tables are (rows, heads) in both."""
+    if name == "backbone/patch_embed/projection/kernel" and input_channels == 1:
+        weight = weight.sum(1, keepdims=True)
+    if name == "segmentation_head/kernel":
+        weight = weight[..., 0, 0]
+    if not name.endswith("kernel"):
+        return weight
+    return weight.transpose(*range(2, weight.ndim), 1, 0)
+
+
+def _without_prefixes(name: str) -> str:
+    for prefix in _PREFIXES:
+        name = name.removeprefix(prefix)
+    return name
+
+
+def _check_swin_t(copied: list[str], unknown: list[str]) -> None:
+    if unknown:
+        raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} such names)")
+    if not copied:
+        raise ValueError("no weight has a counterpart of its shape; Swin-T fits 96 channels and window 7")

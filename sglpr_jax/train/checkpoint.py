@@ -1,0 +1,55 @@
+"""Checkpoints of a training run: atomic, the newest and the best kept. The one file that knows orbax."""
+
+from pathlib import Path
+
+import jax
+import orbax.checkpoint as ocp
+from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
+
+from sglpr_jax.models.sglpr import Params
+from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.train.state import TrainState, new_state
+
+_KEPT_LATEST = 2
+
+
+class Checkpoints:
+    """The checkpoints in one folder; weights and optimiser are separate items, so that either can be read alone."""
+
+    def __init__(self, folder: Path):
+        policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=lambda m: m["score"], n=1)])
+        options = ocp.CheckpointManagerOptions(preservation_policy=policy, cleanup_tmp_directories=True)
+        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+
+    def save(self, state: TrainState, *, score: float | None = None) -> None:
+        """Write the state under its step, with its score if it has one. A step already there is left as it is."""
+        step = int(state.step)
+        if step in self._manager.all_steps():
+            return
+        items = ocp.args.Composite(
+            weights=ocp.args.StandardSave(state.params.weights), optimizer=ocp.args.StandardSave(state.optimizer)
+        )
+        self._manager.save(step, args=items, metrics={"score": -1.0 if score is None else score}, force=True)
+
+    def latest_step(self) -> int | None:
+        """The newest whole checkpoint's step, or None."""
+        return self._manager.latest_step()
+
+    def restore(self, config: TrainConfig) -> TrainState:
+        """The newest state. Raises ValueError when there is none or it belongs to another model."""
+        step = self.latest_step()
+        if step is None:
+            raise ValueError(f"{self._manager.directory}: expected a checkpoint to resume from, found none")
+        like = jax.eval_shape(lambda: new_state(config))
+        items = ocp.args.Composite(
+            weights=ocp.args.StandardRestore(like.params.weights), optimizer=ocp.args.StandardRestore(like.optimizer)
+        )
+        try:
+            found = self._manager.restore(step, args=items)
+        except ValueError as error:
+            raise ValueError(f"{self._manager.directory}/{step}: not a checkpoint of this configuration: {error}") from error
+        return TrainState(jax.numpy.asarray(step, "int32"), Params(found.weights, config.model), found.optimizer)
+
+    def close(self) -> None:
+        """Wait until everything is written."""
+        self._manager.close()

@@ -1,0 +1,90 @@
+"""Everything a training run is told, as plain values. Presets in configs/ fill it in."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.models.config import ModelConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """Which drives to train on: all of `root` but the one named by `seq`, which is tested (leave-one-out)."""
+
+    seq: str = "08"
+    root: Path | None = None
+    """A dataset's folder; none means the simulated drives."""
+    poses: Literal["auto", "semantickitti", "kitti"] = "auto"
+    train_seqs: tuple[str, ...] = ()
+    """The drives to train on; empty means all but `seq`."""
+    rotate: bool = True
+    """Turn every place about z by its own random angle at every step."""
+    max_points: int = 131072
+    """Clouds are padded to this many points; larger ones are thinned evenly."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Equations 5 and 8. The paper gives no margin and no distance; docs/decisions.md says where these come from."""
+
+    margin: float = 0.3
+    squared: bool = False
+    """Square the descriptor distances of equation 5."""
+    closest_positive: bool = True
+    reduction: Literal["max", "sum"] = "max"
+    """`max` is the lazy triplet loss; `sum` counts every negative inside the margin."""
+    ce_weight: float = 0.4
+    dice_weight: float = 0.6
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam with an exponential decay of the learning rate."""
+
+    learning_rate: float = 1e-5
+    warmup_steps: int = 0
+    decay_rate: float = 0.99
+    decay_steps: int = 1000
+    """Steps in which the learning rate falls by `decay_rate`."""
+    staircase: bool = False
+    clip_norm: float | None = None
+    weight_decay: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    model: ModelConfig = ModelConfig()
+    data: DataConfig = DataConfig()
+    sampling: TupleConfig = TupleConfig()
+    loss: LossConfig = LossConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    steps: int = 40_000
+    tuples: int = 1
+    """Tuples a step."""
+    share_negatives: bool = False
+    """Let every other tuple's places that are far enough away be negatives too."""
+    chunk: int = 0
+    """Images that go through the network at a time; 0 means the whole batch. It changes memory and speed, not results."""
+    seed: int = 0
+    log_every: int = 10
+    score_every: int = 1000
+    """Steps between scores and checkpoints."""
+
+    def __post_init__(self):
+        if self.chunk and self.images % self.chunk:
+            raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
+
+    @property
+    def images(self) -> int:
+        """Images a step."""
+        return self.tuples * (1 + self.sampling.positives + self.sampling.negatives)
+
+
+def to_json(config: TrainConfig) -> dict[str, Any]:
+    """The configuration as JSON values, to be written beside every result."""
+    values = dataclasses.asdict(config)
+    values["data"]["root"] = None if config.data.root is None else str(config.data.root)
+    return values

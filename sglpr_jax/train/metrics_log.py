@@ -1,0 +1,45 @@
+"""A run's measurements: one JSON object a line, appended, so that an interrupted run loses nothing."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+class MetricsLog:
+    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped."""
+
+    def __init__(self, path: Path, *, start_step: int = 0):
+        kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
+        self._file = path.open("w")
+        for line in kept:
+            self._write(line)
+
+    def append(self, step: int, values: Mapping[str, Any]) -> None:
+        """Write the measurements of one step; values that are not finite become null."""
+        self._write({"step": step, **{name: _plain(value) for name, value in values.items()}})
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _write(self, line: dict[str, Any]) -> None:
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics file; a last line cut short by a crash is left out."""
+    lines = []
+    for text in path.read_text().splitlines():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def _plain(value: Any) -> float | None:
+    value = float(value)
+    return value if math.isfinite(value) else None

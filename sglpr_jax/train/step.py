@@ -1,0 +1,141 @@
+"""One training step: a pure function of (state, batch).
+
+The triplet and Dice losses span the batch, so no chunk of it knows its gradient before all have been seen. A step in
+chunks therefore goes through the network twice: once forward for what the losses need (descriptors and a few sums per
+chunk), then, with the losses' gradients at those, forward and backward. Activations of one chunk are alive at a time.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from sglpr_jax import losses
+from sglpr_jax.data.batch import Batch, views
+from sglpr_jax.models.sglpr import Params, forward
+from sglpr_jax.train.config import LossConfig, TrainConfig
+from sglpr_jax.train.state import TrainState, optimizer
+
+Metrics = dict[str, Float[Array, ""]]
+
+
+class Summary(NamedTuple):
+    """What the losses need of a chunk of c images; the segmentation's part is None without labels."""
+
+    descriptors: Any
+    """(c, d)"""
+    cross_entropy: Any = None
+    """() summed over the labelled images"""
+    dice_sums: Any = None
+    """(3, classes) summed over the labelled images"""
+
+
+class Chunk(NamedTuple):
+    """Images (c, h, w) and, where there are labels, their maps (c, h, w), which of them count (c,), and a key ()."""
+
+    images: Any
+    maps: Any
+    labelled: Any
+    key: Any
+
+
+@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
+def train_step(state: TrainState, batch: Batch, *, config: TrainConfig) -> tuple[TrainState, Metrics]:
+    """Make one step. The metrics are the loss, its terms, and the norms of gradient, update and weights."""
+    angle_key, model_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
+    chunks = _chunks(batch, angle_key, model_key, config)
+    gradient, metrics = gradients(state.params, chunks, batch, config.loss)
+    updates, optimizer_state = optimizer(config.optimizer).update(gradient, state.optimizer, state.params.weights)
+    weights = optax.apply_updates(state.params.weights, updates)
+    norms = {"gradient_norm": gradient, "update_norm": updates, "weight_norm": weights}
+    metrics |= {name: optax.tree.norm(tree) for name, tree in norms.items()}
+    return TrainState(state.step + 1, state.params.replace(weights=weights), optimizer_state), metrics
+
+
+def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -> tuple[Any, Metrics]:
+    """The gradient of equation 8 at `params.weights`, chunk by chunk, and the loss terms.
+
+    Arrays of `chunks` have a leading chunk axis.
+    """
+
+    def summary(weights, chunk: Chunk) -> Summary:
+        return summarize(params.replace(weights=weights), chunk)
+
+    def loss(summaries: Summary):
+        return joint_loss(_merge(summaries), batch, config)
+
+    if chunks.images.shape[0] == 1:
+        only = jax.tree.map(lambda x: x[0], chunks)
+        return jax.grad(lambda w: loss(jax.tree.map(lambda x: x[None], summary(w, only))), has_aux=True)(params.weights)
+
+    summaries = jax.lax.map(lambda chunk: summary(params.weights, chunk), chunks)
+    cotangents, metrics = jax.grad(loss, has_aux=True)(summaries)
+
+    def add(total, chunk_and_cotangent):
+        chunk, cotangent = chunk_and_cotangent
+        (gradient,) = jax.vjp(lambda w: summary(w, chunk), params.weights)[1](cotangent)
+        return jax.tree.map(jnp.add, total, gradient), None
+
+    zeros = jax.tree.map(jnp.zeros_like, params.weights)
+    return jax.lax.scan(add, zeros, (chunks, cotangents))[0], metrics
+
+
+def summarize(params: Params, chunk: Chunk) -> Summary:
+    """One chunk through the network; the segmentation head only where there are labels."""
+    if chunk.maps is None:
+        return Summary(forward(params, chunk.images, key=chunk.key, segment=False).descriptor)
+    outputs = forward(params, chunk.images, key=chunk.key)
+    cross_entropy = jnp.where(chunk.labelled, losses.cross_entropy(outputs.logits, chunk.maps), 0.0).sum()
+    return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, chunk.maps, chunk.labelled))
+
+
+def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
+    """Equation 8 of a whole batch, and its terms."""
+    triplet, metrics = triplet_loss(summary.descriptors, batch, config)
+    if summary.cross_entropy is None:
+        return triplet, metrics | {"loss": triplet}
+    ce = summary.cross_entropy / jnp.maximum(batch.labelled.sum(), 1)
+    dice = jnp.where(batch.labelled.any(), losses.dice_from_sums(summary.dice_sums), 0.0)
+    total = losses.joint(triplet, ce, dice, ce_weight=config.ce_weight, dice_weight=config.dice_weight)
+    return total, metrics | {"cross_entropy": ce, "dice": dice, "loss": total}
+
+
+def triplet_loss(
+    descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
+) -> tuple[Float[Array, ""], Metrics]:
+    """Equation 5, averaged over the batch's tuples, and the share of tuples that still violate the margin."""
+    tuples = batch.far.shape[0]
+    grouped = descriptors.reshape(tuples, -1, descriptors.shape[-1])
+    anchors = grouped[:, :1]
+    positives = grouped[:, 1 : 1 + batch.positives]
+    to_positives = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, positives), squared=config.squared)
+    to_all = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
+    loss = losses.lazy_triplet(
+        to_positives,
+        to_all,
+        margin=config.margin,
+        closest_positive=config.closest_positive,
+        reduction=config.reduction,
+        where=batch.far,
+    )
+    return loss.mean(), {"triplet": loss.mean(), "violations": (loss > 0).mean()}
+
+
+def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
+    """The batch as the network will see it, cut into chunks along a new leading axis."""
+    images_per_chunk = config.chunk or config.images
+    turn = 2 * jnp.pi if config.data.rotate else 0.0
+    angles = jax.random.uniform(angle_key, (config.images,), maxval=turn) if turn else jnp.zeros(config.images)
+    images, maps = views(batch, angles, config.model.grid)
+    keys = jax.random.split(model_key, config.images // images_per_chunk)
+    cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), (images, maps, jnp.asarray(batch.labelled)))
+    return Chunk(*cut, keys)
+
+
+def _merge(summaries: Summary) -> Summary:
+    """The summary of all chunks as if they had been one: descriptors side by side, sums added."""
+    descriptors, *sums = summaries
+    return Summary(descriptors.reshape(-1, descriptors.shape[-1]), *(None if s is None else s.sum(0) for s in sums))

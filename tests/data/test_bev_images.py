@@ -1,0 +1,100 @@
+"""Ready-made BEV images: turned into eq. 1's orientation, on the scale of counts, with the poses of their frames."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sglpr_jax.data.bev_images import open_sequence, read_image, sequence_names
+
+
+def test_a_sequence(bev_root):
+    assert sequence_names(bev_root) == ("06",)
+    sequence = open_sequence(bev_root, "06")
+    assert (sequence.name, sequence.ids, len(sequence)) == ("06", ("000000", "000001", "000002"), 3)
+    assert (sequence.times, sequence.pose_source, sequence.resolution_m) == (None, "06/pose.txt", 0.4)
+    assert not sequence.has_labels
+    np.testing.assert_array_equal(sequence.positions, np.arange(9.0).reshape(3, 3))
+    assert sequence.image(2).shape == (7, 5)
+
+
+def test_forward_points_right_and_left_points_up(tmp_path):
+    grey = np.zeros((5, 5), np.uint8)
+    grey[0, 2] = 255  # the first row lies ahead
+    grey[2, 0] = 51  # the first column lies to the left
+    Image.fromarray(grey).save(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png")
+    assert image.dtype == np.float32
+    assert image[2, 4] == 10.0  # eq. 1: x grows with the column
+    assert image[0, 2] == pytest.approx(2.0)  # eq. 1: y grows against the row
+    assert np.count_nonzero(image) == 2
+
+
+def test_sparse_images_take_their_own_rows(bev_root):
+    (bev_root / "06/imgs/000001.png").unlink()
+    sequence = open_sequence(bev_root, "06")
+    assert sequence.ids == ("000000", "000002")
+    np.testing.assert_array_equal(sequence.positions, [[0, 1, 2], [6, 7, 8]])
+
+
+def test_too_few_poses_name_the_frame(bev_root):
+    path = bev_root / "06/pose.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
+    with pytest.raises(ValueError, match=r"pose\.txt: expected at least 3 rows \(frame 2\), found 2"):
+        open_sequence(bev_root, "06")
+
+
+def test_missing_poses_or_images_are_named(bev_root):
+    (bev_root / "06/pose.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"06/pose\.txt: no such file"):
+        open_sequence(bev_root, "06")
+    (bev_root / "07/imgs").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match=r"07/imgs: expected images \(\*\.png\), found none"):
+        open_sequence(bev_root, "07")
+
+
+@pytest.mark.parametrize("kept", [0, 20, 50])
+def test_a_cut_off_image_is_named(bev_root, kept):
+    path = bev_root / "06/imgs/000000.png"
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(ValueError, match=r"000000\.png: expected an 8-bit grey PNG"):
+        open_sequence(bev_root, "06").image(0)
+
+
+def test_a_colour_image_is_refused(tmp_path):
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"a\.png: expected an 8-bit grey PNG \(mode L\), found mode RGB"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(FileNotFoundError, match=r"b\.png: no such file"):
+        read_image(tmp_path / "b.png")
+
+
+def test_the_real_images(shared):
+    root = shared / "data/kitti_bev"
+    assert sequence_names(root) == ("00", "02", "06")
+    sequence = open_sequence(root, "06")
+    assert (len(sequence), sequence.positions.shape) == (1101, (1101, 3))
+    image = sequence.image(500)
+    assert image.shape == (151, 151)
+    assert image.max() == pytest.approx(10.0)
+    np.testing.assert_allclose(image / image.max() * 255, np.round(image / image.max() * 255), atol=1e-4)
+    inner = np.zeros((151, 151), bool)
+    inner[13:138, 13:138] = True  # the renderer's crop at 25 m
+    assert not image[~inner].any()
+
+
+def test_the_real_images_look_along_their_scans(shared):
+    """The image of frame 0 of 00 and a rasterised scan of it, both in eq. 1's orientation, show the same walls."""
+    images = open_sequence(shared / "data/kitti_bev", "00")
+    points = np.fromfile(shared / "data/kitti_odometry/sequences/00/velodyne/000000.bin", "<f4").reshape(-1, 4)[:, :3]
+    points = points[points[:, 2] > -1.2]
+    edges = (np.arange(152) - 75.5) * 0.4
+    against_y, along_x = -points[:, 1], points[:, 0]
+    occupied = np.histogram2d(against_y, along_x, bins=[edges, edges])[0] > 0
+    image = images.image(0) > 0
+    covered = {
+        (turns, mirrored): (occupied & np.rot90(image[::mirrored], turns)).sum() / image.sum()
+        for turns in range(4)
+        for mirrored in (1, -1)
+    }
+    assert max(covered, key=lambda seen: covered[seen]) == (0, 1)
+    assert covered[0, 1] > 0.75

@@ -1,0 +1,89 @@
+"""Point clouds of the Point Cloud Library: binary and ascii, any order of fields, NaN points."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.pcd import read_pcd
+
+HEADER = """# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS {fields}
+SIZE {sizes}
+TYPE {types}
+COUNT {counts}
+WIDTH {points}
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {points}
+DATA {data}
+"""
+XYZI = {"fields": "x y z intensity", "sizes": "4 4 4 4", "types": "F F F F", "counts": "1 1 1 1", "points": 3}
+CLOUD = np.array([[1, 2, 3, 0.5], [np.nan, np.nan, np.nan, -1], [-4, 5.5, 6, 0.25]], dtype="<f4")
+
+
+def write(path, body: bytes, **changed):
+    path.write_bytes(HEADER.format(**(XYZI | {"data": "binary"} | changed)).encode() + body)
+    return path
+
+
+def test_binary_with_points_that_are_not_numbers(tmp_path):
+    points = read_pcd(write(tmp_path / "a.pcd", CLOUD.tobytes()))
+    np.testing.assert_array_equal(points, CLOUD[:, :3])
+    assert points.dtype == np.float32
+
+
+def test_binary_with_padding_and_double_fields(tmp_path):
+    record = np.dtype([("ring", "<u2"), ("_", "u1", 6), ("z", "<f8"), ("y", "<f8"), ("x", "<f8")])
+    cloud = np.zeros(2, dtype=record)
+    cloud["x"], cloud["y"], cloud["z"] = [1, 2], [3, 4], [5, 6]
+    layout = {"fields": "ring _ z y x", "sizes": "2 1 8 8 8", "types": "U U F F F", "counts": "1 6 1 1 1", "points": 2}
+    np.testing.assert_array_equal(
+        read_pcd(write(tmp_path / "a.pcd", cloud.tobytes(), **layout)), [[1, 3, 5], [2, 4, 6]]
+    )
+
+
+def test_ascii(tmp_path):
+    body = b"1 2 3 0.5\nnan nan nan -1\n-4 5.5 6 0.25\n"
+    np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data="ascii")), CLOUD[:, :3])
+
+
+def test_lines_may_end_with_carriage_returns(tmp_path):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(HEADER.format(**XYZI, data="binary").replace("\n", "\r\n").encode() + CLOUD.tobytes())
+    np.testing.assert_array_equal(read_pcd(path), CLOUD[:, :3])
+
+
+@pytest.mark.parametrize(
+    "body, changed, message",
+    [
+        (b"", {}, "expected 3 points of 16 bytes, found 0 bytes"),
+        (CLOUD.tobytes()[:-1], {}, "expected 3 points of 16 bytes, found 47 bytes"),
+        (b"", {"points": 0}, "expected at least one point, found POINTS 0"),
+        (CLOUD.tobytes(), {"data": "binary_compressed"}, "expected DATA binary or ascii, found binary_compressed"),
+        (CLOUD.tobytes(), {"fields": "a b c d"}, "expected the fields x, y and z, found a b c d"),
+        (CLOUD.tobytes(), {"sizes": "4 4 4"}, "expected one SIZE, TYPE and COUNT for each of 4 FIELDS"),
+        (CLOUD.tobytes(), {"types": "F F Q F"}, "data type '<q4' not understood"),
+        (CLOUD.tobytes(), {"sizes": "4 4 x 4"}, "data type '<fx' not understood"),
+        (CLOUD.tobytes(), {"fields": ""}, "found no FIELDS"),
+        (b"1 2 3 4\n", {"data": "ascii"}, "expected 3 lines of 4 numbers, found 1 lines"),
+        (b"1 2 3 4\n1 2 3 4\n1 2 c 4\n", {"data": "ascii"}, "could not convert string to float: 'c'"),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path, body, changed, message):
+    with pytest.raises(ValueError, match=rf"a\.pcd: .*{message}"):
+        read_pcd(write(tmp_path / "a.pcd", body, **changed))
+
+
+def test_a_file_without_a_header_is_named(tmp_path):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(CLOUD.tobytes())
+    with pytest.raises(ValueError, match=r"a\.pcd: .*expected a header"):
+        read_pcd(path)
+    with pytest.raises(FileNotFoundError, match=r"b\.pcd: no such file"):
+        read_pcd(tmp_path / "b.pcd")
+
+
+def test_a_real_file(shared):
+    points = read_pcd(shared / "data/samples/16_beams.pcd")
+    assert points.shape == (32000, 3)
+    assert np.isfinite(points).all(axis=1).sum() == 25207

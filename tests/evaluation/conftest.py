@@ -1,0 +1,38 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+
+@pytest.fixture(scope="session")
+def make_file() -> Callable[..., DescriptorFile]:
+    """Return a maker of descriptor files from positions and descriptors."""
+
+    def make(positions, descriptors, *, times=None, sequence="town"):
+        return DescriptorFile(
+            sequence=sequence,
+            ids=tuple(f"{i:06d}" for i in range(len(descriptors))),
+            positions=np.asarray(positions, np.float64),
+            times=times,
+            descriptors=np.asarray(descriptors, np.float32),
+            pose_source="made up",
+            config={},
+            weights_hash="",
+        )
+
+    return make
+
+
+@pytest.fixture
+def two_laps() -> np.ndarray:
+    """Return positions (800, 3) of two equal laps around a circle of 200 m radius, at KITTI's 3 m to a frame."""
+    angle = np.arange(800) * (2 * np.pi / 400)
+    return np.stack([200 * np.cos(angle), 200 * np.sin(angle), np.zeros(800)], axis=1)
+
+
+@pytest.fixture
+def straight() -> np.ndarray:
+    """Return positions (800, 3) of a drive that never comes back."""
+    return np.arange(800.0)[:, None] * [1.0, 0.0, 0.0]

@@ -1,0 +1,111 @@
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.labels import CATEGORIES, COLORS
+from sglpr_jax.metrics import classification_curve
+
+
+def pixels(figure, path):
+    """Return the saved picture's pixels (h, w, 3)."""
+    figures.save(figure, path)
+    assert [found.name for found in path.parent.iterdir()] == [path.name]
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def shows(picture, colour):
+    """Whether at least 20 pixels have this colour."""
+    return np.sum(np.abs(picture - np.array(colour)).max(axis=-1) <= 3) >= 20
+
+
+def legend(figure):
+    drawn = [*figure.legends, figure.axes[0].get_legend()]
+    return [text.get_text() for box in drawn if box is not None for text in box.get_texts()]
+
+
+def test_precision_recall_names_each_curve_with_its_f1max(tmp_path):
+    scores = np.arange(6.0)
+    good = classification_curve(scores, scores > 2)
+    poor = classification_curve(scores, scores % 2 == 0)
+    figure = figures.precision_recall({"good": good, "poor": poor}, title="Sequence 06")
+    assert legend(figure) == ["good 1.000", f"poor {poor.f1_max:.3f}"]
+    (axes,) = figure.axes
+    assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_title()) == ("recall", "precision", "Sequence 06")
+    assert pixels(figure, tmp_path / "curve.png").std() > 10
+
+
+def test_a_trajectory_shows_each_decision_in_its_colour(tmp_path, two_laps):
+    decisions = np.full(800, Decision.NOT_A_QUERY, dtype=np.int8)
+    decisions[300:400] = Decision.TRUE_NEGATIVE
+    decisions[400:700] = Decision.TRUE_POSITIVE
+    decisions[700:760] = Decision.FALSE_NEGATIVE
+    figure = figures.trajectory(two_laps, decisions, title="Sequence 06")
+    assert legend(figure) == ["not a query (340)", "true negative (100)", "true positive (300)", "false negative (60)"]
+    (axes,) = figure.axes
+    assert axes.get_aspect() == 1
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
+    picture = pixels(figure, tmp_path / "trajectory.png")
+    assert shows(picture, (0xD6, 0x27, 0x28))
+    assert shows(picture, (0x2B, 0x5F, 0xC4))
+
+
+def test_a_learning_curve_stands_beside_its_references(tmp_path):
+    figure = figures.learning_curve(
+        {"raw": [(0, 0.1), (100, 0.6)], "rotated": [(0, 0.1), (100, 0.5)]},
+        ylabel="top-1 F1max",
+        references={"polar-FFT": 0.92},
+    )
+    assert legend(figure) == ["raw", "rotated", "polar-FFT 0.920"]
+    line = figure.axes[0].get_lines()[0]
+    np.testing.assert_array_equal(line.get_xydata(), [(0, 0.1), (100, 0.6)])
+    assert pixels(figure, tmp_path / "learning.png").std() > 10
+
+
+def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
+    bev = np.zeros((20, 40), np.int32)
+    bev[:, :20] = 3
+    truth = np.where(bev > 0, CATEGORIES.index("road"), 0)
+    prediction = np.where(bev > 0, CATEGORIES.index("building"), 0)
+    figure = figures.segmentation_panel(bev, truth, prediction, resolution_m=0.5, title="Sequence 08")
+    counts, true_map, predicted = figure.axes
+    assert legend(figure) == ["unlabeled", "road", "building"]
+    for axes in (counts, true_map, predicted):
+        assert axes.get_images()[0].get_extent() == [-10, 10, -5, 5]
+    picture = pixels(figure, tmp_path / "classes.png")
+    third = picture.shape[1] // 3
+    road, building = COLORS[CATEGORIES.index("road")], COLORS[CATEGORIES.index("building")]
+    middle = picture[: picture.shape[0] // 2]
+    assert shows(middle[:, third : 2 * third], road) and not shows(middle[:, third : 2 * third], building)
+    assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)
+
+
+def test_an_empty_image_can_be_drawn(tmp_path):
+    nothing = np.zeros((8, 8), np.int32)
+    pixels(figures.segmentation_panel(nothing, nothing, nothing, resolution_m=1.0), tmp_path / "empty.png")
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[viz\]'"):
+        figures.learning_curve({"raw": [(0, 0.1)]}, ylabel="loss")
+
+
+def test_a_failed_save_leaves_the_older_picture(tmp_path, monkeypatch):
+    figure = figures.learning_curve({"raw": [(0, 0.1), (1, 0.2)]}, ylabel="loss")
+    figures.save(figure, tmp_path / "loss.png")
+    before = (tmp_path / "loss.png").read_bytes()
+
+    def write_half(path, **_):
+        path.write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(figure, "savefig", write_half)
+    with pytest.raises(OSError, match="disk full"):
+        figures.save(figure, tmp_path / "loss.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["loss.png"]
+    assert (tmp_path / "loss.png").read_bytes() == before

@@ -1,0 +1,93 @@
+"""What the Swin-Unet promises beyond its numbers: purity, stochastic depth, transformations, clear errors."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.extend.core import jaxprs_in_params
+
+from sglpr_jax.models.swin import DropPath, SwinBlock
+from sglpr_jax.models.swin_unet import SwinUnet, drop_path_rates
+
+MODEL = SwinUnet(embed_dim=8, depths=(2, 2), heads=(1, 2), window=4, drop_path=0.5)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return jnp.asarray(np.random.default_rng(0).poisson(0.5, size=(3, 32, 32, 1)), jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def variables(images):
+    return jax.jit(MODEL.init)(jax.random.key(0), images)
+
+
+@pytest.fixture(scope="module")
+def tokens(variables, images):
+    return jax.jit(MODEL.apply)(variables, images)[0]
+
+
+def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, tokens):
+    def apply(x):
+        return MODEL.apply(variables, x)[0]
+
+    assert tokens.shape == (3, 8, 8, 8)
+    np.testing.assert_allclose(jax.jit(apply)(images), tokens, atol=2e-5)
+    np.testing.assert_allclose(jax.jit(jax.vmap(apply))(images[:, None])[:, 0], tokens, atol=2e-5)
+    np.testing.assert_allclose(jax.jit(apply)(images[1:2]), tokens[1:2], atol=2e-5)
+
+
+def test_no_array_of_the_model_has_a_rank_above_five(variables, images):
+    ranks = []
+    for equation in all_equations(jax.make_jaxpr(jax.grad(lambda v: MODEL.apply(v, images)[0].sum()))(variables).jaxpr):
+        ranks += [value.aval.ndim for value in equation.outvars]
+    assert max(ranks) <= 5
+
+
+def all_equations(jaxpr):
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jaxprs_in_params(equation.params):
+            yield from all_equations(inner)
+
+
+def test_stochastic_depth_follows_its_key_and_is_off_outside_training(variables, images, tokens):
+    @jax.jit
+    def train(key):
+        return MODEL.apply(variables, images, train=True, rngs={"drop_path": key})[0]
+
+    first, again, other = (train(jax.random.key(seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-3
+    assert np.abs(first - tokens).max() > 1e-3
+
+
+def test_both_branches_of_a_block_are_dropped_per_sample_and_independently():
+    block = SwinBlock(heads=1, window=4, shifted=False, drop_path=0.5)
+    image = jnp.broadcast_to(jnp.asarray(np.random.default_rng(0).normal(size=(4, 4, 8)), jnp.float32), (64, 4, 4, 8))
+    variables = block.init(jax.random.key(0), image)
+    out = block.apply(variables, image, train=True, rngs={"drop_path": jax.random.key(1)})
+    kinds = np.unique(np.round(np.asarray(out - image).reshape(64, -1), 4), axis=0)
+    assert len(kinds) == 4  # neither branch, only the first, only the second, both
+
+
+def test_kept_branches_are_scaled_so_that_the_mean_stays():
+    branch = jnp.ones((4096, 1, 1, 1))
+    out = DropPath(0.25).apply({}, branch, train=True, rngs={"drop_path": jax.random.key(0)})
+    np.testing.assert_allclose(np.unique(out), [0, 1 / 0.75], rtol=1e-6)
+    assert abs(float(out.mean()) - 1) < 0.05
+
+
+def test_drop_path_rates_rise_to_the_last_encoder_block(golden):
+    rates = np.concatenate(drop_path_rates((2, 2, 2, 2), 0.2))
+    np.testing.assert_allclose(rates, golden("tables_masks")["drop_path_full"], atol=1e-7)
+
+
+def test_an_empty_image_has_finite_gradients(variables, images):
+    gradients = jax.jit(jax.grad(lambda v: MODEL.apply(v, jnp.zeros_like(images))[0].var()))(variables)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_windows_that_do_not_tile_the_map_are_refused():
+    with pytest.raises(ValueError, match=r"windows of 4 x 4 tokens must tile the map, found 6 x 6 tokens"):
+        MODEL.init(jax.random.key(0), jnp.zeros((1, 24, 24, 1)))

@@ -1,0 +1,143 @@
+"""Import of PyTorch weights by name. The numbers of imported models are the parity tests' subject."""
+
+import sys
+from types import SimpleNamespace
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.sglpr import Params, describe, init
+from sglpr_jax.models.torch_import import from_swin_t, from_torch_names, import_swin_t, import_swin_unet, torch_name
+
+
+@pytest.fixture
+def state(golden):
+    weights = golden("swinunet_w4_img64_odd_depths").items()
+    return {name.removeprefix("param/"): value for name, value in weights if name.startswith("param/")}
+
+
+@pytest.fixture
+def params(golden, model_config) -> Params:
+    config, _ = model_config(golden("swinunet_w4_img64_odd_depths"))
+    head = HeadConfig(channels=(8, 8, 8), kernels=(4, 3, 3), strides=(4, 2, 2), clusters=4)
+    config = ModelConfig(**{**vars(config), "head": head})
+    shapes = jax.eval_shape(lambda key: init(key, config=config), jax.random.key(0))
+    return jax.tree.map(lambda leaf: np.full(leaf.shape, 0.5, leaf.dtype), shapes)
+
+
+@pytest.fixture
+def checkpoint(tmp_path, monkeypatch):
+    """Stands in for PyTorch, which is an optional extra: `torch.load` returns the saved object's tensors."""
+    contents = {}
+
+    def load(path, *, map_location, weights_only):
+        assert map_location == "cpu" and weights_only
+        if path not in contents:
+            raise RuntimeError("PytorchStreamReader failed reading zip archive")
+        return contents[path]
+
+    def save(content):
+        path = tmp_path / "model.pth"
+        path.touch()
+        contents[path] = content
+        return path
+
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(load=load))
+    return save
+
+
+def tensors(state):
+    return {name: SimpleNamespace(numpy=lambda value=value: value) for name, value in state.items()}
+
+
+def leaves(tree):
+    return flax.traverse_util.flatten_dict(tree, sep="/")
+
+
+def test_swin_unet_checkpoint_with_prefix_wrapper_buffers_and_three_channels(state, params, checkpoint):
+    embedding = state["patch_embed.proj.weight"]
+    state["patch_embed.proj.weight"] = np.repeat(embedding / 3, 3, axis=1)
+    state["layers.0.blocks.0.attn.relative_position_index"] = np.zeros((16, 16), np.int64)
+    state["layers.0.blocks.1.attn_mask"] = np.zeros((4, 16, 16), np.float32)
+    path = checkpoint({"model": tensors({f"module.swin_unet.{name}": value for name, value in state.items()})})
+    imported = leaves(import_swin_unet(params, path).weights)
+
+    assert imported.keys() == leaves(params.weights).keys()
+    for name, value in imported.items():
+        if name.startswith("place_head/"):
+            assert (value == 0.5).all()
+        elif name != "backbone/patch_embed/projection/kernel":
+            assert value.sum() == pytest.approx(state[torch_name(name)].sum(), abs=1e-4)
+    kernel = imported["backbone/patch_embed/projection/kernel"]
+    np.testing.assert_allclose(kernel, embedding.transpose(2, 3, 1, 0), rtol=1e-6)
+
+
+def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(state, params):
+    """The small model plays Swin-T: encoder names only, plus what ImageNet's has more, and one other window size."""
+    swin_t = {name: value for name, value in state.items() if name.startswith(("patch_embed.", "layers.", "norm."))}
+    swin_t |= {"head.weight": np.zeros((1000, 64)), "layers.2.blocks.5.norm1.weight": np.ones(32)}
+    table = "layers.0.blocks.0.attn.relative_position_bias_table"
+    swin_t[table] = np.zeros((169, 1))
+    imported = from_swin_t(swin_t, params)
+
+    weights = leaves(imported.params.weights)
+    assert imported.unused == ("head.weight", table, "layers.2.blocks.5.norm1.weight")
+    assert set(imported.copied) | set(imported.kept) == set(weights)
+    assert not set(imported.copied) & set(imported.kept)
+    expected = state["layers.1.blocks.0.mlp.fc1.weight"].T
+    for place in ("encoder_1", "decoder_2"):
+        np.testing.assert_array_equal(weights[f"backbone/{place}/block_0/mlp_in/kernel"], expected)
+    for name in (
+        "decoder_1_fuse/kernel",
+        "decoder_1_expand/expand/kernel",
+        "encoder_0/block_0/attention/position_bias",
+    ):
+        assert f"backbone/{name}" in imported.kept and (weights[f"backbone/{name}"] == 0.5).all()
+
+
+def test_imported_weights_describe(state, params):
+    weights = {**params.weights, **from_torch_names(state, params.config)}
+    descriptor = describe(Params(weights, params.config), jnp.ones((64, 64)))
+    assert np.linalg.norm(descriptor) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"norm_up.weight": None}, "expected a weight norm_up.weight, found none"),
+        ({"norm_up.gain": np.ones(8)}, "not a weight of Swin-Unet: norm_up.gain"),
+        ({"norm_up.weight": np.ones(9)}, r"norm_up.weight: expected shape \(8,\) .* found \(9,\)"),
+        ({"output.weight": np.ones((9, 8, 1, 1))}, r"output.weight: expected shape \(8, 20\) .* found \(8, 9\)"),
+    ],
+)
+def test_a_checkpoint_of_another_model_is_refused(change, message, state, params):
+    changed = {name: value for name, value in {**state, **change}.items() if value is not None}
+    with pytest.raises(ValueError, match=message):
+        from_torch_names(changed, params.config)
+
+
+def test_a_swin_t_of_another_width_or_with_unknown_names_is_refused(params):
+    with pytest.raises(ValueError, match="no weight has a counterpart of its shape"):
+        from_swin_t({"norm.weight": np.ones(768)}, params)
+    with pytest.raises(ValueError, match=r"not a weight of Swin-T: layer1\.0\.conv\.weight"):
+        from_swin_t({"norm.weight": np.ones(64), "layer1.0.conv.weight": np.ones(3)}, params)
+
+
+def test_files_that_are_not_checkpoints_are_refused_by_name(params, checkpoint, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none.pth: no such checkpoint"):
+        import_swin_unet(params, tmp_path / "none.pth")
+    (tmp_path / "bad.pth").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"bad.pth: expected a PyTorch checkpoint of plain tensors"):
+        import_swin_t(params, tmp_path / "bad.pth")
+    with pytest.raises(ValueError, match=r"model.pth: expected a PyTorch checkpoint with a dictionary of tensors"):
+        import_swin_unet(params, checkpoint([1, 2]))
+
+
+def test_without_pytorch_the_error_names_the_extra(params, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[torch\]'"):
+        import_swin_unet(params, tmp_path / "model.pth")

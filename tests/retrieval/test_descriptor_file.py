@@ -1,0 +1,136 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+
+@pytest.fixture
+def file():
+    return DescriptorFile(
+        sequence="08",
+        ids=("000000", "000007", "ÄÖ-9"),
+        positions=np.arange(9.0).reshape(3, 3),
+        times=np.array([0.0, 0.1, 0.2]),
+        descriptors=np.eye(3, 4, dtype=np.float32),
+        pose_source="08/poses.txt (SemanticKITTI)",
+        config={"preset": "small", "grid": {"resolution_m": 0.4}},
+        weights_hash="abc",
+    )
+
+
+def assert_same(a, b):
+    for field in dataclasses.fields(DescriptorFile):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        else:
+            assert x == y
+
+
+@pytest.mark.parametrize("absent", [{}, {"times": None}, {"positions": None, "pose_source": None}])
+def test_a_file_comes_back_as_it_was_saved(tmp_path, file, absent):
+    file = dataclasses.replace(file, **absent)
+    file.save(tmp_path / "08.npz")
+    assert_same(DescriptorFile.load(tmp_path / "08.npz"), file)
+    assert [path.name for path in tmp_path.iterdir()] == ["08.npz"]
+
+
+def test_a_failed_save_leaves_the_older_file_and_nothing_else(tmp_path, file, monkeypatch):
+    path = tmp_path / "08.npz"
+    file.save(path)
+
+    def write_half(stream, **arrays):
+        stream.write(b"PK half a file")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez", write_half)
+    with pytest.raises(OSError, match="disk full"):
+        dataclasses.replace(file, sequence="other").save(path)
+    assert_same(DescriptorFile.load(path), file)
+    assert [path.name for path in tmp_path.iterdir()] == ["08.npz"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"ids": ("a", "b")}, r"expected descriptors as float32 \(2, any\) for 2 ids, found float32 \(3, 4\)"),
+        ({"positions": np.zeros((4, 3))}, r"expected positions as float64 \(3, 3\) for 3 ids, found float64 \(4, 3\)"),
+        ({"times": np.zeros(2)}, r"expected times as float64 \(3\) for 3 ids, found float64 \(2,\)"),
+        ({"descriptors": np.zeros((3, 4))}, r"expected descriptors as float32 .* found float64"),
+        (
+            {"descriptors": np.array([[0, 1], [np.nan, 0], [0, np.inf]], np.float32)},
+            "expected finite descriptors, found others in 2 rows, the first in row 1",
+        ),
+        ({"positions": np.full((3, 3), np.nan)}, "expected finite positions"),
+        (
+            {"ids": (), "positions": np.zeros((0, 3)), "times": None, "descriptors": np.zeros((0, 4), np.float32)},
+            "expected at least one scan",
+        ),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(file, change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(file, **change)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a descriptor file, found none"):
+        DescriptorFile.load(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut"])
+def test_a_file_of_another_kind_is_named(tmp_path, content):
+    path = tmp_path / "x.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"x\.npz: expected a descriptor file \(\.npz\), found {len(content)} bytes"):
+        DescriptorFile.load(path)
+
+
+def test_a_damaged_file_is_named(tmp_path, file):
+    path = tmp_path / "08.npz"
+    file.save(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"NUMPY", content.index(b"descriptors.npy"))
+    content[at + 150] ^= 0xFF  # inside the numbers: the checksum no longer fits
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"08\.npz: expected a descriptor file \(\.npz\), found a broken one"):
+        DescriptorFile.load(path)
+
+
+def test_objects_are_never_unpickled(tmp_path):
+    np.savez(tmp_path / "evil.npz", about=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ValueError, match=r"evil\.npz: .* broken"):
+        DescriptorFile.load(tmp_path / "evil.npz")
+
+
+def test_missing_arrays_are_listed(tmp_path):
+    np.savez(tmp_path / "x.npz", descriptors=np.zeros((3, 4), np.float32))
+    with pytest.raises(ValueError, match=r"x\.npz: expected arrays about, ids, descriptors; found descriptors"):
+        DescriptorFile.load(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize(
+    ("about", "message"),
+    [
+        ("{}", "expected format 'sglpr-jax descriptors 1', found None"),
+        ("[1]", r"expected format 'sglpr-jax descriptors 1', found \[1\]"),
+        ("{", "expected JSON in `about`, found '{'"),
+        ('{"format": "sglpr-jax descriptors 1"}', "expected `sequence`, `pose_source`, `config`, `weights_hash`"),
+    ],
+)
+def test_another_format_is_refused(tmp_path, about, message):
+    np.savez(tmp_path / "x.npz", about=np.array(about), ids=np.array(["0"]), descriptors=np.zeros((1, 4), np.float32))
+    with pytest.raises(ValueError, match=r"x\.npz: .*" + message):
+        DescriptorFile.load(tmp_path / "x.npz")
+
+
+def test_a_file_whose_arrays_disagree_is_named(tmp_path, file):
+    file.save(tmp_path / "08.npz")
+    with np.load(tmp_path / "08.npz") as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / "08.npz", **{**arrays, "positions": np.zeros((5, 3))})
+    with pytest.raises(ValueError, match=r"08\.npz: expected positions as float64 \(3, 3\) for 3 ids"):
+        DescriptorFile.load(tmp_path / "08.npz")

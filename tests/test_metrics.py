@@ -1,0 +1,76 @@
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import precision_recall_curve
+
+from sglpr_jax.metrics import classification_curve, decision_curve
+
+TIED_SCORES = st.integers(-3, 3).map(float)
+SCORES = st.floats(-1e3, 1e3)
+
+
+def assert_is_sklearns(scores, positive):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "No positive class found", UserWarning)
+        precision, recall, thresholds = precision_recall_curve(positive, scores)
+    curve = classification_curve(scores, positive)
+    np.testing.assert_array_equal(curve.thresholds, thresholds)
+    # scikit-learn adds a last point, precision 1 and recall 0, at which nothing is accepted.
+    np.testing.assert_allclose(curve.precision, precision[:-1], atol=1e-12)
+    np.testing.assert_allclose(curve.recall, recall[:-1], atol=1e-12)
+    with np.errstate(invalid="ignore"):
+        f1 = np.nan_to_num(2 * precision * recall / (precision + recall))
+    np.testing.assert_allclose(curve.f1_max, f1.max(), atol=1e-12)
+
+
+@given(st.lists(st.tuples(TIED_SCORES | SCORES, st.booleans()), min_size=1, max_size=40))
+@settings(deadline=None, max_examples=100)
+@example([(0.5, True)])
+@example([(0.5, False)])
+@example([(1.0, False), (2.0, False)])
+@example([(1.0, True), (1.0, False), (1.0, True)])
+def test_the_curve_is_scikit_learns(items):
+    scores, positive = zip(*items, strict=True)
+    assert_is_sklearns(np.array(scores), np.array(positive))
+
+
+def count_decisions(scores, threshold, right, wrong, missed):
+    accepted = scores >= threshold
+    tp, fp, fn = np.sum(accepted & right), np.sum(accepted & wrong), np.sum(~accepted & missed)
+    return tp / max(tp + fp, 1), tp / max(tp + fn, 1)
+
+
+@given(st.lists(st.tuples(TIED_SCORES, st.integers(0, 2), st.booleans()), min_size=1, max_size=30))
+@settings(deadline=None, max_examples=50)
+def test_decisions_are_counted_at_every_distinct_score(items):
+    scores, outcome, missed = map(np.array, zip(*[*items, (0.0, 2, True)], strict=True))
+    right, wrong = outcome == 0, outcome == 1
+    curve = decision_curve(scores, true_if_accepted=right, false_if_accepted=wrong, missed_if_rejected=missed)
+    assert curve.thresholds.tolist() == sorted(set(scores))
+    expected = [count_decisions(scores, threshold, right, wrong, missed) for threshold in curve.thresholds]
+    np.testing.assert_allclose(np.stack([curve.precision, curve.recall], axis=1), expected, atol=1e-12)
+
+
+def test_an_item_that_counts_for_nothing_changes_no_precision():
+    curve = decision_curve(
+        np.array([3.0, 2.0, 1.0]),
+        true_if_accepted=np.array([True, False, True]),
+        false_if_accepted=np.array([False, False, False]),
+        missed_if_rejected=np.array([True, False, True]),
+    )
+    assert curve.f1_max == 1.0
+
+
+def test_best_is_the_highest_of_equally_good_thresholds():
+    curve = classification_curve(np.array([3.0, 2.0, 1.0, 0.0]), np.array([True, False, False, True]))
+    # F1 is 2/3 when only the first is accepted, and again when all four are.
+    assert curve.f1_max == pytest.approx(2 / 3)
+    assert curve.thresholds[curve.best] == 3.0
+
+
+def test_scores_that_are_not_finite_are_refused():
+    with pytest.raises(ValueError, match="expected finite scores, found 1 of 2"):
+        classification_curve(np.array([np.nan, 1.0]), np.array([True, False]))

@@ -1,0 +1,105 @@
+"""Positions, distances and the rule of LoGG3D-Net for queries, databases and revisits."""
+
+import json
+
+import hypothesis
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+
+from sglpr_jax.data.kitti import read_trajectory
+from sglpr_jax.data.pose_files import read_poses
+from sglpr_jax.poses import EXCLUDED_FRAMES, POSITIVE_M, database_end, distances, positions_from_camera, revisits
+
+coordinates = st.floats(-1e4, 1e4)
+
+
+def test_camera_axes_become_forward_left_up():
+    world_from_camera = np.zeros((1, 3, 4))
+    world_from_camera[0, :, 3] = [1, 2, 3]  # right, down, forward
+    np.testing.assert_array_equal(positions_from_camera(world_from_camera), [[3, -1, -2]])
+
+
+@hypothesis.settings(deadline=None, max_examples=25)
+@hypothesis.given(
+    hnp.arrays(np.float64, (5, 3), elements=coordinates), hnp.arrays(np.float64, (4, 3), elements=coordinates)
+)
+def test_distances_are_norms_of_differences(a, b):
+    expected = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    np.testing.assert_allclose(distances(a, b), expected, rtol=1e-12)
+    np.testing.assert_array_equal(distances(a, a), distances(a, a).T)
+
+
+@hypothesis.settings(deadline=None, max_examples=25)
+@hypothesis.given(hnp.arrays(np.float64, 40, elements=st.floats(0, 3)), st.floats(0.5, 20))
+def test_the_database_follows_the_rule_word_for_word(steps, excluded_s):
+    times = np.cumsum(steps)
+    expected = []
+    for query, now in enumerate(times):
+        k = next(frame for frame, time in enumerate(times) if time > now - excluded_s)
+        expected.append(0 if now - times[0] < excluded_s else min(k + 1, query))
+    np.testing.assert_array_equal(database_end(40, times=times, excluded_s=excluded_s), expected)
+
+
+def test_without_times_frames_are_the_clock():
+    ends = database_end(1000)
+    assert not ends[:EXCLUDED_FRAMES].any()
+    np.testing.assert_array_equal(ends[EXCLUDED_FRAMES:], np.arange(EXCLUDED_FRAMES, 1000) - EXCLUDED_FRAMES + 2)
+    np.testing.assert_array_equal(ends, database_end(1000, times=np.arange(1000.0), excluded_s=float(EXCLUDED_FRAMES)))
+
+
+def test_a_query_is_never_in_its_own_database():
+    assert np.all(database_end(10, excluded_frames=0) <= np.arange(10))
+
+
+def test_no_frames_have_no_database():
+    assert database_end(0).shape == (0,)
+    assert revisits(np.zeros((0, 3))).shape == (0,)
+
+
+@pytest.mark.parametrize("times", [[0.0, 2.0, 1.0], [0.0, np.nan, 1.0]])
+def test_times_must_run_forwards(times):
+    with pytest.raises(ValueError, match="never decrease"):
+        database_end(3, times=np.array(times))
+
+
+def test_a_loop_is_a_revisit_and_standing_still_is_not():
+    turn = np.linspace(0, 4 * np.pi, 80, endpoint=False)  # two rounds of 40 frames
+    circle = np.stack([50 * np.cos(turn), 50 * np.sin(turn), np.zeros(80)], axis=1)
+    np.testing.assert_array_equal(revisits(circle, excluded_frames=20), np.arange(80) >= 40)
+    assert not revisits(np.zeros((20, 3)), excluded_frames=20).any()
+
+
+def test_height_counts_only_in_3d():
+    climb = np.zeros((100, 3))
+    climb[:, 2] = np.arange(100)
+    assert not revisits(climb, excluded_frames=20).any()
+    assert revisits(climb[:, :2], excluded_frames=20)[20:].all()
+
+
+@pytest.mark.parametrize(
+    "sequence, count", [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
+)
+def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
+    published = json.loads((shared / "data/protocol/logg3d_is_revisit_D-3_T-30.json").read_text())[sequence]
+    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, poses="semantickitti")
+    found = revisits(positions, times=times)
+    assert found.sum() == count
+    np.testing.assert_array_equal(found, np.array(published) == 1)
+    assert revisits(positions).sum() == count  # 290 frames stand for 30 s
+
+
+@pytest.mark.parametrize("sequence, count", [("02", 217), ("08", 158)])
+def test_the_pose_file_matters(shared, sequence, count):
+    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, poses="kitti")
+    assert revisits(positions, times=times).sum() == count
+
+
+@pytest.mark.parametrize("sequence, count", [("00", 774), ("02", 217), ("06", 268)])
+def test_revisits_of_the_bev_images(shared, sequence, count):
+    positions = read_poses(shared / f"data/kitti_bev/{sequence}/pose.txt")[:, :, 3]
+    assert revisits(positions).sum() == count
+    frames = np.arange(len(positions))
+    fifty_apart = frames[:, None] - frames[None, :] > 50
+    assert ((distances(positions, positions) < POSITIVE_M) & fifty_apart).any(axis=1).sum() == count
