@@ -1,14 +1,32 @@
 """The linear layer, layer norm and initial values that all modules share, set as the PyTorch reference has them."""
 
+import math
 from functools import partial
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.typing import Initializer
 from jaxtyping import Array, Float
 
-Linear = partial(nn.Dense, kernel_init=nn.initializers.normal(0.02))
-"""A dense layer with weights N(0, 0.02) and bias 0."""
+
+class Linear(nn.Dense):
+    """A dense layer with weights N(0, 0.02) and bias 0, computed as one product of two matrices.
+
+    XLA's CPU backend is three times slower at the same product with the leading axes left apart.
+    """
+
+    kernel_init: Initializer = nn.initializers.normal(0.02)
+
+    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
+        """The same linear map of every vector of `c` channels."""
+        return super().__call__(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.features)
+
+
+def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
+    """The exact GELU, x times the normal distribution function, by erf: `jax.nn.gelu` takes the costlier erfc."""
+    return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
+
 
 LayerNorm = partial(nn.LayerNorm, epsilon=1e-5)
 """Layer norm over channels with PyTorch's epsilon (Flax's default is 1e-6)."""

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.attention import WindowAttention, join_windows, shift_mask, split_windows
-from sglpr_jax.models.layers import LayerNorm, Linear, torch_uniform
+from sglpr_jax.models.layers import LayerNorm, Linear, gelu, torch_uniform
 
 
 class PatchEmbed(nn.Module):
@@ -68,7 +68,7 @@ class SwinBlock(nn.Module):
         attended = self._attend(LayerNorm(name="attention_norm")(x))
         x = x + DropPath(self.drop_path)(attended, train=train)
         hidden = Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x))
-        hidden = nn.gelu(hidden, approximate=False)
+        hidden = gelu(hidden)
         return x + DropPath(self.drop_path)(Linear(x.shape[-1], name="mlp_out")(hidden), train=train)
 
     def _attend(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.sim.drive import ROUTES, plan_drive, streets_needed
-from sglpr_jax.sim.sensor import Sensor, scan
+from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
 from sglpr_jax.sim.world import build_world
 
 SETTINGS_FILE = "simulation.json"
@@ -28,7 +28,7 @@ def write_dataset(
     *,
     names: Sequence[str] = ("00", "05", "08"),
     scans: int = 300,
-    sensor: Sensor = Sensor(),
+    sensor: Sensor = HDL64E,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Path:
@@ -55,7 +55,9 @@ def _claim(root: Path, settings: dict) -> None:
     settings = json.loads(json.dumps(settings))  # as JSON gives them back: tuples are lists
     if not path.exists():
         if (root / "sequences").exists():
-            raise ValueError(f"{root} holds sequences but no {SETTINGS_FILE}: they are not simulated; choose another folder")
+            raise ValueError(
+                f"{root} holds sequences that were not simulated (no {SETTINGS_FILE}); choose another folder"
+            )
         root.mkdir(parents=True, exist_ok=True)
         _write(path, json.dumps(settings, indent=1).encode())
         return

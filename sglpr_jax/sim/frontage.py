@@ -43,19 +43,74 @@ class Style:
     height: Range
     gap: Range
     set_back: Range
-    garden: int  # ground between the houses
-    border: tuple[str, ...]  # what may close off the front
-    parking: float  # probability of parking bays along a side
+    garden: int  # label of the ground around the houses
+    border: tuple[str, ...]  # what may close off the front; one is drawn per side
+    parking: float  # probability that a block has parking bays
     greenery: float  # trees and bushes per metre of side
-    houses: float = 1.0  # probability that a plot is built on
+    houses: float  # probability that a plot is built on
 
 
 STYLES = {
-    "centre": Style((9, 22), (8, 13), (9, 18), (-2, 0.5), (0, 1.5), SIDEWALK, ("none",), 0.6, 0.05, 0.9),
-    "suburb": Style((8, 14), (7, 11), (4, 8), (3, 11), (3, 8), TERRAIN, ("hedge", "hedge", "fence", "wall", "none", "none"), 0.3, 0.35),
-    "estate": Style((18, 38), (10, 13), (8, 13), (8, 20), (4, 10), TERRAIN, ("none", "none", "hedge"), 0.5, 0.25),
-    "works": Style((16, 40), (12, 20), (5, 9), (6, 18), (3, 10), PARKING, ("fence", "wall", "hedge"), 0.2, 0.08),
-    "park": Style((6, 9), (4, 6), (3, 4), (20, 40), (8, 15), TERRAIN, ("none", "none", "hedge", "fence"), 0.2, 0.6, 0.3),
+    "centre": Style(
+        width=(9, 22),
+        depth=(8, 13),
+        height=(9, 18),
+        gap=(-2, 0.5),
+        set_back=(0, 1.5),
+        garden=SIDEWALK,
+        border=("none",),
+        parking=0.6,
+        greenery=0.05,
+        houses=0.9,
+    ),
+    "suburb": Style(
+        width=(8, 14),
+        depth=(7, 11),
+        height=(4, 8),
+        gap=(3, 11),
+        set_back=(3, 8),
+        garden=TERRAIN,
+        border=("hedge", "hedge", "fence", "wall", "none", "none"),
+        parking=0.3,
+        greenery=0.35,
+        houses=1,
+    ),
+    "estate": Style(
+        width=(18, 38),
+        depth=(10, 13),
+        height=(8, 13),
+        gap=(8, 20),
+        set_back=(4, 10),
+        garden=TERRAIN,
+        border=("none", "none", "hedge"),
+        parking=0.5,
+        greenery=0.25,
+        houses=1,
+    ),
+    "works": Style(
+        width=(16, 40),
+        depth=(12, 20),
+        height=(5, 9),
+        gap=(6, 18),
+        set_back=(3, 10),
+        garden=PARKING,
+        border=("fence", "wall", "hedge"),
+        parking=0.2,
+        greenery=0.08,
+        houses=1,
+    ),
+    "park": Style(
+        width=(6, 9),
+        depth=(4, 6),
+        height=(3, 4),
+        gap=(20, 40),
+        set_back=(8, 15),
+        garden=TERRAIN,
+        border=("none", "none", "hedge", "fence"),
+        parking=0.2,
+        greenery=0.6,
+        houses=0.3,
+    ),
 }
 
 
@@ -72,7 +127,7 @@ class Verge:
 
 
 def draw_verge(rng: np.random.Generator, style: Style) -> Verge:
-    """Draw bays and sidewalk of one side."""
+    """Draw the parking bays and the sidewalk around a block."""
     return Verge(BAY_M if rng.random() < style.parking else 0.0, rng.uniform(1.5, 3.5))
 
 
@@ -86,7 +141,7 @@ def frontage(rng: np.random.Generator, style: Style, verge: Verge, length: float
     yield from _plots(rng, style, verge, length)
     for _ in range(rng.poisson(style.greenery * length)):
         s, d = rng.uniform(verge.depth, length - verge.depth), verge.depth + 0.8 + 12 * rng.random() ** 2
-        yield from _tree(rng, s, d) if rng.random() < 0.5 else _bush(rng, s, d)
+        yield from _tree(rng, s, d, (2.5, 6)) if rng.random() < 0.5 else _bush(rng, s, d)
 
 
 def _steps(rng: np.random.Generator, start: float, stop: float, spacing: Range) -> Iterator[float]:
@@ -117,8 +172,9 @@ def _parked_cars(rng: np.random.Generator, d: float, length: float) -> Iterator[
             yield from _car(rng, s, d, 0.0)
 
 
-def _tree(rng: np.random.Generator, s: float, d: float) -> Iterator[Item]:
-    trunk, crown = rng.uniform(0.25, 0.7), rng.uniform(2.5, 6)
+def _tree(rng: np.random.Generator, s: float, d: float, spread: Range) -> Iterator[Item]:
+    """A trunk under a crown whose diameter is in the range `spread`."""
+    trunk, crown = rng.uniform(0.25, 0.7), rng.uniform(*spread)
     below = rng.uniform(1.2, 2.6)
     yield Item("cylinder", TRUNK, s, d, 0, trunk, trunk, below + 0.3 * crown)
     yield Item("ellipsoid", VEGETATION, s, d, below, crown, crown, crown * rng.uniform(0.8, 1.4), roughness=0.5)
@@ -142,7 +198,7 @@ def _street_furniture(rng: np.random.Generator, verge: Verge, length: float) -> 
     if verge.walk > 2 and rng.random() < 0.4:
         spacing = rng.uniform(7, 16)
         for s in _steps(rng, 4, length - 4, (spacing, spacing + 1)):
-            yield from _tree(rng, s, d + 0.3)
+            yield from _tree(rng, s, d + 0.3, (1.8, 3.4))  # small: the vehicle passes beside it
 
 
 def _passers_by(rng: np.random.Generator, verge: Verge, length: float) -> Iterator[Item]:
@@ -192,9 +248,7 @@ def _plots(rng: np.random.Generator, style: Style, verge: Verge, length: float) 
         s += width + gap
 
 
-def _house(
-    rng: np.random.Generator, s: float, d: float, width: float, depth: float, height: float
-) -> Iterator[Item]:
+def _house(rng: np.random.Generator, s: float, d: float, width: float, depth: float, height: float) -> Iterator[Item]:
     """A house whose front begins at (s, d)."""
     yield Item("box", BUILDING, s + width / 2, d + depth / 2, 0, width, depth, height, rng.normal(0, 0.01))
     if rng.random() < 0.5:  # a wing or a porch in front of the house, or set back beside it

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sglpr_jax.sim.shapes import Rays, Scene, Shapes, nearest_hit
+from sglpr_jax.sim.shapes import AnyArray, Scene, Shapes, Vectors, nearest_hit
 from sglpr_jax.sim.world import CELL_M, GROUND, Ground, World
 
 HDL64E_DEG = (*np.linspace(2.0, -8.33, 32).tolist(), *np.linspace(-8.83, -24.8, 32).tolist())
@@ -42,8 +42,11 @@ class Sensor:
             )
 
 
+HDL64E = Sensor()
+
+
 def scan(
-    key: Array, world: World, world_from_lidar: Float[np.ndarray, "4 4"], *, sensor: Sensor
+    key: Array, world: World, world_from_lidar: Float[np.ndarray, "4 4"], *, sensor: Sensor = HDL64E
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
     """Return one scan of `world`: points (x, y, z in metres in the LiDAR frame, intensity 0 to 1) and raw labels.
 
@@ -80,7 +83,7 @@ def _largest(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"], count: 
     by_size = np.argsort(-radius / clearance, kind="stable")
     chosen = by_size[clearance[by_size] <= max_range_m][:count]
 
-    def pad(values: np.ndarray, filler: float, dtype: type) -> np.ndarray:
+    def pad(values: AnyArray, filler: float, dtype: type) -> np.ndarray:
         width = [(0, count - len(chosen))] + [(0, 0)] * (values.ndim - 1)
         return np.pad(values[chosen], width, constant_values=filler).astype(dtype)
 
@@ -94,12 +97,12 @@ def _largest(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"], count: 
     )
 
 
-def _rays(sensor: Sensor) -> Rays:
+def _rays(sensor: Sensor) -> Vectors:
     """One ray per laser and azimuth, of horizontal length 1: x and y are (1, azimuths), z is (lasers, 1)."""
     azimuth = np.arange(sensor.azimuth_steps) * (2 * np.pi / sensor.azimuth_steps)
     slope = np.tan(np.radians(sensor.elevations_deg))
     x, y, z = np.cos(azimuth)[None, :], np.sin(azimuth)[None, :], slope[:, None]
-    return Rays(*(jnp.asarray(axis, jnp.float32) for axis in (x, y, z)))
+    return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in (x, y, z)))
 
 
 def _ground_label(ground: Ground, x: Array, y: Array) -> Array:
@@ -127,9 +130,11 @@ def _turn(
     depth = roughness * jnp.abs(jax.random.normal(key_depth, distance.shape))
     reach = distance * length + noise + depth
     returned = (reach < sensor.max_range_m) & (jax.random.uniform(key_dropout, distance.shape) >= sensor.dropout)
+    reach = jnp.where(returned, reach, 0)
 
     x, y, z = (axis * (reach / length) for axis in rays)
     (cos, _, _, east), (sin, _, _, north) = world_from_lidar[0], world_from_lidar[1]
-    label = jnp.where(label == GROUND, _ground_label(ground, cos * x - sin * y + east, sin * x + cos * y + north), label)
+    ground_label = _ground_label(ground, cos * x - sin * y + east, sin * x + cos * y + north)
+    label = jnp.where(label == GROUND, ground_label, label)
     points = jnp.stack([x, y, z, 0.4 * jnp.exp(-reach / 40)], axis=-1)
     return points.reshape(-1, 4), label.reshape(-1), returned.reshape(-1)

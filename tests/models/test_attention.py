@@ -50,16 +50,13 @@ def test_buffers_of_the_full_size_model_are_the_references(golden):
         for block in range(2):
             buffers = {"attn.relative_position_index": relative_position_index(7).astype(np.int64)}
             if block == 1 and size > 7:
-                buffers = {
-                    "attn_mask": np.where(shift_mask(size, size, 7, 3), BLOCKED, 0.0).astype(np.float32),
-                    **buffers,
-                }
+                mask = np.where(shift_mask(size, size, 7, 3), BLOCKED, 0.0).astype(np.float32)
+                buffers = {"attn_mask": mask, **buffers}
             for name, table in buffers.items():
                 digest.update(f"{stage}.blocks.{block}.{name}".encode())
                 digest.update(table.tobytes())
-    assert (
-        digest.hexdigest() == json.loads(str(golden("tables_masks")["hashes"]))["full_size_all_buffers_name_then_bytes"]
-    )
+    hashes = json.loads(str(golden("tables_masks")["hashes"]))
+    assert digest.hexdigest() == hashes["full_size_all_buffers_name_then_bytes"]
 
 
 def test_windows_of_a_rectangular_map_are_its_tiles_and_join_to_it_again():

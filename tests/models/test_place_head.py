@@ -15,20 +15,28 @@ def head(kernels, strides):
 
 @pytest.mark.parametrize(
     ("kernels", "strides", "sizes"),
-    [((3, 3, 3), (2, 2, 2), (16, 8, 4)), ((4, 3, 3), (4, 2, 2), (8, 4, 2)), ((2, 2, 2), (2, 2, 2), (16, 8, 4))],
+    [((3, 3, 3), (2, 2, 2), [16, 8, 4]), ((4, 3, 3), (4, 2, 2), [8, 4, 2]), ((2, 2, 2), (2, 2, 2), [16, 8, 4])],
     ids=["A: 3/2 3/2 3/2", "B: 4/4 3/2 3/2", "C: 2/2 2/2 2/2"],
 )
-def test_descriptors_have_length_one_and_do_not_depend_on_their_batch(kernels, strides, sizes):
-    module = head(kernels, strides)
+def test_the_map_shrinks_by_each_stride(kernels, strides, sizes):
+    run = head(kernels, strides).init_with_output
+    (descriptors, seen), _ = jax.eval_shape(run, jax.random.key(0), jnp.zeros((3, 32, 32, 6)))
+    assert descriptors.shape == (3, 32)
+    assert [seen[f"head_convolution{i}"].shape[1] for i in range(3)] == sizes
+
+
+def test_descriptors_have_length_one_and_do_not_depend_on_their_batch():
+    module = head((4, 3, 3), (4, 2, 2))
     features = jnp.asarray(np.random.default_rng(0).normal(size=(3, 32, 32, 6)), jnp.float32)
     variables = jax.jit(module.init)(jax.random.key(0), features)
-    descriptors, seen = jax.jit(module.apply)(variables, features)
-    assert descriptors.shape == (3, 32)
-    assert [seen[f"head_convolution{i}"].shape[1] for i in range(3)] == list(sizes)
+
+    def describe(x):
+        return module.apply(variables, x)[0]
+
+    descriptors = describe(features)
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=-1), 1, atol=1e-6)
-    alone = jax.jit(lambda x: module.apply(variables, x)[0])(features[1:2])
-    np.testing.assert_allclose(alone, descriptors[1:2], atol=2e-6)
-    one_by_one = jax.jit(jax.vmap(lambda x: module.apply(variables, x)[0]))(features[:, None])[:, 0]
+    np.testing.assert_allclose(jax.jit(describe)(features[1:2]), descriptors[1:2], atol=2e-6)
+    one_by_one = jax.jit(jax.vmap(describe))(features[:, None])[:, 0]
     np.testing.assert_allclose(one_by_one, descriptors, atol=2e-6)
 
 

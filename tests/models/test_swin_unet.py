@@ -24,7 +24,7 @@ def variables(images):
 
 @pytest.fixture(scope="module")
 def tokens(variables, images):
-    return jax.jit(MODEL.apply)(variables, images)[0]
+    return MODEL.apply(variables, images)[0]
 
 
 def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, tokens):
