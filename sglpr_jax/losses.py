@@ -28,17 +28,24 @@ def lazy_triplet(
     margin: float,
     closest_positive: bool = True,
     reduction: Literal["max", "sum"] = "max",
+    temperature: float = 0.0,
     where: Bool[Array, "*t n"] | None = None,
 ) -> Float[Array, "*t"]:
     """Equation 5 for each tuple, from the distances of its anchor to its k_p positives and k_n negatives.
 
     `where` masks negatives; a tuple left with none costs nothing. `reduction="sum"` is the triplet loss that is not
     lazy: every negative inside the margin counts. `closest_positive=False` takes the farthest positive.
+
+    A `temperature` T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)), which tends to it as T goes
+    to 0. The maximum alone pulls untrained descriptors into one point, where its gradient vanishes; this does not.
     """
     pull = positive.min(-1) if closest_positive else positive.max(-1)
-    hinge = jax.nn.relu(margin + pull[..., None] - negative)
+    violation = margin + pull[..., None] - negative
     if where is not None:
-        hinge = jnp.where(where, hinge, 0.0)
+        violation = jnp.where(where, violation, -jnp.inf)
+    if temperature > 0:
+        return temperature * jax.nn.softplus(jax.nn.logsumexp(violation / temperature, axis=-1))
+    hinge = jax.nn.relu(violation)
     return hinge.max(-1) if reduction == "max" else hinge.sum(-1)
 
 

@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sglpr_jax.models.layers import l2_normalize
+from sglpr_jax.models.layers import Linear, l2_normalize
 
 
 class NetVLAD(nn.Module):
@@ -26,14 +26,14 @@ class NetVLAD(nn.Module):
         """The vector before its final L2 normalisation."""
         d = features.shape[-1]
         weights_init = nn.initializers.normal(d**-0.5)
-        logits = nn.Dense(self.clusters, kernel_init=weights_init, name="assignment")(features)
+        logits = Linear(self.clusters, kernel_init=weights_init, name="assignment")(features)
         assignment = nn.softmax(logits)
         centres = self.param("centres", weights_init, (d, self.clusters))
         residuals = jnp.einsum("bnd,bnk->bdk", features, assignment)
         residuals = residuals - assignment.sum(1)[:, None, :] * centres[None]
         vlad = l2_normalize(residuals, axis=1).reshape(len(features), -1)
-        y = nn.Dense(self.output, kernel_init=weights_init, name="hidden")(l2_normalize(vlad))
+        y = Linear(self.output, kernel_init=weights_init, name="hidden")(l2_normalize(vlad))
         if not self.gating:
             return y
         gate_init = nn.initializers.normal(self.output**-0.5)
-        return y * nn.sigmoid(nn.Dense(self.output, kernel_init=gate_init, name="gate")(y))
+        return y * nn.sigmoid(Linear(self.output, kernel_init=gate_init, name="gate")(y))

@@ -67,8 +67,7 @@ class SwinBlock(nn.Module):
         """Keeps the shape; `train` switches stochastic depth on. Raises ValueError where windows do not fit."""
         attended = self._attend(LayerNorm(name="attention_norm")(x))
         x = x + DropPath(self.drop_path)(attended, train=train)
-        hidden = Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x))
-        hidden = gelu(hidden)
+        hidden = gelu(Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x)))
         return x + DropPath(self.drop_path)(Linear(x.shape[-1], name="mlp_out")(hidden), train=train)
 
     def _attend(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:

@@ -84,7 +84,7 @@ def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
     """The weights of a `.pth` file by name, without buffers, wrapper keys and prefixes."""
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("reading a .pth file needs PyTorch: pip install 'sglpr-jax[torch]'") from error
     if not Path(path).is_file():
@@ -92,7 +92,8 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises a different type for each way a file can be damaged
-        raise ValueError(f"expected a PyTorch checkpoint of plain tensors ({error})") from error
+        reason = str(error).split(". ")[0]
+        raise ValueError(f"expected a PyTorch checkpoint of plain tensors ({reason})") from error
     for wrapper in ("model", "state_dict"):
         content = content.get(wrapper, content) if isinstance(content, Mapping) else content
     if not isinstance(content, Mapping) or not all(hasattr(value, "numpy") for value in content.values()):
@@ -127,7 +128,7 @@ def from_torch_names(
 def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
     """A Swin-T by its PyTorch names into `params`; see `import_swin_t`."""
     last = len(params.config.depths) - 1
-    weights = flax.traverse_util.flatten_dict(params.weights, sep="/")
+    weights = _flatten(params.weights)
     copied, used, misshapen = [], set(), set()
     for name in _expected_shapes(params.config, 1):
         source = re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
@@ -158,8 +159,11 @@ def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tupl
     """Shapes of all weights that a Swin-Unet shares with the model: all but the place head's."""
     image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, input_channels), np.float32)
     init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=True), jax.random.key(0), image)
-    flat = flax.traverse_util.flatten_dict(init["params"], sep="/")
-    return {name: leaf.shape for name, leaf in flat.items() if not name.startswith("place_head/")}
+    return {name: leaf.shape for name, leaf in _flatten(init["params"]).items() if not name.startswith("place_head/")}
+
+
+def _flatten(weights: Any) -> dict[str, Any]:
+    return flax.traverse_util.flatten_dict(weights, sep="/")
 
 
 def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarray:

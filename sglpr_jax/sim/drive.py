@@ -13,15 +13,15 @@ ROUTES = {
     # Around a row of three blocks, likewise.
     "05": ((0, 0), (3, 0), (3, 1), (0, 1), (0, 0), (3, 0), (3, 0.5)),
     # Out along two streets, around a block, and the two streets back: revisits in the opposite direction.
-    "08": ((0.5, 0), (2, 0), (2, 3), (3, 3), (3, 2), (2, 2), (2, 0), (0.5, 0)),
+    "08": ((1, 0), (2, 0), (2, 3), (3, 3), (3, 2), (2, 2), (2, 0), (1, 0)),
 }
-"""The corners of every route as (street along y, street along x); halves lie between streets. Scale 1: some 610 m."""
+"""The corners of every route as (street along y, street along x); fractions lie between streets. Scale 1: some 610 m."""
 SCANS_PER_SCALE = 300
 SPEED_MPS = 6.0
 LANE_M = 0.9
 """How far right of the middle of the street the vehicle keeps; small, so that both directions lie within 3 m."""
 SWAY_M = 0.3
-CORNER_RADIUS_M = 7.0
+CORNER_RADIUS_M = 4.5
 STEP_M = 0.25
 
 

@@ -52,11 +52,11 @@ class Style:
 
 STYLES = {
     "centre": Style(
-        width=(9, 22),
-        depth=(8, 13),
-        height=(9, 18),
-        gap=(-2, 0.5),
-        set_back=(0, 1.5),
+        width=(9.0, 22.0),
+        depth=(8.0, 13.0),
+        height=(9.0, 18.0),
+        gap=(-2.0, 0.5),
+        set_back=(0.0, 1.5),
         garden=SIDEWALK,
         border=("none",),
         parking=0.6,
@@ -64,47 +64,47 @@ STYLES = {
         houses=0.9,
     ),
     "suburb": Style(
-        width=(8, 14),
-        depth=(7, 11),
-        height=(4, 8),
-        gap=(3, 11),
-        set_back=(3, 8),
+        width=(8.0, 14.0),
+        depth=(7.0, 11.0),
+        height=(4.0, 8.0),
+        gap=(3.0, 11.0),
+        set_back=(3.0, 8.0),
         garden=TERRAIN,
         border=("hedge", "hedge", "fence", "wall", "none", "none"),
         parking=0.3,
         greenery=0.35,
-        houses=1,
+        houses=1.0,
     ),
     "estate": Style(
-        width=(18, 38),
-        depth=(10, 13),
-        height=(8, 13),
-        gap=(8, 20),
-        set_back=(4, 10),
+        width=(18.0, 38.0),
+        depth=(10.0, 13.0),
+        height=(8.0, 13.0),
+        gap=(8.0, 20.0),
+        set_back=(4.0, 10.0),
         garden=TERRAIN,
         border=("none", "none", "hedge"),
         parking=0.5,
         greenery=0.25,
-        houses=1,
+        houses=1.0,
     ),
     "works": Style(
-        width=(16, 40),
-        depth=(12, 20),
-        height=(5, 9),
-        gap=(6, 18),
-        set_back=(3, 10),
+        width=(16.0, 40.0),
+        depth=(12.0, 20.0),
+        height=(5.0, 9.0),
+        gap=(6.0, 18.0),
+        set_back=(3.0, 10.0),
         garden=PARKING,
         border=("fence", "wall", "hedge"),
         parking=0.2,
         greenery=0.08,
-        houses=1,
+        houses=1.0,
     ),
     "park": Style(
-        width=(6, 9),
-        depth=(4, 6),
-        height=(3, 4),
-        gap=(20, 40),
-        set_back=(8, 15),
+        width=(6.0, 9.0),
+        depth=(4.0, 6.0),
+        height=(3.0, 4.0),
+        gap=(20.0, 40.0),
+        set_back=(8.0, 15.0),
         garden=TERRAIN,
         border=("none", "none", "hedge", "fence"),
         parking=0.2,
@@ -140,8 +140,8 @@ def frontage(rng: np.random.Generator, style: Style, verge: Verge, length: float
     yield from _border(rng, style, verge, length)
     yield from _plots(rng, style, verge, length)
     for _ in range(rng.poisson(style.greenery * length)):
-        s, d = rng.uniform(verge.depth, length - verge.depth), verge.depth + 0.8 + 12 * rng.random() ** 2
-        yield from _tree(rng, s, d, (2.5, 6)) if rng.random() < 0.5 else _bush(rng, s, d)
+        s, d = rng.uniform(verge.depth + 2, length - verge.depth - 2), verge.depth + 0.8 + 12 * rng.random() ** 2
+        yield from _tree(rng, s, d, (2.5, 6.0)) if rng.random() < 0.5 else _bush(rng, s, d)
 
 
 def _steps(rng: np.random.Generator, start: float, stop: float, spacing: Range) -> Iterator[float]:
@@ -167,7 +167,7 @@ def _car(rng: np.random.Generator, s: float, d: float, yaw: float) -> Iterator[I
 
 def _parked_cars(rng: np.random.Generator, d: float, length: float) -> Iterator[Item]:
     occupied = rng.uniform(0.15, 0.95)
-    for s in _steps(rng, 7, length - 7, (5.6, 6.4)):
+    for s in _steps(rng, 7.0, length - 7, (5.6, 6.4)):
         if rng.random() < occupied:
             yield from _car(rng, s, d, 0.0)
 
@@ -189,21 +189,21 @@ def _street_furniture(rng: np.random.Generator, verge: Verge, length: float) -> 
     """Lamp posts, signs and, along some sides, a row of trees."""
     d = verge.bay + 0.4
     lamps = rng.uniform(18, 40)
-    for s in _steps(rng, 2, length, (lamps, lamps + 3)):
+    for s in _steps(rng, 2.0, length - 2, (lamps, lamps + 3)):
         yield Item("cylinder", POLE, s, d, 0, 0.2, 0.2, rng.uniform(5, 8))
-    for s in _steps(rng, 2, length, (12, 50)):
+    for s in _steps(rng, 2.0, length - 2, (12.0, 50.0)):
         side = rng.uniform(0.5, 0.8)
         yield Item("cylinder", POLE, s, d, 0, 0.09, 0.09, 2.3)
         yield Item("box", TRAFFIC_SIGN, s, d, 2.0, 0.06, side, side, rng.normal(0, 0.2))
     if verge.walk > 2 and rng.random() < 0.4:
         spacing = rng.uniform(7, 16)
-        for s in _steps(rng, 4, length - 4, (spacing, spacing + 1)):
+        for s in _steps(rng, 4.0, length - 4, (spacing, spacing + 1)):
             yield from _tree(rng, s, d + 0.3, (1.8, 3.4))  # small: the vehicle passes beside it
 
 
 def _passers_by(rng: np.random.Generator, verge: Verge, length: float) -> Iterator[Item]:
     """People, riders and parked bicycles on the sidewalk."""
-    for s in rng.uniform(0, length, rng.poisson(length / 60)):
+    for s in rng.uniform(2, length - 2, rng.poisson(length / 60)):
         d, height = verge.bay + rng.uniform(0.6, verge.walk), rng.uniform(1.5, 1.9)
         what = rng.choice(["person", "bicyclist", "bicycle"], p=[0.5, 0.2, 0.3])
         if what == "person":
@@ -243,7 +243,7 @@ def _plots(rng: np.random.Generator, style: Style, verge: Verge, length: float) 
         if rng.random() < style.houses and width > 3:
             set_back = row if rng.random() < 0.7 else rng.uniform(*style.set_back)
             yield from _house(rng, s, verge.depth + set_back, width, depth, rng.uniform(*style.height))
-        if gap > 2.5:
+        if gap > 2.5 and s + width + gap < end:
             yield from _between_houses(rng, s + width, verge.depth, gap)
         s += width + gap
 
@@ -253,7 +253,7 @@ def _house(rng: np.random.Generator, s: float, d: float, width: float, depth: fl
     yield Item("box", BUILDING, s + width / 2, d + depth / 2, 0, width, depth, height, rng.normal(0, 0.01))
     if rng.random() < 0.5:  # a wing or a porch in front of the house, or set back beside it
         wing, forward = rng.uniform(0.2, 0.5) * width, rng.uniform(-1.5, 1.5)
-        at = s + rng.uniform(0.5, 1) * width
+        at = s + wing / 2 + rng.uniform(0, width - wing)
         yield Item("box", BUILDING, at, d + depth / 2 - forward, 0, wing, depth, rng.uniform(0.5, 0.85) * height)
 
 

@@ -83,7 +83,7 @@ def _largest(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"], count: 
     by_size = np.argsort(-radius / clearance, kind="stable")
     chosen = by_size[clearance[by_size] <= max_range_m][:count]
 
-    def pad(values: AnyArray, filler: float, dtype: type) -> np.ndarray:
+    def pad(values: AnyArray, filler: float | int, dtype: type) -> np.ndarray:
         width = [(0, count - len(chosen))] + [(0, 0)] * (values.ndim - 1)
         return np.pad(values[chosen], width, constant_values=filler).astype(dtype)
 

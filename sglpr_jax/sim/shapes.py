@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 AnyArray = Array | np.ndarray
-Interval = tuple[Array, Array]
+Interval = tuple[AnyArray, AnyArray]
 """Where a ray enters and where it leaves a solid; enter > leave where it misses."""
 
 
@@ -114,8 +114,8 @@ def _nearest_of_kind(
 def nearest_hit(rays: Vectors, scene: Scene) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"]]:
     """Distance to the first shape that each ray from the origin meets, and which one it is.
 
-    Distances count in lengths of the ray's direction, which need not be 1. The index counts boxes, then cylinders, then ellipsoids; a ray that meets nothing has distance inf and index -1. A
-    shape around the rays' origin is not seen.
+    Distances count in lengths of the ray's direction, which need not be 1. The index counts boxes, then cylinders, then
+    ellipsoids; a ray that meets nothing has distance inf and index -1. A shape around the rays' origin is not seen.
     """
     shape = jnp.broadcast_shapes(*(axis.shape for axis in rays))
     best = jnp.full(shape, jnp.inf, jnp.float32), jnp.full(shape, -1, jnp.int32)

@@ -76,23 +76,23 @@ def build_world(seed: int | tuple[int, ...], *, streets: tuple[int, int]) -> Wor
 def _scene(rng: np.random.Generator, blocks: list[Block]) -> Scene:
     rows = {"box": [], "cylinder": [], "ellipsoid": []}
     for block in blocks:
-        rows["box"].append((*(block.corner + block.size / 2), 0, *(block.size / 2), KERB_M, 0, GROUND, 0))
+        rows["box"].append([*(block.corner + block.size / 2), 0, *(block.size / 2), KERB_M, 0, GROUND, 0])
         for corner, length, heading in block.sides():
             for item in frontage(rng, block.style, block.verge, length):
                 rows[item.kind].append(_row(item, corner, heading))
     return Scene(*(_shapes(rows[kind]) for kind in ("box", "cylinder", "ellipsoid")))
 
 
-def _row(item: Item, corner: Float[np.ndarray, "2"], heading: float) -> tuple[float, ...]:
+def _row(item: Item, corner: Float[np.ndarray, "2"], heading: float) -> list:
     """An item of a side in the world frame: centre, half sizes, yaw, label, roughness."""
     cos, sin = np.cos(heading), np.sin(heading)
     x, y = corner[0] + cos * item.s - sin * item.d, corner[1] + sin * item.s + cos * item.d
     z = KERB_M + item.bottom + item.height / 2
     half = item.length / 2, item.width / 2, item.height / 2
-    return (x, y, z, *half, heading + item.yaw, item.label, item.roughness)
+    return [x, y, z, *half, heading + item.yaw, item.label, item.roughness]
 
 
-def _shapes(rows: list[tuple[float, ...]]) -> Shapes:
+def _shapes(rows: list[list]) -> Shapes:
     table = np.array(rows, dtype=np.float64).reshape(-1, 9)
     return Shapes(table[:, 0:3], table[:, 3:6], table[:, 6], table[:, 7].astype(np.int32), table[:, 8])
 

@@ -34,6 +34,8 @@ class LossConfig:
     closest_positive: bool = True
     reduction: Literal["max", "sum"] = "max"
     """`max` is the lazy triplet loss; `sum` counts every negative inside the margin."""
+    temperature: float = 0.0
+    """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
     ce_weight: float = 0.4
     dice_weight: float = 0.6
 

@@ -119,6 +119,7 @@ def triplet_loss(
         margin=config.margin,
         closest_positive=config.closest_positive,
         reduction=config.reduction,
+        temperature=config.temperature,
         where=batch.far,
     )
     return loss.mean(), {"triplet": loss.mean(), "violations": (loss > 0).mean()}

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -60,3 +61,15 @@ def model_config():
         return config, values["in_chans"]
 
     return read
+
+
+@pytest.fixture(scope="session")
+def random_variables():
+    """Random weights of a module, biases included; made by numpy, for compiling a module's own `init` takes seconds."""
+
+    def make(module, *inputs: Any):
+        rng = np.random.default_rng(0)
+        shapes = jax.eval_shape(module.init, jax.random.key(0), *inputs)
+        return jax.tree.map(lambda leaf: rng.normal(scale=0.3, size=leaf.shape).astype(leaf.dtype), shapes)
+
+    return make

@@ -81,12 +81,11 @@ def numpy_attention(params, windows, blocked, heads):
     return mixed @ params["projection"]["kernel"] + params["projection"]["bias"]
 
 
-def test_attention_equals_numpy_under_jit_and_vmap():
+def test_attention_equals_numpy_under_jit_and_vmap(random_variables):
     attention, blocked = WindowAttention(heads=3), shift_mask(8, 8, 4, 2)
     rng = np.random.default_rng(0)
     windows = rng.normal(size=(2 * len(blocked), 16, 12)).astype(np.float32)
-    shapes = jax.eval_shape(lambda x: attention.init(jax.random.key(0), x, blocked), windows)["params"]
-    params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), shapes)
+    params = random_variables(attention, windows)["params"]
 
     def apply(x):
         return attention.apply({"params": params}, x, blocked)

@@ -50,9 +50,9 @@ def test_output_and_gradients_agree(tag, reduction, golden, assert_parity):
         assert_parity(jnp.linalg.norm(by_name[name]), expected[f"eval_gradnorm/{name}"], name)
 
 
-def test_jit_and_vmap_agree_and_an_empty_map_has_finite_gradients():
+def test_jit_and_vmap_agree_and_an_empty_map_has_finite_gradients(random_variables):
     module, image = CBAM(reduction=16), jnp.asarray(np.random.default_rng(0).normal(size=(3, 8, 8, 6)), jnp.float32)
-    variables = module.init(jax.random.key(0), image)
+    variables = random_variables(module, image)
     assert variables["params"]["channel"]["mlp_in"]["kernel"].shape == (6, 1)
     expected = module.apply(variables, image)
     np.testing.assert_allclose(jax.jit(module.apply)(variables, image), expected, atol=1e-6)

@@ -59,10 +59,10 @@ def test_output_and_gradients_agree(gating, batch_norm, golden, assert_parity):
         assert_parity(jnp.linalg.norm(by_name[name]), expected[f"eval_gradnorm/{name}"], name)
 
 
-def test_vmap_and_order_of_locals_change_nothing():
+def test_vmap_and_order_of_locals_change_nothing(random_variables):
     module, rng = NetVLAD(clusters=4, output=8), np.random.default_rng(0)
     features = jnp.asarray(rng.normal(size=(3, 20, 6)), jnp.float32)
-    variables = module.init(jax.random.key(0), features)
+    variables = random_variables(module, features)
     expected = module.apply(variables, features)
     one_by_one = jax.vmap(module.apply, (None, 0))(variables, features[:, None])[:, 0]
     np.testing.assert_allclose(one_by_one, expected, atol=1e-6)

@@ -25,10 +25,10 @@ def test_the_map_shrinks_by_each_stride(kernels, strides, sizes):
     assert [seen[f"head_convolution{i}"].shape[1] for i in range(3)] == sizes
 
 
-def test_descriptors_have_length_one_and_do_not_depend_on_their_batch():
+def test_descriptors_have_length_one_and_do_not_depend_on_their_batch(random_variables):
     module = head((4, 3, 3), (4, 2, 2))
     features = jnp.asarray(np.random.default_rng(0).normal(size=(3, 32, 32, 6)), jnp.float32)
-    variables = jax.jit(module.init)(jax.random.key(0), features)
+    variables = random_variables(module, features)
 
     def describe(x):
         return module.apply(variables, x)[0]
@@ -40,22 +40,23 @@ def test_descriptors_have_length_one_and_do_not_depend_on_their_batch():
     np.testing.assert_allclose(one_by_one, descriptors, atol=2e-6)
 
 
-def test_a_stride_two_convolution_is_centred_on_every_second_pixel():
+def test_a_stride_two_convolution_is_centred_on_every_second_pixel(random_variables):
     """Flax's SAME would start at pixel 1 on even sizes; PyTorch's padding of 1 starts at pixel 0."""
     module = head((3, 3, 3), (2, 2, 2))
     features = jnp.asarray(np.random.default_rng(0).normal(size=(1, 8, 8, 6)), jnp.float32)
-    variables = jax.jit(module.init)(jax.random.key(0), features)
+    variables = random_variables(module, features)
     _, seen = jax.jit(module.apply)(variables, features)
-    kernel = np.asarray(variables["params"]["convolution_0"]["kernel"])
+    layer, norm = (variables["params"][name] for name in ("convolution_0", "norm_0"))
     bordered = np.pad(np.asarray(seen["cbam"])[0], ((1, 1), (1, 1), (0, 0)))
     windows = np.lib.stride_tricks.sliding_window_view(bordered, (3, 3), (0, 1))[::2, ::2]
-    expected = np.einsum("ijcyx,yxco->ijo", windows, kernel)
+    expected = np.einsum("ijcyx,yxco->ijo", windows, layer["kernel"]) + layer["bias"]
     expected = (expected - expected.mean(-1, keepdims=True)) / np.sqrt(expected.var(-1, keepdims=True) + 1e-5)
+    expected = expected * norm["scale"] + norm["bias"]
     np.testing.assert_allclose(seen["head_convolution0"][0], np.maximum(expected, 0), atol=2e-5)
 
 
-def test_an_empty_map_has_finite_gradients():
+def test_an_empty_map_has_finite_gradients(random_variables):
     module, features = head((4, 3, 3), (4, 2, 2)), jnp.zeros((2, 32, 32, 6))
-    variables = jax.jit(module.init)(jax.random.key(0), features)
+    variables = random_variables(module, features)
     loss = jax.jit(jax.grad(lambda v, x: module.apply(v, x)[0].sum(), (0, 1)))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(loss(variables, features)))

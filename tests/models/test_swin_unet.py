@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from sglpr_jax.models.swin import DropPath, SwinBlock
+from sglpr_jax.models.swin import DropPath, PatchEmbed, SwinBlock
 from sglpr_jax.models.swin_unet import SwinUnet, drop_path_rates
 
 MODEL = SwinUnet(embed_dim=8, depths=(2, 2), heads=(1, 2), window=4, drop_path=0.5)
@@ -18,8 +18,8 @@ def images():
 
 
 @pytest.fixture(scope="module")
-def variables(images):
-    return jax.jit(MODEL.init)(jax.random.key(0), images)
+def variables(random_variables, images):
+    return random_variables(MODEL, images)
 
 
 @pytest.fixture(scope="module")
@@ -62,10 +62,10 @@ def test_stochastic_depth_follows_its_key_and_is_off_outside_training(variables,
     assert np.abs(first - tokens).max() > 1e-3
 
 
-def test_both_branches_of_a_block_are_dropped_per_sample_and_independently():
+def test_both_branches_of_a_block_are_dropped_per_sample_and_independently(random_variables):
     block = SwinBlock(heads=1, window=4, shifted=False, drop_path=0.5)
     image = jnp.broadcast_to(jnp.asarray(np.random.default_rng(0).normal(size=(4, 4, 8)), jnp.float32), (64, 4, 4, 8))
-    variables = block.init(jax.random.key(0), image)
+    variables = random_variables(block, image)
     out = block.apply(variables, image, train=True, rngs={"drop_path": jax.random.key(1)})
     kinds = np.unique(np.round(np.asarray(out - image).reshape(64, -1), 4), axis=0)
     assert len(kinds) == 4  # neither branch, only the first, only the second, both
@@ -86,6 +86,16 @@ def test_drop_path_rates_rise_to_the_last_encoder_block(golden):
 def test_an_empty_image_has_finite_gradients(variables, images):
     gradients = jax.jit(jax.grad(lambda v: MODEL.apply(v, jnp.zeros_like(images))[0].var()))(variables)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_initial_weights_are_the_references(images):
+    block = SwinBlock(heads=2, window=4, shifted=True).init(jax.random.key(0), jnp.zeros((1, 8, 8, 16)))["params"]
+    kernel = PatchEmbed(channels=8).init(jax.random.key(0), images)["params"]["projection"]["kernel"]
+    np.testing.assert_allclose(np.std(block["mlp_in"]["kernel"]), 0.02, rtol=0.1)
+    np.testing.assert_allclose(np.std(block["attention"]["position_bias"]), 0.02, rtol=0.3)
+    np.testing.assert_array_equal(block["attention"]["qkv"]["bias"], 0)
+    np.testing.assert_array_equal(block["mlp_norm"]["scale"], 1)
+    assert 0.2 < np.abs(kernel).max() <= 0.25  # uniform within 1 / sqrt(16 inputs)
 
 
 def test_windows_that_do_not_tile_the_map_are_refused():
