@@ -30,12 +30,16 @@ def relative_position_index(window: int) -> Int[np.ndarray, "t t"]:
 
 
 @cache
-def shift_mask(height: int, width: int, window: int, shift: int) -> Bool[np.ndarray, "n t t"]:
+def shift_mask(
+    height: int, width: int, window: int, shift: int, *, circular: bool = False
+) -> Bool[np.ndarray, "n t t"]:
     """True where two tokens of a window may not see each other in an image rolled by `-shift`.
 
     The roll brings opposite borders together in the last windows; n = (height / window) * (width / window).
+    In a `circular` image the left and right borders really are neighbours, and nothing is blocked across them.
     """
-    regions = 3 * _strip(height, window, shift)[:, None] + _strip(width, window, shift)[None, :]
+    columns = np.zeros(width, np.int64) if circular else _strip(width, window, shift)
+    regions = 3 * _strip(height, window, shift)[:, None] + columns[None, :]
     blocks = regions.reshape(height // window, window, width // window, window)
     tokens = blocks.transpose(0, 2, 1, 3).reshape(-1, window**2)
     return tokens[:, :, None] != tokens[:, None, :]

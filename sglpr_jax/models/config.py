@@ -39,6 +39,8 @@ class ModelConfig:
     """How point counts become network input: as they are, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"
     """`circle` blanks the cells outside the largest circle, so that a rotation moves nothing in or out of view."""
+    polar: tuple[int, int] | None = None
+    """(rings, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
     patch: int = 4
     embed_dim: int = 96
     depths: tuple[int, ...] = (2, 2, 2, 2)
@@ -53,6 +55,11 @@ class ModelConfig:
         if len(self.depths) != len(self.heads):
             raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
         step = self.patch * 2 ** (len(self.depths) - 1)
-        for name, size in (("height", self.grid.height), ("width", self.grid.width)):
+        for size in self.image_size:
             if size % step:
-                raise ValueError(f"the grid's {name} must be a multiple of {step}, found {size}")
+                raise ValueError(f"the backbone's image must be a multiple of {step} cells, found {self.image_size}")
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Rows and columns of the image that the backbone sees."""
+        return self.polar or (self.grid.height, self.grid.width)

@@ -7,11 +7,12 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.bev import Grid
 from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.layers import Linear, torch_uniform
 from sglpr_jax.models.place_head import PlaceHead
+from sglpr_jax.models.polar import from_polar, to_polar
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.swin import FinalPatchExpand
 from sglpr_jax.models.swin_unet import SwinUnet
@@ -43,6 +44,8 @@ class SGLPR(nn.Module):
     @nn.compact
     def __call__(self, image: Float[Array, "b h w c"], *, segment: bool = False, train: bool = False) -> Outputs:
         config = self.config
+        if config.polar:
+            image = to_polar(image, config.grid, *config.polar)
         tokens, intermediates = SwinUnet(
             embed_dim=config.embed_dim,
             depths=config.depths,
@@ -51,34 +54,37 @@ class SGLPR(nn.Module):
             mlp_ratio=config.mlp_ratio,
             patch=config.patch,
             drop_path=config.drop_path,
+            circular=config.polar is not None,
             name="backbone",
         )(image, train=train)
         pixels = logits = None
         if segment or config.head.tap == "pixels":
             pixels = FinalPatchExpand(config.patch, name="expand")(tokens)
             intermediates["pixels"] = pixels
-        descriptor, head = PlaceHead(config.head, name="place_head")(tokens if config.head.tap == "tokens" else pixels)
+        features = tokens if config.head.tap == "tokens" else pixels
+        descriptor, head = PlaceHead(config.head, config.polar is not None, name="place_head")(features)
         if segment:
-            logits = nn.Dense(config.classes, use_bias=False, name="segmentation_head")(pixels)
+            cells = from_polar(pixels, config.grid) if config.polar else pixels
+            logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")(cells)
         return Outputs(descriptor, logits, intermediates | head)
 
 
 def prepare(bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w 1"]:
-    """Point counts as network input: rescaled as `config.counts` says, blank outside the circle if `config.field` is."""
+    """Point counts as network input: rescaled as `config.counts` says, blank where it does not see."""
     image = jnp.asarray(bev, jnp.float32)
     if config.counts == "log1p":
         image = jnp.log1p(image)
     elif config.counts == "clipped":
         image = jnp.minimum(image, CLIP_COUNT) / CLIP_COUNT
-    if config.field == "circle":
-        image = image * _circle(config.grid)[None]
-    return image[..., None]
+    return jnp.where(field_of_view(config), image, 0.0)[..., None]
 
 
-def _circle(grid: Grid) -> Float[np.ndarray, "h w"]:
+def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
+    """Which cells the network sees: all, or those inside the largest circle."""
+    grid = config.grid
     down, right = np.mgrid[: grid.height, : grid.width]
-    down, right = down - (grid.height - 1) / 2, right - (grid.width - 1) / 2
-    return (np.hypot(down, right) < min(grid.height, grid.width) / 2).astype(np.float32)
+    distance = np.hypot(down - (grid.height - 1) / 2, right - (grid.width - 1) / 2)
+    return (distance < min(grid.height, grid.width) / 2)[None] | (config.field == "square")
 
 
 def _batched(params: Params, bev: Array) -> Array:

@@ -53,7 +53,8 @@ class DropPath(nn.Module):
 class SwinBlock(nn.Module):
     """x + attention(norm(x)), then x + mlp(norm(x)); attention inside windows, shifted by half a window if asked.
 
-    An image no larger than the window is one window of its own size, and is not shifted.
+    An image no larger than the window is one window of its own size, and is not shifted. In a `circular` image the last
+    column is the first one's neighbour.
     """
 
     heads: int
@@ -61,6 +62,7 @@ class SwinBlock(nn.Module):
     shifted: bool
     mlp_ratio: int = 4
     drop_path: float = 0.0
+    circular: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> Float[Array, "b h w c"]:
@@ -80,7 +82,7 @@ class SwinBlock(nn.Module):
         if shift == 0:
             return join_windows(attention(split_windows(x, window)), h, w)
         windows = split_windows(jnp.roll(x, (-shift, -shift), (1, 2)), window)
-        mixed = attention(windows, shift_mask(h, w, window, shift))
+        mixed = attention(windows, shift_mask(h, w, window, shift, circular=self.circular))
         return jnp.roll(join_windows(mixed, h, w), (shift, shift), (1, 2))
 
 
@@ -91,13 +93,14 @@ class SwinStage(nn.Module):
     window: int
     mlp_ratio: int
     drop_paths: tuple[float, ...]
+    circular: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> list[Float[Array, "b h w c"]]:
         """The output of every block, the stage's own output last."""
         outputs = []
         for i, rate in enumerate(self.drop_paths):
-            block = SwinBlock(self.heads, self.window, i % 2 == 1, self.mlp_ratio, rate, name=f"block_{i}")
+            block = SwinBlock(self.heads, self.window, i % 2 == 1, self.mlp_ratio, rate, self.circular, name=f"block_{i}")
             x = block(x, train=train)
             outputs.append(x)
         return outputs

@@ -19,7 +19,8 @@ def drop_path_rates(depths: tuple[int, ...], rate: float) -> list[tuple[float, .
 class SwinUnet(nn.Module):
     """Image to one token per patch, before the last expansion to pixels.
 
-    Stage i has embed_dim * 2**i channels. The decoder mirrors the encoder, its depths, heads and drop path included.
+    Stage i has embed_dim * 2**i channels. The decoder mirrors the encoder, its depths, heads and drop path included. A
+    `circular` image's left and right borders are neighbours, as those of a polar image are.
     """
 
     embed_dim: int
@@ -29,6 +30,7 @@ class SwinUnet(nn.Module):
     mlp_ratio: int = 4
     patch: int = 4
     drop_path: float = 0.0
+    circular: bool = False
 
     @nn.compact
     def __call__(
@@ -36,7 +38,13 @@ class SwinUnet(nn.Module):
     ) -> tuple[Float[Array, "b h//{self.patch} w//{self.patch} {self.embed_dim}"], dict[str, Float[Array, "b _ _ _"]]]:
         """Tokens, and the intermediates by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
         stages = [
-            {"heads": heads, "window": self.window, "mlp_ratio": self.mlp_ratio, "drop_paths": rates}
+            {
+                "heads": heads,
+                "window": self.window,
+                "mlp_ratio": self.mlp_ratio,
+                "drop_paths": rates,
+                "circular": self.circular,
+            }
             for heads, rates in zip(self.heads, drop_path_rates(self.depths, self.drop_path), strict=True)
         ]
         x = PatchEmbed(self.embed_dim, self.patch, name="patch_embed")(image)

@@ -15,7 +15,7 @@ ROUTES = {
     # Out along two streets, around a block, and the two streets back: revisits in the opposite direction.
     "08": ((1, 0), (2, 0), (2, 3), (3, 3), (3, 2), (2, 2), (2, 0), (1, 0)),
 }
-"""The corners of every route as (street along y, street along x); fractions lie between streets. Scale 1: some 610 m."""
+"""The corners of every route as (street along y, street along x); 1.5 is midway between two. Scale 1: some 600 m."""
 SCANS_PER_SCALE = 300
 SPEED_MPS = 6.0
 LANE_M = 0.9

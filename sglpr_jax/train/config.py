@@ -1,27 +1,10 @@
 """Everything a training run is told, as plain values. Presets in configs/ fill it in."""
 
 import dataclasses
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from sglpr_jax.data.tuples import TupleConfig
 from sglpr_jax.models.config import ModelConfig
-
-
-@dataclasses.dataclass(frozen=True)
-class DataConfig:
-    """Which drives to train on: all of `root` but the one named by `seq`, which is tested (leave-one-out)."""
-
-    seq: str = "08"
-    root: Path | None = None
-    """A dataset's folder; none means the simulated drives."""
-    poses: Literal["auto", "semantickitti", "kitti"] = "auto"
-    train_seqs: tuple[str, ...] = ()
-    """The drives to train on; empty means all but `seq`."""
-    rotate: bool = True
-    """Turn every place about z by its own random angle at every step."""
-    max_points: int = 131072
-    """Clouds are padded to this many points; larger ones are thinned evenly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +42,6 @@ class TrainConfig:
     """One training run."""
 
     model: ModelConfig = ModelConfig()
-    data: DataConfig = DataConfig()
     sampling: TupleConfig = TupleConfig()
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
@@ -70,6 +52,10 @@ class TrainConfig:
     """Let every other tuple's places that are far enough away be negatives too."""
     chunk: int = 0
     """Images that go through the network at a time; 0 means the whole batch. It changes memory and speed, not results."""
+    rotate: bool = True
+    """Turn every place about z by its own random angle at every step."""
+    max_points: int = 131072
+    """Clouds are padded to this many points; larger ones are thinned evenly."""
     seed: int = 0
     log_every: int = 10
     score_every: int = 1000
@@ -83,10 +69,3 @@ class TrainConfig:
     def images(self) -> int:
         """Images a step."""
         return self.tuples * (1 + self.sampling.positives + self.sampling.negatives)
-
-
-def to_json(config: TrainConfig) -> dict[str, Any]:
-    """The configuration as JSON values, to be written beside every result."""
-    values = dataclasses.asdict(config)
-    values["data"]["root"] = None if config.data.root is None else str(config.data.root)
-    return values

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sglpr_jax import losses
 from sglpr_jax.data.batch import Batch, views
-from sglpr_jax.models.sglpr import Params, forward
+from sglpr_jax.models.sglpr import Params, field_of_view, forward
 from sglpr_jax.train.config import LossConfig, TrainConfig
 from sglpr_jax.train.state import TrainState, optimizer
 
@@ -128,9 +128,9 @@ def triplet_loss(
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
     """The batch as the network will see it, cut into chunks along a new leading axis."""
     images_per_chunk = config.chunk or config.images
-    turn = 2 * jnp.pi if config.data.rotate else 0.0
-    angles = jax.random.uniform(angle_key, (config.images,), maxval=turn) if turn else jnp.zeros(config.images)
+    angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) * config.rotate
     images, maps = views(batch, angles, config.model.grid)
+    maps = None if maps is None else jnp.where(field_of_view(config.model), maps, 0)
     keys = jax.random.split(model_key, config.images // images_per_chunk)
     cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), (images, maps, jnp.asarray(batch.labelled)))
     return Chunk(*cut, keys)

@@ -1,0 +1,59 @@
+"""bin/demo: the whole job in minutes: simulate, train, embed, evaluate."""
+
+import dataclasses
+import shutil
+import sys
+from pathlib import Path
+
+import tyro
+
+from sglpr_jax.cli.datasets import simulate
+from sglpr_jax.cli.embed import EmbedCommand, embed_sequence
+from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
+from sglpr_jax.cli.presets import load_preset
+from sglpr_jax.cli.runtime import run
+from sglpr_jax.cli.train import TrainCommand, train_and_test
+
+SCANS = 200
+AZIMUTH_STEPS = 450
+
+
+@dataclasses.dataclass(frozen=True)
+class DemoCommand:
+    """Train a small model on two simulated drives and find the loop closures of a third, never seen.
+
+    The third, 08, comes back to its places in the opposite direction.
+    """
+
+    out: Path = Path("runs/demo")
+    """Folder for everything; an earlier demo's run in it is replaced, its simulated drives are kept."""
+    scans: int = SCANS
+    """Scans of each drive."""
+    steps: int | None = None
+    """Training steps. None: the preset's."""
+
+
+def demo(command: DemoCommand) -> Path:
+    """Do what the command says; returns its folder."""
+    town, trained = command.out / "town", command.out / "run"
+    simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)
+    if trained.exists():
+        shutil.rmtree(trained)
+    config = load_preset("demo")
+    config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
+    train_and_test(TrainCommand(seq="08", data=town, preset="demo", out=trained, config=config))
+    print("\nthe same by hand: bin/embed, then bin/evaluate", file=sys.stderr)
+    descriptors = embed_sequence(EmbedCommand(data=town, seq="08", weights=trained, out=command.out / "08.npz"))
+    evaluate_file(EvaluateCommand(descriptors))
+    pictures = sorted([*trained.glob("test/*.png"), *(command.out / "08").glob("*.png")])
+    print("pictures:", *pictures, sep="\n  ")
+    return command.out
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: demo(tyro.cli(DemoCommand, prog="demo")))
+
+
+if __name__ == "__main__":
+    main()

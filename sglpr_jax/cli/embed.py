@@ -1,0 +1,89 @@
+"""bin/embed: write the descriptors of a sequence, or of a folder of scans."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from sglpr_jax.cli.methods import Method, network, reference
+from sglpr_jax.cli.runtime import progress_bar, run
+from sglpr_jax.data import ImageSequence, ScanSequence, open_sequence
+from sglpr_jax.data.kitti import PoseChoice
+from sglpr_jax.data.scan_files import ScanFormat
+from sglpr_jax.models.params import load
+from sglpr_jax.models.presets import model_preset
+
+
+@dataclasses.dataclass(frozen=True)
+class EmbedCommand:
+    """Write one descriptor per scan, with ids, positions and times where there are any.
+
+    Examples:
+      bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
+      bin/embed --weights runs/small-08 --data my_scans/ --out mine.npz --skip-bad
+      bin/embed --method polar-fft --data KITTI --seq 08 --out reference.npz
+    """
+
+    data: Path
+    """A dataset (KITTI's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    out: Path
+    """The descriptor file to write (.npz)."""
+    weights: Path | None = None
+    """A training run's folder, or a folder with config.json and model.safetensors."""
+    method: Literal["sglpr", "polar-fft", "thumbnail"] = "sglpr"
+    """The network, or a reference that needs no weights."""
+    seq: str | None = None
+    """Which sequence; may be left out where there is only one."""
+    poses: PoseChoice = "auto"
+    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    format: ScanFormat = "auto"
+    """What the scans of a plain folder are, where their names do not tell."""
+    rotate_seed: int | None = None
+    """Turn every scan about z by its own random angle first."""
+    skip_bad: bool = False
+    """Report scans that cannot be read and go on without them."""
+    batch: int = 16
+    """Images described at a time."""
+
+
+def embed_sequence(command: EmbedCommand) -> Path:
+    """Do what the command says; returns the file written."""
+    if not command.out.parent.is_dir():
+        raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
+    sequence = open_sequence(command.data, command.seq, poses=command.poses, format=command.format)
+    method = _method(command, sequence)
+    with progress_bar(f"embed {sequence.name}", len(sequence)) as show:
+        file = method.embed(
+            sequence,
+            rotation_seed=command.rotate_seed,
+            batch=command.batch,
+            on_bad_scan=_report if command.skip_bad else None,
+            on_progress=show,
+        )
+    file.save(command.out)
+    skipped = len(sequence) - len(file)
+    print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
+    return command.out
+
+
+def _method(command: EmbedCommand, sequence: ScanSequence | ImageSequence) -> Method:
+    if command.method != "sglpr":
+        return reference(command.method, sequence, model_preset("small").grid)
+    if command.weights is None:
+        raise ValueError("expected --weights (a training run's folder), found none")
+    return network(load(command.weights))
+
+
+def _report(scan: str, error: Exception) -> None:
+    print(f"skipped {scan}: {error}", file=sys.stderr)
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: embed_sequence(tyro.cli(EmbedCommand, prog="embed")))
+
+
+if __name__ == "__main__":
+    main()

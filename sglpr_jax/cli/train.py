@@ -1,0 +1,128 @@
+"""bin/train: train on all drives but one, then test on that one, beside references."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from sglpr_jax.cli.datasets import dataset_root, leave_one_out
+from sglpr_jax.cli.presets import load_preset, preset_names
+from sglpr_jax.cli.runtime import run, stop_on_signal
+from sglpr_jax.cli.final_test import final_test
+from sglpr_jax.cli.training_recall import training_recall
+from sglpr_jax.data.batch import read_batch
+from sglpr_jax.data.kitti import PoseChoice
+from sglpr_jax.data.tuples import TuplePool
+from sglpr_jax.models.params import save
+from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.train.loop import train
+
+CONFIG_FILE = "config.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainCommand:
+    """Train a model on all drives of a dataset but one, and test it on that one (leave-one-out).
+
+    Examples:
+      bin/train --seq 08                                  on the simulated drives, preset small
+      bin/train --seq 08 --data KITTI --preset paper
+      bin/train --seq 08 --data KITTI --resume            goes on where the run was stopped
+      bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
+    """
+
+    seq: str = "08"
+    """The drive to test on; it is never trained on."""
+    data: Path | None = None
+    """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated drives."""
+    preset: str = "small"
+    """A file of configs/ by name, or a path to one of your own."""
+    out: Path | None = None
+    """The run's folder. None: runs/PRESET-SEQ."""
+    resume: bool = False
+    """Go on from the run's newest checkpoint."""
+    train_seqs: tuple[str, ...] = ()
+    """The drives to train on. Empty: all but the one tested."""
+    poses: PoseChoice = "auto"
+    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=TrainConfig)
+
+
+def parse(arguments: list[str] | None = None) -> TrainCommand:
+    """Defaults, overridden by the preset, overridden by the flags."""
+    chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    chooser.add_argument("--preset", default=TrainCommand.preset)
+    preset = chooser.parse_known_args(arguments)[0].preset
+    default = TrainCommand(preset=preset, config=load_preset(preset))
+    return tyro.cli(TrainCommand, args=arguments, default=default, prog="train", description=_description())
+
+
+def train_and_test(command: TrainCommand) -> Path:
+    """Do what the command says; returns the run's folder."""
+    folder = command.out or Path("runs") / f"{Path(command.preset).stem}-{command.seq}"
+    root = dataset_root(command.data)
+    drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
+    config = command.config
+    _claim(folder, command, resume=command.resume)
+    pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
+
+    def make_batch(step: int):
+        frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
+        return read_batch(
+            drives, pool, frames, max_points=config.max_points, share_negatives=config.share_negatives
+        )
+
+    with stop_on_signal() as stopped:
+        score = training_recall(drives, pool, config)
+        state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)
+    save(state.params, folder / "weights")
+    if int(state.step) < config.steps:
+        Console(stderr=True).print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume")
+        sys.exit(130)
+    final_test(state.params, test, folder / "test", seed=config.seed)
+    return folder
+
+
+def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
+    """Note the effective configuration in the run's folder, or see that a resumed run has the same."""
+    path = folder / CONFIG_FILE
+    settings = json.loads(json.dumps(dataclasses.asdict(dataclasses.replace(command, out=None, resume=False)), default=str))
+    if resume:
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: expected a run to resume, found none")
+        different = sorted(_differences(json.loads(path.read_text()), settings) - {"config.steps"})
+        if different:
+            raise ValueError(f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}")
+    elif path.exists():
+        raise FileExistsError(f"{folder}: there is a run already; go on with --resume, or choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(settings, indent=2) + "\n")
+
+
+def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
+    if not (isinstance(a, dict) and isinstance(b, dict)):
+        return set() if a == b else {prefix.removesuffix(".")}
+    return {name for key in a.keys() | b.keys() for name in _differences(a.get(key), b.get(key), f"{prefix}{key}.")}
+
+
+def _positions(drive) -> np.ndarray:
+    return drive.positions
+
+
+def _description() -> str:
+    return f"{TrainCommand.__doc__}\nPresets: {', '.join(preset_names())}"
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: print(f"run: {train_and_test(parse())}"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""The losses against the PyTorch references, under chunks and masks, and where their gradients could break."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax import losses
+
+FIXTURE = Path(__file__).parent / "fixtures" / "losses.npz"
+TOLERANCE = 1e-4
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict[str, np.ndarray]:
+    with np.load(FIXTURE, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+@pytest.fixture(scope="module")
+def images(golden):
+    return images_of(golden)
+
+
+def images_of(golden, suffix=""):
+    """Logits with the classes last, as ours have them, and labels."""
+    logits = jnp.asarray(np.moveaxis(golden[f"logits{suffix}"], 1, -1))
+    return logits, jnp.asarray(golden[f"labels{suffix}"], jnp.int32)
+
+
+def assert_parity(found, expected):
+    found, expected = np.asarray(found, np.float64), np.asarray(expected, np.float64)
+    assert found.shape == expected.shape
+    assert np.abs(found - expected).max() <= TOLERANCE * np.abs(expected).max()
+
+
+def mean_cross_entropy(logits, labels):
+    return losses.cross_entropy(logits, labels).mean()
+
+
+@pytest.mark.parametrize(("name", "loss"), [("dice", losses.dice), ("ce", mean_cross_entropy)])
+def test_segmentation_losses_are_the_references(golden, images, name, loss):
+    value, gradient = jax.jit(jax.value_and_grad(loss))(*images)
+    assert_parity(value, golden[name])
+    assert_parity(np.moveaxis(gradient, -1, 1), golden[f"{name}_grad"])
+
+
+def test_dice_weights_its_classes(golden, images):
+    weights = jnp.asarray(golden["dice_weights"], jnp.float32)
+    assert_parity(losses.dice(*images, weights=weights), golden["dice_weighted"])
+
+
+def test_confident_logits_cost_nothing_although_most_classes_are_absent(golden):
+    images = images_of(golden, "_confident")
+    assert float(golden["dice_confident"]) == float(golden["ce_confident"]) == 0
+    assert abs(float(losses.dice(*images))) < 1e-6
+    assert float(mean_cross_entropy(*images)) < 1e-6
+
+
+def test_cross_entropy_is_one_number_per_image(images):
+    logits, labels = images
+    log_probability = np.asarray(logits, np.float64)
+    log_probability -= np.log(np.exp(log_probability).sum(-1, keepdims=True))
+    truth = np.asarray(labels)[..., None]
+    expected = -np.take_along_axis(log_probability, truth, -1).mean((1, 2, 3))
+    np.testing.assert_allclose(losses.cross_entropy(*images), expected, rtol=1e-5)
+    np.testing.assert_allclose(jax.vmap(losses.cross_entropy)(*images), expected, rtol=1e-5)
+
+
+def test_sums_of_chunks_give_the_dice_of_the_batch(images):
+    logits, labels = images
+    chunks = [losses.dice_sums(logits[i : i + 1], labels[i : i + 1]) for i in range(len(logits))]
+    np.testing.assert_allclose(losses.dice_from_sums(sum(chunks)), losses.dice(logits, labels), rtol=1e-6)
+    mean_of_images = np.mean([losses.dice_from_sums(sums) for sums in chunks])
+    assert abs(mean_of_images - float(losses.dice(logits, labels))) > 1e-3  # which is another loss
+
+
+def test_images_without_labels_count_for_nothing_in_dice(images):
+    logits, labels = images
+    where = jnp.array([True, False, True])
+
+    def masked(logits):
+        return losses.dice(logits, labels, where=where)
+
+    value, gradient = jax.value_and_grad(masked)(logits.at[1].set(jnp.nan))
+    np.testing.assert_allclose(value, losses.dice(logits[::2], labels[::2]), rtol=1e-6)
+    assert np.abs(gradient[1]).max() == 0
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("ignore_zero", [False, True])
+@pytest.mark.parametrize("reduction", ["sum", "max"])
+@pytest.mark.parametrize("closest", [False, True])
+def test_triplet_loss_is_the_reference(golden, closest, reduction, ignore_zero):
+    anchor, positive, negative = (jnp.asarray(golden[name]) for name in ("q", "pos", "neg"))
+    case = f"min{int(closest)}_lazy{int(reduction == 'max')}_ignore{int(ignore_zero)}"
+
+    def loss(anchor):
+        distances = [
+            losses.descriptor_distance(*jnp.broadcast_arrays(anchor, others), squared=True)
+            for others in (positive, negative)
+        ]
+        each = losses.lazy_triplet(
+            *distances, margin=float(golden["margin"]), closest_positive=closest, reduction=reduction
+        )
+        return each.sum() / (each > 1e-16).sum() if ignore_zero else each.mean()
+
+    value, gradient = jax.jit(jax.value_and_grad(loss))(anchor)
+    assert_parity(value, golden[f"triplet_{case}"])
+    assert_parity(gradient, golden[f"triplet_gq_{case}"])
+
+
+def distances(*, tuples: int = 5, negatives: int = 7):
+    rng = np.random.default_rng(0)
+    return jnp.asarray(rng.uniform(0.2, 1, (tuples, 2)), jnp.float32), jnp.asarray(
+        rng.uniform(0, 2, (tuples, negatives)), jnp.float32
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"reduction": "sum"}, {"temperature": 0.1}], ids=["max", "sum", "smooth"])
+def test_a_masked_negative_is_as_if_it_were_not_there(options):
+    positive, negative = distances()
+    where = jnp.ones(negative.shape, bool).at[:, 4:].set(False)
+    masked = losses.lazy_triplet(positive, negative, margin=0.3, where=where, **options)
+    np.testing.assert_allclose(
+        masked, losses.lazy_triplet(positive, negative[:, :4], margin=0.3, **options), rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"reduction": "sum"}, {"temperature": 0.1}], ids=["max", "sum", "smooth"])
+def test_a_tuple_without_negatives_costs_nothing_and_has_no_gradient(options):
+    positive, negative = distances()
+    where = jnp.ones(negative.shape, bool).at[2].set(False)
+
+    def loss(positive, negative):
+        return losses.lazy_triplet(positive, negative, margin=0.3, where=where, **options)
+
+    assert loss(positive, negative)[2] == 0
+    for gradient in jax.grad(lambda *pair: loss(*pair).sum(), (0, 1))(positive, negative):
+        assert np.isfinite(gradient).all()
+        assert np.abs(gradient[2]).max() == 0
+
+
+def test_the_smooth_triplet_loss_tends_to_the_lazy_one():
+    positive, negative = distances()
+    lazy = losses.lazy_triplet(positive, negative, margin=0.3)
+    gaps = [
+        float(jnp.abs(losses.lazy_triplet(positive, negative, margin=0.3, temperature=t) - lazy).max())
+        for t in (0.3, 0.03, 0.003)
+    ]
+    assert gaps[0] > 10 * gaps[2] > 0
+    # T log(1 + sum over n of exp(x / T)) lies at most T log(n + 1) above the maximum of 0 and the x.
+    assert all(gap <= t * np.log(8) + 1e-6 for gap, t in zip(gaps, (0.3, 0.03, 0.003), strict=True))
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_distance_is_numpys_and_its_gradient_is_finite_where_two_descriptors_are_equal(squared):
+    a, b = np.random.default_rng(0).normal(size=(2, 3, 8)).astype(np.float32)
+    b[1] = a[1]
+    expected = np.linalg.norm(a - b, axis=-1) ** (2 if squared else 1)
+
+    def distance(a):
+        return losses.descriptor_distance(a, jnp.asarray(b), squared=squared)
+
+    np.testing.assert_allclose(jax.jit(distance)(jnp.asarray(a)), expected, rtol=1e-6)
+    gradient = jax.grad(lambda a: distance(a).sum())(jnp.asarray(a))
+    np.testing.assert_array_equal(gradient[1], 0)
+    assert np.isfinite(gradient).all() and np.abs(gradient[0]).max() > 0
+
+
+def test_joint_loss_weighs_its_terms():
+    total = losses.joint(jnp.float32(1), jnp.float32(10), jnp.float32(100), ce_weight=0.4, dice_weight=0.6)
+    assert float(total) == pytest.approx(65)
