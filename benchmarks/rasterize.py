@@ -6,12 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from inputs import random_scans
 from ratio import Contender, Job, alternate, check_equal, report
 
 from sglpr_jax.bev import Grid, rasterize, rasterize_labels
-
-CLOUD_SPREAD = 0.29
-"""Standard deviation of x and y over the window's width, with which 84 % of the points fall inside."""
 
 
 def main(*, points: int = 120_000, size: int = 224, repeats: int = 51, calls: int = 20, threads: int = 2) -> None:
@@ -25,17 +23,15 @@ def main(*, points: int = 120_000, size: int = 224, repeats: int = 51, calls: in
         threads: threads that each program may use.
     """
     grid = Grid(height=size, width=size)
-    rng = np.random.default_rng(0)
-    cloud = rng.normal(0, CLOUD_SPREAD * size * grid.resolution_m, (points, 3)).astype(np.float32)
-    labels = rng.integers(1, 20, points, dtype=np.int32)
-
+    cloud, labels = random_scans(points, grid=grid)
     rows = []
     for name, arrays in {"rasterize": (cloud,), "rasterize_labels": (cloud, labels)}.items():
         ours = Contender("JAX", jax_job, name, arrays, grid, calls, threads=threads)
         other = Contender("numpy", numpy_job, name, arrays, grid, calls, threads=threads)
         check_equal(name, ours.run()[0], other.run()[0], tolerance=0)
         rows.append((name, *(alternate((ours, other), repeats=repeats) / calls).T))
-    report(f"{points:,} points onto {size} x {size} cells", rows, packages=("jax", "jaxlib", "numpy"), threads=threads)
+    title = f"{points:,} points onto {size} x {size} cells"
+    report(title, rows, other="numpy", packages=("jax", "numpy"), threads=threads)
 
 
 def jax_job(name: str, arrays: tuple[np.ndarray, ...], grid: Grid, calls: int) -> Job:

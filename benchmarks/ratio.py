@@ -22,6 +22,10 @@ from rich.table import Table
 
 Job = Callable[[], Any]
 
+SPREAD = (0.1, 0.9)
+BUSY_ALLOWANCE = 0.5
+"""Load average beyond the CPUs that does not matter yet."""
+
 _SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -68,6 +72,16 @@ def require_torch() -> None:
         raise SystemExit("this benchmark compares with PyTorch, which is not installed: pip install 'sglpr-jax[torch]'")
 
 
+def warn_if_busy(threads: int) -> None:
+    """Print a warning where other programs leave too few CPUs for `threads`."""
+    busy, cpus = os.getloadavg()[0], os.cpu_count() or 1
+    if busy + threads > cpus + BUSY_ALLOWANCE:
+        print(
+            f"warning: other programs keep {busy:.1f} of {cpus} CPUs busy. Two threads that share a CPU cost PyTorch's "
+            "OpenMP far more than JAX: take --threads 1, or wait"
+        )
+
+
 def check_equal(name: str, ours: np.ndarray, theirs: np.ndarray, *, tolerance: float) -> None:
     """Print the largest difference; raises SystemExit where it is above `tolerance` times the largest value."""
     difference, scale = np.abs(np.subtract(ours, theirs)).max(), np.abs(theirs).max()
@@ -85,18 +99,25 @@ def alternate(contenders: Sequence[Contender], *, repeats: int) -> np.ndarray:
     return seconds
 
 
-def report(title: str, rows: Sequence[tuple[str, np.ndarray, np.ndarray]], *, packages: Sequence[str], threads: int):
-    """Print a table of (name, seconds of ours, seconds of the other) and what is needed to repeat it."""
-    table = Table("", "other, ms", "JAX, ms", "JAX / other", "spread", title=title)
-    for name, ours, other in rows:
-        ratios = ours / other
-        low, high = np.quantile(ratios, (0.1, 0.9))
-        milliseconds = (f"{1e3 * np.median(other):.4g}", f"{1e3 * np.median(ours):.4g}")
+def report(
+    title: str,
+    rows: Sequence[tuple[str, np.ndarray, np.ndarray]],
+    *,
+    other: str,
+    packages: Sequence[str],
+    threads: int,
+) -> None:
+    """Print a table of (name, our seconds, the other's seconds), and what is needed to repeat it."""
+    table = Table("", f"{other}, ms", "JAX, ms", f"JAX / {other}", "spread", title=title)
+    for name, ours, theirs in rows:
+        ratios = ours / theirs
+        low, high = np.quantile(ratios, SPREAD)
+        milliseconds = (f"{1e3 * np.median(seconds):.4g}" for seconds in (theirs, ours))
         table.add_row(name, *milliseconds, f"{np.median(ratios):.3f}", f"{low:.3f} to {high:.3f}")
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-    tunables = os.environ.get("GLIBC_TUNABLES")
     Console().print(table)
-    print(f"Medians of {len(rows[0][1])} repeats; below 1 JAX is faster; spread: from the 10 % to the 90 % quantile.")
-    print(f"command: {shlex.join(['python', *sys.argv])}" + (f"   (GLIBC_TUNABLES={tunables})" if tunables else ""))
-    print(f"Python {platform.python_version()}, {versions}; {threads} threads each; {os.cpu_count()} CPUs, load average", end=" ")
-    print(", ".join(f"{load:.1f}" for load in os.getloadavg()))
+    print(f"Medians of {len(rows[0][1])} repeats. Below 1 JAX is faster. Spread: the 10 % and 90 % quantiles.")
+    print(f"Command: {shlex.join(['python', *sys.argv])}")
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in packages]
+    print(", ".join([f"Python {platform.python_version()}", *versions, f"{threads} threads each"]))
+    load = ", ".join(f"{average:.1f}" for average in os.getloadavg())
+    print(f"{os.cpu_count()} CPUs, load average {load}; GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")

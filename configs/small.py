@@ -14,13 +14,11 @@ from sglpr_jax.train.config import LossConfig, OptimizerConfig, TrainConfig
 CONFIG = TrainConfig(
     model=model_preset("small"),
     sampling=TupleConfig(negatives=0),  # the batch's other places are the negatives
-    loss=LossConfig(margin=0.3, squared=True, temperature=0.2),
-    optimizer=OptimizerConfig(
-        learning_rate=5e-4, warmup_steps=100, decay_rate=0.5, decay_steps=800, clip_norm=1.0
-    ),
+    loss=LossConfig(margin=0.3, squared=True, temperature=0.1),
+    optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=100, decay_rate=0.5, decay_steps=650, clip_norm=1.0),
     steps=4000,
     tuples=20,
     share_negatives=True,
     max_points=131072,
-    score_every=250,
+    score_every=500,
 )

@@ -30,9 +30,7 @@ class Grid:
                 raise ValueError(f"a grid's {name} must be a positive even number of cells, found {size}")
 
 
-def _cell_of_point(
-    points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array, "*b"] | None
-) -> Int[Array, "*b n"]:
+def _cell_of_point(points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array, "*b"] | None) -> Int[Array, "*b n"]:
     """The flat cell of every point; one past the last cell for a point that is outside, not finite or padding."""
     # A multiplication, because XLA compiles a division by a constant to one; tiny values would flush to zero there.
     scale = np.float32(1.0 / grid.resolution_m)

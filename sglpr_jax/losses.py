@@ -36,8 +36,8 @@ def lazy_triplet(
     `where` masks negatives; a tuple left with none costs nothing. `reduction="sum"` is the triplet loss that is not
     lazy: every negative inside the margin counts. `closest_positive=False` takes the farthest positive.
 
-    A `temperature` T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)), which tends to it as T goes
-    to 0. The maximum alone pulls untrained descriptors into one point, where its gradient vanishes; this does not.
+    A `temperature` T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)), which tends to it as T
+    goes to 0. The maximum alone pulls untrained descriptors into one point, where its gradient vanishes; this does not.
     """
     pull = positive.min(-1) if closest_positive else positive.max(-1)
     violation = margin + pull[..., None] - negative

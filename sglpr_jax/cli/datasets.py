@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
-from sglpr_jax.data import ImageSequence, ScanSequence, open_sequence, sequence_names
+from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.sim import write_dataset
 from sglpr_jax.sim.sensor import HDL64E, Sensor
@@ -55,7 +55,7 @@ def simulate(
 
 def leave_one_out(
     root: Path, seq: str, *, train_seqs: Many[str] = (), poses: PoseChoice = "auto"
-) -> tuple[list[ScanSequence] | list[ImageSequence], ScanSequence | ImageSequence]:
+) -> tuple[list[Drive], Drive]:
     """The drives to train on (all but `seq`, or those named) and the one to test on.
 
     Raises FileNotFoundError for a drive that does not exist, ValueError where the test drive would be trained on,

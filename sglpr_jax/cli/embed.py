@@ -9,7 +9,7 @@ import tyro
 
 from sglpr_jax.cli.methods import Method, network, reference
 from sglpr_jax.cli.runtime import progress_bar, run
-from sglpr_jax.data import ImageSequence, ScanSequence, open_sequence
+from sglpr_jax.data import Drive, open_sequence
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.scan_files import ScanFormat
 from sglpr_jax.models.params import load
@@ -68,7 +68,7 @@ def embed_sequence(command: EmbedCommand) -> Path:
     return command.out
 
 
-def _method(command: EmbedCommand, sequence: ScanSequence | ImageSequence) -> Method:
+def _method(command: EmbedCommand, sequence: Drive) -> Method:
     if command.method != "sglpr":
         return reference(command.method, sequence, model_preset("small").grid)
     if command.weights is None:

@@ -9,22 +9,22 @@ import jax
 import numpy as np
 from rich.console import Console
 
+from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.cli.methods import Method, network, reference
 from sglpr_jax.cli.runtime import progress_bar
-from sglpr_jax.data import ImageSequence, ScanSequence
+from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.report import comparison, evaluate, table, to_json
 from sglpr_jax.evaluation.segmentation import SegmentationResult, score_segmentation
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.models.sglpr import Params, field_of_view, init, segment
-from sglpr_jax.bev import rasterize, rasterize_labels
 
 ROTATION_SEED = 0
 TRAINED = "sglpr"
 
 
-def final_test(params: Params, sequence: ScanSequence | ImageSequence, folder: Path, *, seed: int) -> None:
+def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> None:
     """Embed, score, print and draw; everything that is printed is also written into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     untrained = init(jax.random.key(seed + 1), config=params.config)
@@ -49,7 +49,7 @@ def final_test(params: Params, sequence: ScanSequence | ImageSequence, folder: P
 
 def _score(
     methods: dict[str, Method],
-    sequence: ScanSequence | ImageSequence,
+    sequence: Drive,
     folder: Path,
     title: str,
     rotation_seed: int | None,
@@ -69,13 +69,12 @@ def _print(results: dict[str, list[Result]], title: str) -> None:
     console.print(comparison(results, title=title))
 
 
-def _draw(
-    results: dict[str, list[Result]], sequence: ScanSequence | ImageSequence, folder: Path, title: str
-) -> None:
+def _draw(results: dict[str, list[Result]], sequence: Drive, folder: Path, title: str) -> None:
     top1 = {name: scored[0] for name, scored in results.items()}
     curves = {name: result.curve for name, result in top1.items() if result.curve is not None}
     figures.save(
-        figures.precision_recall(curves, title=f"{sequence.name}, {title}: top-1"), folder / f"precision-recall-{title}.png"
+        figures.precision_recall(curves, title=f"{sequence.name}, {title}: top-1"),
+        folder / f"precision-recall-{title}.png",
     )
     decisions = top1[TRAINED].decisions
     if decisions is not None and sequence.positions is not None:
@@ -118,4 +117,9 @@ def _maps(params: Params, sequence: ScanSequence, row: int) -> tuple[np.ndarray,
 
 def _segmentation_json(result: SegmentationResult) -> dict:
     iou = {name: None if np.isnan(x) else float(x) for name, x in zip(CATEGORIES, result.iou, strict=True)}
-    return {**dataclasses.asdict(result), "mean_iou": result.mean_iou, "majority": CATEGORIES[result.majority], "iou": iou}
+    return {
+        **dataclasses.asdict(result),
+        "mean_iou": result.mean_iou,
+        "majority": CATEGORIES[result.majority],
+        "iou": iou,
+    }

@@ -1,4 +1,4 @@
-"""The methods a descriptor can come from, each as a function of images: the network, and references without training."""
+"""The methods a descriptor can come from, as functions of images: the network, and references without training."""
 
 import dataclasses
 import functools
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.data import ImageSequence, ScanSequence
+from sglpr_jax.data import Drive, ImageSequence
 from sglpr_jax.evaluation.baselines.polar_fft import polar_fft
 from sglpr_jax.evaluation.baselines.thumbnail import thumbnail
 from sglpr_jax.models.params import weights_hash
@@ -32,12 +32,10 @@ class Method:
     about: dict[str, Any]
     weights_hash: str = ""
 
-    def embed(self, sequence: ScanSequence | ImageSequence, **options: Any) -> DescriptorFile:
+    def embed(self, sequence: Drive, **options: Any) -> DescriptorFile:
         """Describe a whole sequence; options are those of `retrieval.embed.embed`."""
         about = {"data": sequence.name, **self.about}
-        return embed(
-            self.describe, sequence, self.grid, config=about, weights_hash=self.weights_hash, **options
-        )
+        return embed(self.describe, sequence, self.grid, config=about, weights_hash=self.weights_hash, **options)
 
 
 def network(params: Params) -> Method:
@@ -46,14 +44,12 @@ def network(params: Params) -> Method:
     return Method(functools.partial(_describe, params), params.config.grid, about, weights_hash(params))
 
 
-def reference(name: str, sequence: ScanSequence | ImageSequence, grid: Grid) -> Method:
-    """A reference without training: `polar-fft` (320 numbers) or `thumbnail` (25 x 25), on whole images or on `grid`."""
+def reference(name: str, sequence: Drive, grid: Grid) -> Method:
+    """A reference without training, on whole images or on `grid`: `polar-fft` or `thumbnail`."""
     images_are_made = isinstance(sequence, ImageSequence)
     radius = BEV_IMAGE_RADIUS if images_are_made else None
     functions: dict[str, Callable] = {"polar-fft": functools.partial(polar_fft, radius=radius), "thumbnail": thumbnail}
     if name not in functions:
         raise ValueError(f"no reference method {name!r}; there are {', '.join(functions)}")
     about = {"method": name} if images_are_made else {"method": name, "grid": dataclasses.asdict(grid)}
-    return Method(
-        lambda images: functions[name](np.asarray(images)), None if images_are_made else grid, about
-    )
+    return Method(lambda images: functions[name](np.asarray(images)), None if images_are_made else grid, about)

@@ -31,7 +31,7 @@ def run(command: Callable[[], object]) -> None:
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a flag, so that work can end where nothing is lost; the second one kills."""
+    """Turn the first Ctrl-C or SIGTERM into a flag, so that work ends where nothing is lost; the second one kills."""
     asked = False
 
     def ask(number, _frame):

@@ -12,9 +12,9 @@ import tyro
 from rich.console import Console
 
 from sglpr_jax.cli.datasets import dataset_root, leave_one_out
+from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.presets import load_preset, preset_names
 from sglpr_jax.cli.runtime import run, stop_on_signal
-from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.training_recall import training_recall
 from sglpr_jax.data.batch import read_batch
 from sglpr_jax.data.kitti import PoseChoice
@@ -74,9 +74,7 @@ def train_and_test(command: TrainCommand) -> Path:
 
     def make_batch(step: int):
         frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
-        return read_batch(
-            drives, pool, frames, max_points=config.max_points, share_negatives=config.share_negatives
-        )
+        return read_batch(drives, pool, frames, max_points=config.max_points, share_negatives=config.share_negatives)
 
     with stop_on_signal() as stopped:
         score = training_recall(drives, pool, config)
@@ -92,13 +90,17 @@ def train_and_test(command: TrainCommand) -> Path:
 def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
     """Note the effective configuration in the run's folder, or see that a resumed run has the same."""
     path = folder / CONFIG_FILE
-    settings = json.loads(json.dumps(dataclasses.asdict(dataclasses.replace(command, out=None, resume=False)), default=str))
+    settings = json.loads(
+        json.dumps(dataclasses.asdict(dataclasses.replace(command, out=None, resume=False)), default=str)
+    )
     if resume:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: expected a run to resume, found none")
         different = sorted(_differences(json.loads(path.read_text()), settings) - {"config.steps"})
         if different:
-            raise ValueError(f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}")
+            raise ValueError(
+                f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
+            )
     elif path.exists():
         raise FileExistsError(f"{folder}: there is a run already; go on with --resume, or choose another --out")
     folder.mkdir(parents=True, exist_ok=True)

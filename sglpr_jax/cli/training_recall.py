@@ -1,12 +1,13 @@
 """The score of a training run: how well it tells the places of its own drives apart."""
 
-from collections.abc import Callable, Sequence as Many
+from collections.abc import Callable
+from collections.abc import Sequence as Many
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sglpr_jax.data import ImageSequence, ScanSequence
+from sglpr_jax.data import Drive
 from sglpr_jax.data.batch import read_batch, views
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.models.sglpr import Params, describe
@@ -17,9 +18,7 @@ CHUNK = 16
 _SEED = 2**31 - 1  # no training run's, so that these are not the tuples of a step
 
 
-def training_recall(
-    drives: Many[ScanSequence] | Many[ImageSequence], pool: TuplePool, config: TrainConfig
-) -> Callable[[Params], dict[str, float]]:
+def training_recall(drives: Many[Drive], pool: TuplePool, config: TrainConfig) -> Callable[[Params], dict[str, float]]:
     """A function of weights: Recall@1 among fixed places of the training drives, each view turned by a random angle.
 
     Every place is an anchor and a positive; an anchor's nearest descriptor among all the positives should be one less

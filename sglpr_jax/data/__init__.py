@@ -5,9 +5,9 @@ from pathlib import Path
 from sglpr_jax.data import bev_images, folder, kitti
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.scan_files import ScanFormat, read_scan
-from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 
-__all__ = ["ImageSequence", "ScanSequence", "open_sequence", "read_scan", "sequence_names"]
+__all__ = ["Drive", "ImageSequence", "ScanSequence", "open_sequence", "read_scan", "sequence_names"]
 
 
 def sequence_names(root: Path) -> tuple[str, ...]:
@@ -28,7 +28,7 @@ def sequence_names(root: Path) -> tuple[str, ...]:
 
 def open_sequence(
     root: Path, name: str | None = None, *, poses: PoseChoice = "auto", format: ScanFormat = "auto"
-) -> ScanSequence | ImageSequence:
+) -> Drive:
     """Open one sequence of `root`, which may have any of the layouts of `sequence_names`.
 
     Without `name`, `root` must have one sequence. `poses` chooses between the two pose files of KITTI's layout and is

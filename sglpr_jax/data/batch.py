@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
-from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.labels import to_classes
 
@@ -33,7 +33,7 @@ class Batch:
 
 
 def read_batch(
-    drives: Many[ScanSequence] | Many[ImageSequence],
+    drives: Many[Drive],
     pool: TuplePool,
     frames: Int[np.ndarray, "t k"],
     *,
@@ -46,12 +46,12 @@ def read_batch(
     of its own tuple. Clouds of more than `max_points` points are thinned evenly.
     """
     flat = frames.reshape(-1)
-    places = [(drives[pool.drive[f]], int(pool.frame[f])) for f in flat]
+    places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in flat]
     far = pool.far_apart(frames[:, :1], flat[None, :])
     if not share_negatives:
         far &= _own_negatives(frames.shape, positives=pool.config.positives)
     if isinstance(drives[0], ImageSequence):
-        images = np.stack([drive.image(frame) for drive, frame in places])
+        images = np.stack([_read_image(*place) for place in places])
         return Batch(np.zeros(len(flat), bool), far, pool.config.positives, images=images)
     points, count, classes, labelled = _padded([_read_scan(*place) for place in places], max_points)
     has_labels = any(drive.has_labels for drive in drives)
@@ -82,7 +82,15 @@ def _own_negatives(shape: tuple[int, int], *, positives: int) -> Bool[np.ndarray
     return np.kron(np.eye(tuples, dtype=bool), is_negative)
 
 
-def _read_scan(drive: ScanSequence, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+def _read_image(drive: Drive, frame: int) -> np.ndarray:
+    if not isinstance(drive, ImageSequence):
+        raise ValueError(f"expected all drives of a batch to be images, found scans in {drive.name}")
+    return drive.image(frame)
+
+
+def _read_scan(drive: Drive, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+    if not isinstance(drive, ScanSequence):
+        raise ValueError(f"expected all drives of a batch to be scans, found images in {drive.name}")
     labels = drive.labels(frame)
     return drive.points(frame), None if labels is None else to_classes(labels)
 

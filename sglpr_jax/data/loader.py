@@ -2,13 +2,13 @@
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import TypeVar
 
 T = TypeVar("T")
 
 
-def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 2) -> Iterator[T]:
+def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 2) -> Generator[T, None, None]:
     """Yield make(start), ..., make(stop - 1) in order, up to `depth` of them made ahead by a thread.
 
     An exception of `make` is raised here, at its turn. Closing the iterator ends the thread.

@@ -75,3 +75,7 @@ class ImageSequence:
     def image(self, i: int) -> Float32[np.ndarray, "h w"]:
         """Read image `i` in the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
         return self.read_image(self.image_paths[i])
+
+
+Drive = ScanSequence | ImageSequence
+"""What a reader returns; the drives of one dataset are all of one kind."""

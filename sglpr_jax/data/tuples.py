@@ -29,7 +29,7 @@ class Positives:
     """For every frame of the pool its positives, as slices of one flat array."""
 
     frames: Int[np.ndarray, "pairs"]
-    starts: Int[np.ndarray, "frames+1"]
+    starts: Int[np.ndarray, "bounds"]
 
     @property
     def anchors(self) -> Int[np.ndarray, "anchors"]:
@@ -59,28 +59,26 @@ class TuplePool:
             raise ValueError(f"no two frames lie within {config.positive_m} m of each other: nothing can be a positive")
 
     def draw(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
-        """The pool's frame numbers of one batch, (anchor, positives, negatives) a row: a pure function of its arguments."""
+        """The pool's frame numbers of one batch, (anchor, positives, negatives) a row. A pure function.
+
+        Raises ValueError for an anchor that has no negatives.
+        """
         rng = np.random.default_rng([seed, step])
         anchored = [self._draw_anchored(rng) for _ in range(tuples)]
-        negatives = self._draw_negatives(rng, np.array([row[0] for row in anchored]))
-        return np.concatenate([np.array(anchored), negatives], axis=1)
+        return np.array([[*row, *self._draw_negatives(rng, row[0])] for row in anchored])
 
     def _draw_anchored(self, rng: np.random.Generator) -> list[int]:
         other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
         source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
         anchor = int(rng.choice(source.anchors))
-        return [anchor, *source.draw(rng, anchor, self.config.positives)]
+        return [anchor, *source.draw(rng, anchor, self.config.positives).tolist()]
 
-    def _draw_negatives(
-        self, rng: np.random.Generator, anchors: Int[np.ndarray, "t"]
-    ) -> Int[np.ndarray, "t {self.config.negatives}"]:
-        drawn = rng.integers(len(self.drive), size=(len(anchors), self.config.negatives))
-        for _ in range(100):
-            wrong = ~self.far_apart(anchors[:, None], drawn)
-            if not wrong.any():
-                return drawn
-            drawn[wrong] = rng.integers(len(self.drive), size=int(wrong.sum()))
-        raise ValueError(f"found no negatives farther than {self.config.negative_m} m: the drives are too short")
+    def _draw_negatives(self, rng: np.random.Generator, anchor: int) -> Int[np.ndarray, "{self.config.negatives}"]:
+        choices = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self.drive))))
+        size = self.config.negatives
+        if size and not len(choices):
+            raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
+        return rng.choice(choices, size, replace=len(choices) < size)
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
         """Whether two frames are certainly other places: of other drives, or beyond the negative distance."""

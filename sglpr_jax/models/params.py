@@ -1,4 +1,4 @@
-"""Weights on disk: a folder with config.json and model.safetensors, so that weights never travel without their model."""
+"""Weights on disk: a folder with config.json and model.safetensors, so that they never travel without their model."""
 
 import dataclasses
 import hashlib
@@ -23,16 +23,18 @@ WEIGHTS_FILE = "model.safetensors"
 
 
 def save(params: Params, folder: Path | str) -> Path:
-    """Write the weights and their configuration; a reader never sees one file without the other's content."""
+    """Write weights and configuration under a temporary name, then put them in the place of `folder`."""
     folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     flat = {name: np.asarray(leaf) for name, leaf in _flatten(params.weights).items()}
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
-        safetensors.numpy.save_file(flat, Path(scratch) / WEIGHTS_FILE)
-        (Path(scratch) / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
-        folder.mkdir(exist_ok=True)
-        for name in (WEIGHTS_FILE, CONFIG_FILE):
-            os.replace(Path(scratch) / name, folder / name)
+        new, old = Path(scratch) / "new", Path(scratch) / "old"
+        new.mkdir()
+        safetensors.numpy.save_file(flat, new / WEIGHTS_FILE)
+        (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(new, folder)
     return folder
 
 
@@ -47,7 +49,9 @@ def load(folder: Path | str) -> Params:
         folder = folder / "weights"
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
-            raise FileNotFoundError(f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing")
+            raise FileNotFoundError(
+                f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing"
+            )
     config = config_from_dict(_read_json(folder / CONFIG_FILE), source=folder / CONFIG_FILE)
     try:
         flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)

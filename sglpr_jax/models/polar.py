@@ -48,4 +48,3 @@ def _sample(image: Float[Array, "b h w c"], row: np.ndarray, column: np.ndarray)
 
     summed = sum(corner(dy, dx) for dy in (0, 1) for dx in (0, 1))
     return jnp.reshape(summed, (len(image), *row.shape, -1))
-

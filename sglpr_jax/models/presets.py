@@ -7,6 +7,18 @@ from sglpr_jax.models.config import HeadConfig, ModelConfig
 
 _HEAD_B = HeadConfig(tap="pixels", channels=(128, 256, 512), kernels=(4, 3, 3), strides=(4, 2, 2))
 _PAPER = ModelConfig()
+_SMALL = ModelConfig(
+    grid=Grid(resolution_m=0.4, height=128, width=128),
+    field="circle",
+    polar=(64, 256),
+    patch=8,
+    embed_dim=64,
+    depths=(2, 2, 2),
+    heads=(2, 4, 8),
+    window=4,
+    drop_path=0.0,
+    head=HeadConfig(tap="tokens", channels=(64, 128, 256), kernels=(3, 3, 3), strides=(1, 1, 2)),
+)
 
 MODELS: dict[str, ModelConfig] = {
     # The paper's model, its head read literally: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
@@ -16,15 +28,9 @@ MODELS: dict[str, ModelConfig] = {
     # The paper says "projection radius 11.2 m", which its own eq. 1 gives only with cells of 0.1 m.
     "paper-11m": dataclasses.replace(_PAPER, grid=Grid(resolution_m=0.1)),
     # Trains on two CPU cores within the hour; its window is that of the ready-made KITTI images (+-25.6 m).
-    "small": ModelConfig(
-        grid=Grid(resolution_m=0.4, height=128, width=128),
-        field="circle",
-        embed_dim=32,
-        heads=(1, 2, 4, 8),
-        window=4,
-        drop_path=0.0,
-        head=HeadConfig(tap="pixels", channels=(64, 128, 256), kernels=(4, 3, 3), strides=(4, 2, 2)),
-    ),
+    "small": _SMALL,
+    # Smaller still, for bin/demo.
+    "demo": dataclasses.replace(_SMALL, embed_dim=32, heads=(1, 2, 4)),
     # For tests: every part of the model, next to no arithmetic.
     "tiny": ModelConfig(
         grid=Grid(resolution_m=1.6, height=32, width=32),

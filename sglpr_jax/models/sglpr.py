@@ -32,7 +32,7 @@ class Outputs(NamedTuple):
     """What one pass gives: descriptors (b, 256), logits (b, h, w, classes) if asked for, and every named map."""
 
     descriptor: Array
-    logits: Array | None
+    logits: Any
     intermediates: dict[str, Array]
 
 
@@ -57,14 +57,15 @@ class SGLPR(nn.Module):
             circular=config.polar is not None,
             name="backbone",
         )(image, train=train)
-        pixels = logits = None
+        pixels: Any = None
+        logits = None  # both made only where something reads them
         if segment or config.head.tap == "pixels":
             pixels = FinalPatchExpand(config.patch, name="expand")(tokens)
             intermediates["pixels"] = pixels
-        features = tokens if config.head.tap == "tokens" else pixels
+        features: Any = tokens if config.head.tap == "tokens" else pixels
         descriptor, head = PlaceHead(config.head, config.polar is not None, name="place_head")(features)
         if segment:
-            cells = from_polar(pixels, config.grid) if config.polar else pixels
+            cells: Any = from_polar(pixels, config.grid) if config.polar else pixels
             logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")(cells)
         return Outputs(descriptor, logits, intermediates | head)
 
@@ -87,13 +88,6 @@ def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
     return (distance < min(grid.height, grid.width) / 2)[None] | (config.field == "square")
 
 
-def _batched(params: Params, bev: Array) -> Array:
-    grid = params.config.grid
-    if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
-        raise ValueError(f"expected images of {grid.height} x {grid.width} cells as [..., H, W], found shape {bev.shape}")
-    return prepare(bev.reshape(-1, grid.height, grid.width), params.config)
-
-
 def describe(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b d"]:
     """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
 
@@ -101,25 +95,35 @@ def describe(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"])
     two descriptors is the dissimilarity of their places (equation 2). Raises ValueError for images of another size
     than `params.config.grid`.
     """
-    outputs = SGLPR(params.config).apply({"params": params.weights}, _batched(params, bev))
-    return outputs.descriptor.reshape(*bev.shape[:-2], -1)
+    return forward(params, bev, segment=False).descriptor.reshape(*bev.shape[:-2], -1)
 
 
 def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
     """The semantic logits of each image, from the head that training uses."""
-    outputs = SGLPR(params.config).apply({"params": params.weights}, _batched(params, bev), segment=True)
-    return outputs.logits.reshape(*bev.shape, -1)
+    return forward(params, bev).logits.reshape(*bev.shape, -1)
 
 
-def forward(params: Params, bev: Array, *, key: Array | None = None, segment: bool = True) -> Outputs:
-    """Everything at once, for training and pictures: (b, h, w) counts in, descriptors, logits and named maps out.
+def forward(
+    params: Params,
+    bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
+    *,
+    key: Array | None = None,
+    segment: bool = True,
+) -> Outputs:
+    """Everything at once, for training and pictures: descriptors, logits and named maps, leading axes made one.
 
-    With a `key` it is the training pass, in which stochastic depth drops residual branches.
+    With a `key` it is the training pass, in which stochastic depth drops residual branches. Without `segment` the
+    segmentation head does not exist. Raises ValueError for images of another size than `params.config.grid`.
     """
-    rngs = None if key is None else {"drop_path": key}
-    return SGLPR(params.config).apply(
-        {"params": params.weights}, _batched(params, bev), segment=segment, train=key is not None, rngs=rngs
+    grid = params.config.grid
+    if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
+        raise ValueError(f"expected images [..., H, W] of {grid.height} x {grid.width} cells, found shape {bev.shape}")
+    image = prepare(bev.reshape(-1, grid.height, grid.width), params.config)
+    train, rngs = key is not None, None if key is None else {"drop_path": key}
+    outputs: Any = SGLPR(params.config).apply(
+        {"params": params.weights}, image, segment=segment, train=train, rngs=rngs
     )
+    return outputs
 
 
 def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None) -> Params:

@@ -100,7 +100,9 @@ class SwinStage(nn.Module):
         """The output of every block, the stage's own output last."""
         outputs = []
         for i, rate in enumerate(self.drop_paths):
-            block = SwinBlock(self.heads, self.window, i % 2 == 1, self.mlp_ratio, rate, self.circular, name=f"block_{i}")
+            block = SwinBlock(
+                self.heads, self.window, i % 2 == 1, self.mlp_ratio, rate, self.circular, name=f"block_{i}"
+            )
             x = block(x, train=train)
             outputs.append(x)
         return outputs

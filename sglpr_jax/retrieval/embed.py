@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sglpr_jax.bev import Grid, centre_crop, rasterize, rotate_image, rotate_points
-from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data.sequence import Drive, ImageSequence
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 DescribeFn = Callable[[Float[Array, "b h w"]], Float[Any, "b d"]]
@@ -21,7 +21,7 @@ _POINTS_STEP = 16384
 
 def embed(
     describe: DescribeFn,
-    sequence: ScanSequence | ImageSequence,
+    sequence: Drive,
     grid: Grid | None,
     *,
     config: dict[str, Any],
@@ -68,7 +68,7 @@ def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
 
 
 def _images(
-    sequence: ScanSequence | ImageSequence,
+    sequence: Drive,
     grid: Grid | None,
     angles: Float[np.ndarray, " n"] | None,
     on_bad_scan: Callable[[str, Exception], None] | None,
@@ -85,7 +85,7 @@ def _images(
 
 
 def read_image(
-    sequence: ScanSequence | ImageSequence, row: int, grid: Grid | None, *, angle: Float[Array, ""] | None = None
+    sequence: Drive, row: int, grid: Grid | None, *, angle: Float[Array, ""] | None = None
 ) -> Float[Array, "h w"]:
     """The image of one scan, turned by `angle` radians if given. Raises ValueError where scans come without a grid."""
     if isinstance(sequence, ImageSequence):

@@ -1,6 +1,7 @@
 """Checkpoints of a training run: atomic, the newest and the best kept. The one file that knows orbax."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
@@ -45,9 +46,11 @@ class Checkpoints:
             weights=ocp.args.StandardRestore(like.params.weights), optimizer=ocp.args.StandardRestore(like.optimizer)
         )
         try:
-            found = self._manager.restore(step, args=items)
+            found: Any = self._manager.restore(step, args=items)
         except ValueError as error:
-            raise ValueError(f"{self._manager.directory}/{step}: not a checkpoint of this configuration: {error}") from error
+            raise ValueError(
+                f"{self._manager.directory}/{step}: not a checkpoint of this configuration: {error}"
+            ) from error
         return TrainState(jax.numpy.asarray(step, "int32"), Params(found.weights, config.model), found.optimizer)
 
     def close(self) -> None:

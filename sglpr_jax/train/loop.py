@@ -48,7 +48,7 @@ def train(
     try:
         with _progress() as progress:
             bar = progress.add_task("train", total=config.steps, completed=start, terms="")
-            for state, measured in _steps(config, state, batches, stopped):
+            for state, measured in _steps(config, state, batches, stopped):  # noqa: B020 - state in, state out
                 progress.update(bar, completed=int(state.step), terms=_terms(measured))
                 log.append(int(state.step), measured)
                 if int(state.step) % config.score_every == 0 or int(state.step) == config.steps:
@@ -67,16 +67,16 @@ def _steps(
     config: TrainConfig, state: TrainState, batches: Iterator[Batch], stopped: Callable[[], bool]
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps."""
-    since, measured, waited = time.perf_counter(), [], 0.0
-    while int(state.step) < config.steps and not stopped():
+    since, measured, waited, stop = time.perf_counter(), [], 0.0, False
+    while int(state.step) < config.steps and not stop:
         asked = time.perf_counter()
         batch = next(batches)
         waited += time.perf_counter() - asked
         state, metrics = train_step(state, batch, config=config)
         measured.append(jax.device_get(metrics))
-        step = int(state.step)
+        step, stop = int(state.step), stopped()
         _require_finite(measured[-1], step)
-        if step % config.log_every == 0 or step % config.score_every == 0 or step == config.steps or stopped():
+        if step % config.log_every == 0 or step % config.score_every == 0 or step == config.steps or stop:
             seconds = time.perf_counter() - since
             means = {name: float(np.mean([m[name] for m in measured])) for name in metrics}
             yield state, means | {"steps_per_second": len(measured) / seconds, "data_wait": waited / seconds}

@@ -5,6 +5,7 @@ chunks therefore goes through the network twice: once forward for what the losse
 chunk), then, with the losses' gradients at those, forward and backward. Activations of one chunk are alive at a time.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -52,7 +53,7 @@ def train_step(state: TrainState, batch: Batch, *, config: TrainConfig) -> tuple
     weights = optax.apply_updates(state.params.weights, updates)
     norms = {"gradient_norm": gradient, "update_norm": updates, "weight_norm": weights}
     metrics |= {name: optax.tree.norm(tree) for name, tree in norms.items()}
-    return TrainState(state.step + 1, state.params.replace(weights=weights), optimizer_state), metrics
+    return TrainState(state.step + 1, dataclasses.replace(state.params, weights=weights), optimizer_state), metrics
 
 
 def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -> tuple[Any, Metrics]:
@@ -62,7 +63,7 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
     """
 
     def summary(weights, chunk: Chunk) -> Summary:
-        return summarize(params.replace(weights=weights), chunk)
+        return summarize(dataclasses.replace(params, weights=weights), chunk)
 
     def loss(summaries: Summary):
         return joint_loss(_merge(summaries), batch, config)
@@ -132,8 +133,9 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     images, maps = views(batch, angles, config.model.grid)
     maps = None if maps is None else jnp.where(field_of_view(config.model), maps, 0)
     keys = jax.random.split(model_key, config.images // images_per_chunk)
-    cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), (images, maps, jnp.asarray(batch.labelled)))
-    return Chunk(*cut, keys)
+    whole = (images, maps, jnp.asarray(batch.labelled))
+    cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), whole)
+    return Chunk(*cut, key=keys)
 
 
 def _merge(summaries: Summary) -> Summary:

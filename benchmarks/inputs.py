@@ -1,0 +1,44 @@
+"""What the benchmarks run on: the model of a preset, random weights, random scans."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.sglpr import Params, init
+
+CLOUD_SPREAD = 0.29
+"""Standard deviation of x and y as a part of the window's width: 84 % of the points fall inside."""
+
+WEIGHT_NOISE = 0.01
+"""Added to initial weights, of which many are 0 or 1 and would hide that one stands in another's place."""
+
+
+def comparable_model(preset: str) -> ModelConfig:
+    """The preset's model, less what is not the same arithmetic in both frameworks.
+
+    A polar model is left without its resampling and circular borders: the image comes in the size of the polar one.
+    Stochastic depth, which is random, is off.
+    """
+    config = model_preset(preset)
+    height, width = config.image_size
+    grid = Grid(config.grid.resolution_m, height, width)
+    return dataclasses.replace(config, grid=grid, field="square", polar=None, drop_path=0.0)
+
+
+def random_params(config: ModelConfig) -> Params:
+    """Weights as numpy arrays, none of them at a value that many others have."""
+    rng = np.random.default_rng(0)
+    params = jax.device_get(init(jax.random.key(0), config=config))
+    return jax.tree.map(lambda w: w + WEIGHT_NOISE * rng.standard_normal(w.shape, np.float32), params)
+
+
+def random_scans(*shape: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Clouds (*shape, 3), denser near the sensor, and the class of each point (*shape)."""
+    rng = np.random.default_rng(0)
+    spread = CLOUD_SPREAD * grid.resolution_m * np.array([grid.width, grid.height, 0.0]) + [0, 0, 1]
+    points = spread * rng.standard_normal((*shape, 3))
+    return points.astype(np.float32), rng.integers(1, 20, shape, dtype=np.int32)

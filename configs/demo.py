@@ -1,0 +1,23 @@
+"""What bin/demo trains: the small model made smaller, on two simulated drives with labels, in minutes.
+
+Expect: see docs/results.md.
+Command: bin/demo
+"""
+
+import dataclasses
+
+from sglpr_jax.cli.presets import load_preset
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.train.config import OptimizerConfig
+
+_SMALL = load_preset("small")
+
+CONFIG = dataclasses.replace(
+    _SMALL,
+    model=model_preset("demo"),
+    optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=20, decay_rate=0.5, decay_steps=80, clip_norm=1.0),
+    steps=300,
+    tuples=8,
+    max_points=32768,
+    score_every=100,
+)

@@ -1,0 +1,167 @@
+"""A batch holds what the files say, and its views are what equation 1 makes of the turned points."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image
+from sglpr_jax.data.batch import read_batch, views
+from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data.tuples import TupleConfig, TuplePool
+from sglpr_jax.labels import to_classes
+
+GRID = Grid(resolution_m=1.0, height=16, width=16)
+RAW_LABELS = np.array([40, 10, 70, 252, 0], np.uint32)
+STEP_M = 2.0
+SIZES = (6, 9, 3, 9, 5, 8, 9, 4, 9, 7, 9, 9, 9, 9, 9, 9)
+
+
+def clouds(seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(-9, 9, (n, 3)).astype(np.float32) for n in SIZES]
+
+
+def positions() -> np.ndarray:
+    """A straight drive with 2 m between frames, so that only the next frame is a positive."""
+    return np.column_stack([np.arange(len(SIZES)) * STEP_M, np.zeros((len(SIZES), 2))])
+
+
+def labels_of(cloud: np.ndarray) -> np.ndarray:
+    return RAW_LABELS[np.arange(len(cloud)) % len(RAW_LABELS)]
+
+
+def scan_sequence(folder: Path, scans: list[np.ndarray], *, labelled: bool) -> ScanSequence:
+    """A drive with scans in memory and label files on disk."""
+    folder.mkdir()
+    by_path = {folder / f"{i:06d}.bin": cloud for i, cloud in enumerate(scans)}
+    label_paths = tuple(path.with_suffix(".label") if labelled else None for path in by_path)
+    for path, cloud in zip(label_paths, scans, strict=True):
+        if path is not None:
+            labels_of(cloud).tofile(path)
+    return ScanSequence(
+        name=folder.name,
+        ids=tuple(path.stem for path in by_path),
+        positions=positions(),
+        times=None,
+        pose_source=None,
+        scan_paths=tuple(by_path),
+        label_paths=label_paths,
+        read_scan=by_path.__getitem__,
+    )
+
+
+@pytest.fixture
+def drives(tmp_path) -> list[ScanSequence]:
+    """A drive with labels and one without."""
+    return [
+        scan_sequence(tmp_path / name, clouds(seed), labelled=labelled)
+        for seed, (name, labelled) in enumerate([("00", True), ("05", False)])
+    ]
+
+
+@pytest.fixture
+def pool(drives) -> TuplePool:
+    return TuplePool([drive.positions for drive in drives], TupleConfig(positives=1, negatives=2))
+
+
+FRAMES = np.array([[0, 1, 12, 20], [18, 17, 5, 31]])
+
+
+def read(drives, pool, frames=FRAMES, *, max_points=9, share_negatives=False):
+    return read_batch(drives, pool, frames, max_points=max_points, share_negatives=share_negatives)
+
+
+def test_clouds_are_padded_and_say_how_many_points_count(drives, pool):
+    batch = read(drives, pool, max_points=12)
+    every = clouds(0) + clouds(1)
+    assert batch.points.shape == (8, 12, 3) and batch.images is None
+    for row, frame in enumerate(FRAMES.reshape(-1)):
+        n = len(every[frame])
+        assert batch.count[row] == n
+        np.testing.assert_array_equal(batch.points[row, :n], every[frame])
+        np.testing.assert_array_equal(batch.points[row, n:], 0)
+        expected = to_classes(labels_of(every[frame]).astype(np.int32)) if frame < len(SIZES) else 0
+        np.testing.assert_array_equal(batch.classes[row, :n], expected)
+    np.testing.assert_array_equal(batch.labelled, FRAMES.reshape(-1) < len(SIZES))
+
+
+def test_large_clouds_are_thinned_evenly_with_their_labels(drives, pool):
+    batch = read(drives, pool, max_points=5)
+    np.testing.assert_array_equal(batch.count, [min(n, 5) for n in np.tile(SIZES, 2)[FRAMES.reshape(-1)]])
+    kept = [0, 2, 4, 6, 8]  # of the nine points of frame 1
+    np.testing.assert_array_equal(batch.points[1], clouds(0)[1][kept])
+    np.testing.assert_array_equal(batch.classes[1], to_classes(labels_of(clouds(0)[1]).astype(np.int32))[kept])
+
+
+def test_without_any_labels_there_are_no_classes(drives, pool, tmp_path):
+    bare = [scan_sequence(tmp_path / name, clouds(0), labelled=False) for name in ("06", "07")]
+    batch = read(bare, pool)
+    assert batch.classes is None
+    assert not batch.labelled.any()
+    assert views(batch, jnp.zeros(8), GRID)[1] is None
+
+
+@pytest.mark.parametrize("share_negatives", [False, True])
+def test_the_negatives_of_each_anchor_are_those_of_brute_force(drives, pool, share_negatives):
+    frames = np.array([[0, 1, 12, 5], [3, 4, 15, 31], [18, 17, 5, 30]])  # frame 5 is too near to the first anchor
+    batch = read(drives, pool, frames, share_negatives=share_negatives)
+    expected = np.zeros((3, 12), bool)
+    every = np.concatenate([positions(), positions()])
+    for t, anchor in enumerate(frames[:, 0]):
+        for place, frame in enumerate(frames.reshape(-1)):
+            other_drive = (anchor < len(SIZES)) != (frame < len(SIZES))
+            far = other_drive or np.linalg.norm(every[anchor] - every[frame]) > 20
+            own = place // 4 == t and place % 4 >= 2
+            expected[t, place] = far and (own or share_negatives)
+    np.testing.assert_array_equal(batch.far, expected)
+    assert batch.far.sum() == (21 if share_negatives else 5)
+    assert batch.positives == 1
+
+
+def test_views_are_the_rasterised_turned_points(drives, pool):
+    batch = read(drives, pool)
+    angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 8).astype(np.float32)
+    images, maps = jax.jit(views, static_argnames="grid")(batch, jnp.asarray(angles), grid=GRID)
+    assert images.dtype == jnp.float32
+    every = clouds(0) + clouds(1)
+    for row, frame in enumerate(FRAMES.reshape(-1)):
+        x, y, z = every[frame].T
+        cos, sin = np.cos(angles[row]), np.sin(angles[row])
+        turned = jnp.asarray(np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1))
+        classes = jnp.asarray(to_classes(labels_of(every[frame]).astype(np.int32)) * (frame < len(SIZES)))
+        np.testing.assert_array_equal(images[row], rasterize(turned, grid=GRID))
+        np.testing.assert_array_equal(maps[row], rasterize_labels(turned, classes, grid=GRID))
+    assert images.sum() > 0 and maps.sum() > 0
+
+
+def test_images_are_turned_whole_and_then_cropped():
+    pictures = np.random.default_rng(0).uniform(0, 10, (len(SIZES), 20, 20)).astype(np.float32)
+    paths = tuple(Path(f"{i:06d}.png") for i in range(len(SIZES)))
+    drive = ImageSequence(
+        name="06",
+        ids=tuple(path.stem for path in paths),
+        positions=positions(),
+        times=None,
+        pose_source=None,
+        image_paths=paths,
+        resolution_m=1.0,
+        read_image=lambda path: pictures[int(path.stem)],
+    )
+    frames = np.array([[0, 1, 12, 13]])
+    pool = TuplePool([positions()], TupleConfig(negatives=2))
+    batch = read([drive], pool, frames)
+    assert batch.points is None and not batch.labelled.any()
+    np.testing.assert_array_equal(batch.images, pictures[frames[0]])
+
+    still, maps = views(batch, jnp.zeros(4), GRID)
+    assert maps is None
+    np.testing.assert_allclose(still, pictures[frames[0], 2:18, 2:18], atol=1e-5)
+    quarter, _ = views(batch, jnp.full(4, np.pi / 2), GRID)
+    np.testing.assert_allclose(quarter, np.rot90(pictures[frames[0], 2:18, 2:18], axes=(1, 2)), atol=1e-4)
+    # A cell that a turn brings into the crop from outside it comes from the whole image, not from zero.
+    turned, _ = views(batch, jnp.full(4, 0.7), GRID)
+    whole = rotate_image(jnp.asarray(batch.images), jnp.full(4, 0.7))
+    np.testing.assert_allclose(turned, whole[:, 2:18, 2:18], atol=1e-5)
