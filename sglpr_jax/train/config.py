@@ -51,7 +51,8 @@ class TrainConfig:
     share_negatives: bool = False
     """Let every other tuple's places that are far enough away be negatives too."""
     chunk: int = 0
-    """Images that go through the network at a time (0: all). It changes memory and speed, not results."""
+    """Images that go through the network at a time (0: all). It changes memory and speed; of the results only which
+    branches stochastic depth drops."""
     rotate: bool = True
     """Turn every place about z by its own random angle at every step."""
     max_points: int = 131072

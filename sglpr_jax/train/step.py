@@ -114,16 +114,17 @@ def triplet_loss(
     positives = grouped[:, 1 : 1 + batch.positives]
     to_positives = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, positives), squared=config.squared)
     to_all = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
-    loss = losses.lazy_triplet(
+    terms = functools.partial(
+        losses.lazy_triplet,
         to_positives,
         to_all,
         margin=config.margin,
         closest_positive=config.closest_positive,
         reduction=config.reduction,
-        temperature=config.temperature,
         where=batch.far,
     )
-    return loss.mean(), {"triplet": loss.mean(), "violations": (loss > 0).mean()}
+    loss = terms(temperature=config.temperature).mean()
+    return loss, {"triplet": loss, "violations": (terms() > 0).mean()}  # the smooth loss never is zero
 
 
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:

@@ -1,0 +1,64 @@
+"""A tiny model with random weights, and batches for it made in memory."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.data.batch import Batch
+from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.sglpr import SGLPR, Params
+from sglpr_jax.train.config import OptimizerConfig, TrainConfig
+
+POINTS = 200
+
+
+@pytest.fixture(scope="session")
+def config() -> TrainConfig:
+    """Two tuples of four places, the whole batch at once, no stochastic depth."""
+    return TrainConfig(
+        model=dataclasses.replace(model_preset("tiny"), drop_path=0.0),
+        sampling=TupleConfig(positives=1, negatives=2),
+        optimizer=OptimizerConfig(learning_rate=1e-3),
+        steps=6,
+        tuples=2,
+        max_points=POINTS,
+        log_every=1,
+        score_every=2,
+    )
+
+
+@pytest.fixture(scope="session")
+def params(config) -> Params:
+    """Random weights; made by numpy, for compiling `init` takes seconds."""
+    rng = np.random.default_rng(0)
+    image = jnp.zeros((1, config.model.grid.height, config.model.grid.width, 1))
+    shapes = jax.eval_shape(lambda key: SGLPR(config.model).init(key, image, segment=True), jax.random.key(0))
+    draw = lambda leaf: jnp.asarray(rng.normal(scale=0.1, size=leaf.shape), leaf.dtype)  # noqa: E731
+    return Params(jax.tree.map(draw, shapes["params"]), config.model)
+
+
+@pytest.fixture(scope="session")
+def make_batch(config):
+    """The batch of a step: clouds that differ from place to place, each with a class per point, or images."""
+
+    def make(step: int, *, labels: bool = True, images: bool = False) -> Batch:
+        rng = np.random.default_rng([7, step])
+        b, grid = config.images, config.model.grid
+        far = np.kron(np.eye(config.tuples, dtype=bool), np.array([False, False, True, True]))
+        if images:
+            pictures = rng.poisson(0.5, (b, grid.height, grid.width)).astype(np.float32)
+            return Batch(np.zeros(b, bool), far, 1, images=pictures)
+        return Batch(
+            labelled=np.arange(b) % 3 != 0 if labels else np.zeros(b, bool),
+            far=far,
+            positives=1,
+            points=rng.normal(scale=10, size=(b, POINTS, 3)).astype(np.float32),
+            count=rng.integers(POINTS // 2, POINTS, b).astype(np.int32),
+            classes=rng.integers(0, 20, (b, POINTS)).astype(np.int32) if labels else None,
+        )
+
+    return make
