@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from sglpr_jax.cli.runtime import run
+from sglpr_jax.cli.runtime import console, run
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import evaluate, table, to_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
@@ -34,13 +34,13 @@ def evaluate_file(command: EvaluateCommand) -> Path:
     results = evaluate(file)
     folder = command.out or command.file.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
-    Console().print(table(results, title=f"sequence {file.sequence}, {len(file)} scans"))
+    console().print(table(results, title=f"sequence {file.sequence}, {len(file)} scans"))
     about = {"file": str(command.file), "config": file.config, "weights_hash": file.weights_hash}
     temporary = folder / ".results.json.tmp"
     temporary.write_text(json.dumps({**about, "results": to_json(results)}, indent=2) + "\n")
     os.replace(temporary, folder / "results.json")
     written = ["results.json", *_draw(file, results, folder)]
-    Console().print("\n".join(f"written: {folder / name}" for name in written), highlight=False)
+    console().print("\n".join(f"written: {folder / name}" for name in written))
     return folder
 
 

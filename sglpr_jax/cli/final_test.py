@@ -7,11 +7,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.cli.methods import Method, network, reference
-from sglpr_jax.cli.runtime import progress_bar
+from sglpr_jax.cli.runtime import console, progress_bar
 from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
@@ -44,7 +43,7 @@ def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> N
     if isinstance(sequence, ScanSequence) and sequence.has_labels:
         report["segmentation"] = _test_segmentation(params, sequence, folder)
     (folder / "results.json").write_text(json.dumps(report, indent=2) + "\n")
-    Console().print(f"written to {folder}", highlight=False)
+    console().print(f"written to {folder}")
 
 
 def _score(
@@ -64,9 +63,8 @@ def _score(
 
 
 def _print(results: dict[str, list[Result]], title: str) -> None:
-    console = Console()
-    console.print(table(results[TRAINED], title=f"{title}: {TRAINED}"))
-    console.print(comparison(results, title=title))
+    console().print(table(results[TRAINED], title=f"{title}: {TRAINED}"))
+    console().print(comparison(results, title=title))
 
 
 def _draw(results: dict[str, list[Result]], sequence: Drive, folder: Path, title: str) -> None:
@@ -88,10 +86,9 @@ def _test_segmentation(params: Params, sequence: ScanSequence, folder: Path) -> 
     counts, truth, prediction = (np.stack(part) for part in zip(*maps, strict=True))
     seen = (counts > 0) & field_of_view(params.config)
     result = score_segmentation(truth, prediction, counted=seen, classes=params.config.classes)
-    Console().print(
+    console().print(
         f"segmentation of {len(rows)} scans: mean IoU {result.mean_iou:.3f}; "
         f"predicting {CATEGORIES[result.majority]} everywhere: {result.majority_mean_iou:.3f}",
-        highlight=False,
     )
     if importlib.util.find_spec("matplotlib"):
         middle = len(rows) // 2

@@ -11,6 +11,8 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+_TABLE_WIDTH = 140
+
 
 def cache_folder() -> Path:
     """Where this user's compiled programs and simulated drives are kept."""
@@ -27,6 +29,11 @@ def run(command: Callable[[], object]) -> None:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def console() -> Console:
+    """Standard output; wide enough for the tables where it is no terminal with a width of its own."""
+    return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
 
 
 @contextlib.contextmanager

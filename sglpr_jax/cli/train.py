@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -19,9 +20,11 @@ from sglpr_jax.cli.training_recall import training_recall
 from sglpr_jax.data.batch import read_batch
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
+from sglpr_jax.evaluation import figures
 from sglpr_jax.models.params import save
 from sglpr_jax.train.config import TrainConfig
-from sglpr_jax.train.loop import train
+from sglpr_jax.train.loop import METRICS_FILE, train
+from sglpr_jax.train.metrics_log import read_metrics
 
 CONFIG_FILE = "config.json"
 
@@ -83,8 +86,19 @@ def train_and_test(command: TrainCommand) -> Path:
     if int(state.step) < config.steps:
         Console(stderr=True).print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume")
         sys.exit(130)
+    draw_learning_curve(folder)
     final_test(state.params, test, folder / "test", seed=config.seed)
     return folder
+
+
+def draw_learning_curve(folder: Path) -> None:
+    """Draw a run's loss and its score, recall@1 among its own places, over the steps."""
+    if not importlib.util.find_spec("matplotlib"):
+        return
+    lines = read_metrics(folder / METRICS_FILE)
+    names = {"loss": "loss", "score": "recall@1 of training places"}
+    curves = {title: [(line["step"], line[name]) for line in lines if name in line] for name, title in names.items()}
+    figures.save(figures.learning_curve(curves, ylabel="loss, recall@1"), folder / "learning-curve.png")
 
 
 def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:

@@ -37,7 +37,7 @@ def params(config) -> Params:
     rng = np.random.default_rng(0)
     image = jnp.zeros((1, config.model.grid.height, config.model.grid.width, 1))
     shapes = jax.eval_shape(lambda key: SGLPR(config.model).init(key, image, segment=True), jax.random.key(0))
-    draw = lambda leaf: jnp.asarray(rng.normal(scale=0.1, size=leaf.shape), leaf.dtype)  # noqa: E731
+    draw = lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype)  # noqa: E731
     return Params(jax.tree.map(draw, shapes["params"]), config.model)
 
 

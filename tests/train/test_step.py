@@ -10,52 +10,54 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.sglpr import forward
+from sglpr_jax.train.config import LossConfig
 from sglpr_jax.train.state import new_state
-from sglpr_jax.train.step import Summary, _chunks, gradients, joint_loss, summarize, train_step
+from sglpr_jax.train.step import Summary, _chunks, gradients, joint_loss, summarize, train_step, triplet_loss
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def gradients_of(params, batch, config):
-    keys = jax.random.split(jax.random.key(0))
-    return gradients(params, _chunks(batch, *keys, config), batch, config.loss)
+    return gradients(params, chunks_of(batch, config), batch, config.loss)
+
+
+def chunks_of(batch, config):
+    return _chunks(batch, *jax.random.split(jax.random.key(0)), config)
 
 
 def assert_same(found, expected):
     """Equal to float32 accuracy, measured against the largest value of each array."""
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * max(np.abs(b).max(), 1e-3))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-4 * np.abs(b).max() + 1e-7)
 
 
 @pytest.fixture(scope="module")
 def whole(config, params, make_batch):
+    """The gradient and the metrics of a labelled batch that goes through the network at once."""
     return gradients_of(params, make_batch(0), config)
 
 
-@pytest.mark.parametrize("chunk", [1, 4])
-def test_chunks_give_the_gradient_and_metrics_of_the_whole_batch(config, params, make_batch, whole, chunk):
-    gradient, metrics = gradients_of(params, make_batch(0), dataclasses.replace(config, chunk=chunk))
+def test_chunks_give_the_gradient_and_metrics_of_the_whole_batch(config, params, make_batch, whole):
+    gradient, metrics = gradients_of(params, make_batch(0), dataclasses.replace(config, chunk=2))
     assert set(metrics) == {"loss", "triplet", "cross_entropy", "dice", "violations"}
-    assert_same(gradient, whole[0])
     assert_same(metrics, whole[1])
-    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient["segmentation_head"]))
+    assert_same(gradient, whole[0])
+    assert np.abs(gradient["segmentation_head"]["kernel"]).max() > 1e-3
+    assert np.abs(gradient["place_head"]["netvlad"]["centres"]).max() > 1e-3
 
 
-@pytest.mark.parametrize("images", [False, True], ids=["points", "images"])
-def test_without_labels_the_triplet_loss_is_all(config, params, make_batch, images):
-    batch = make_batch(0, labels=False, images=images)
+def test_without_labels_the_triplet_loss_is_all_in_chunks_too(config, params, make_batch):
+    batch = make_batch(0, images=True)
     gradient, metrics = gradients_of(params, batch, config)
-    in_chunks = gradients_of(params, batch, dataclasses.replace(config, chunk=4))
     assert set(metrics) == {"loss", "triplet", "violations"}
     assert metrics["loss"] == metrics["triplet"] > 0
-    assert_same(in_chunks, (gradient, metrics))
     assert np.abs(gradient["segmentation_head"]["kernel"]).max() == 0
-    assert np.abs(gradient["place_head"]["netvlad"]["centres"]).max() > 0
+    assert np.abs(gradient["place_head"]["netvlad"]["centres"]).max() > 1e-3
+    assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
 
 
 def test_the_metrics_are_those_of_numpy(config, params, make_batch, whole):
     batch = make_batch(0)
-    keys = jax.random.split(jax.random.key(0))
-    chunks = _chunks(batch, *keys, config)
+    chunks = chunks_of(batch, config)
     outputs = jax.jit(forward)(params, chunks.images[0])
     d, logits = (np.asarray(x, np.float64) for x in (outputs.descriptor, outputs.logits))
 
@@ -72,7 +74,7 @@ def test_the_metrics_are_those_of_numpy(config, params, make_batch, whole):
     p = (p / p.sum(-1, keepdims=True))[batch.labelled]
     truth = np.eye(20)[np.asarray(chunks.maps[0])[batch.labelled]]
     np.testing.assert_allclose(whole[1]["cross_entropy"], -np.log((p * truth).sum(-1)).mean(), rtol=1e-4)
-    overlap, total = ((2 * p * truth).sum((0, 1, 2)), (p**2 + truth**2).sum((0, 1, 2)))
+    overlap, total = (2 * p * truth).sum((0, 1, 2)), (p**2 + truth**2).sum((0, 1, 2))
     np.testing.assert_allclose(whole[1]["dice"], np.mean(1 - (overlap + 1e-5) / (total + 1e-5)), rtol=1e-4)
     expected = whole[1]["triplet"] + 0.4 * whole[1]["cross_entropy"] + 0.6 * whole[1]["dice"]
     np.testing.assert_allclose(whole[1]["loss"], expected, rtol=1e-6)
@@ -93,69 +95,80 @@ def test_a_batch_without_one_labelled_place_has_no_segmentation_loss(config, par
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
-def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_batch):
+def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_batch, whole):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
     config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(config.model, drop_path=0.5))
-    params, batch = dataclasses.replace(params, config=config.model), make_batch(0)
+    batch = make_batch(0)
 
-    @jax.jit
-    def plain(params):
-        chunks = _chunks(batch, *jax.random.split(jax.random.key(0)), config)
+    @functools.partial(jax.grad, has_aux=True)
+    def plain(weights):
+        chunks = chunks_of(batch, config)
+        parts = [
+            summarize(dataclasses.replace(params, weights=weights, config=config.model), chunk)
+            for chunk in (jax.tree.map(lambda x, i=i: x[i], chunks) for i in range(config.images // config.chunk))
+        ]
+        descriptors, cross_entropy, dice_sums = zip(*parts, strict=True)
+        return joint_loss(Summary(jnp.concatenate(descriptors), sum(cross_entropy), sum(dice_sums)), batch, config.loss)
 
-        def loss(weights):
-            parts = [
-                summarize(dataclasses.replace(params, weights=weights), jax.tree.map(lambda x, i=i: x[i], chunks))
-                for i in range(config.images // config.chunk)
-            ]
-            merged = Summary(jnp.concatenate([p.descriptors for p in parts]), *map(sum, zip(*(p[1:] for p in parts))))  # noqa: B905
-            return joint_loss(merged, batch, config.loss)
-
-        return jax.grad(loss, has_aux=True)(params.weights)
-
-    found = gradients_of(params, batch, config)
-    assert_same(found, plain(params))
-    still = gradients_of(
-        dataclasses.replace(params, config=dataclasses.replace(config.model, drop_path=0.0)), batch, config
-    )
-    assert abs(float(found[1]["loss"] - still[1]["loss"])) > 1e-4
+    found = gradients_of(dataclasses.replace(params, config=config.model), batch, config)
+    assert_same(found, jax.jit(plain)(params.weights))
+    assert abs(float(found[1]["loss"] - whole[1]["loss"])) > 1e-4
 
 
-def test_a_violation_is_one_of_the_margin_under_the_smooth_loss_too(config, params, make_batch, whole):
-    smooth = dataclasses.replace(config.loss, temperature=0.2, margin=-2.5)  # distances of unit vectors end at 2
-    _, metrics = gradients_of(params, make_batch(0), dataclasses.replace(config, loss=smooth))
-    assert metrics["violations"] == 0
-    assert metrics["triplet"] > 0
+def test_the_share_of_violations_is_that_of_the_margin_for_the_smooth_loss_too(make_batch):
+    batch = make_batch(0)
+    apart = jnp.eye(8).at[1].set(jnp.eye(8)[0])  # only the second anchor's positive is as far away as its negatives
+    for temperature in (0.0, 0.2):
+        loss, metrics = triplet_loss(apart, batch, LossConfig(margin=0.3, temperature=temperature))
+        assert metrics["violations"] == 0.5
+        assert metrics["triplet"] == loss > 0
 
 
-def test_steps_on_one_batch_lower_its_loss_and_compile_once(config, params, make_batch):
+def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     chex.clear_trace_counter()
     traced = chex.assert_max_traces(train_step.__wrapped__, n=1)
     step = jax.jit(traced, static_argnames="config", donate_argnames="state")
-    state, batch = new_state(config, params=jax.tree.map(jnp.copy, params)), make_batch(0)
-    config = dataclasses.replace(config, rotate=False)
-    losses = []
-    for expected_step in range(15):
-        assert state.step == expected_step
-        state, metrics = step(state, batch, config=config)
-        losses.append(float(metrics["loss"]))
-    assert losses[-1] < 0.9 * losses[0]
-    assert metrics["gradient_norm"] > 0 and metrics["update_norm"] > 0
-    np.testing.assert_allclose(
-        metrics["weight_norm"],
-        np.sqrt(sum((leaf**2).sum() for leaf in jax.tree.leaves(state.params.weights))),
-        rtol=1e-5,
-    )
+
+    def run(*, steps: int, start: int = 0):
+        state = new_state(config, params=jax.tree.map(jnp.copy, params)).replace(step=jnp.int32(start))
+        seen = []
+        for i in range(steps):
+            state, metrics = step(state, make_batch(0), config=config)
+            assert state.step == start + i + 1
+            seen.append(jax.device_get(metrics))
+        return state.params.weights, seen
+
+    weights, metrics = run(steps=25)
+    losses = [m["loss"] for m in metrics]
+    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
+    assert metrics[0]["gradient_norm"] > 0 and metrics[0]["update_norm"] > 0
+    squares = sum(np.square(leaf).sum() for leaf in jax.tree.leaves(weights))
+    np.testing.assert_allclose(metrics[-1]["weight_norm"], np.sqrt(squares), rtol=1e-5)
+
+    again = run(steps=2)[1]
+    chex.assert_trees_all_equal(again, metrics[:2])
+    assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
 
 
-def test_a_step_is_a_pure_function_whose_rotations_follow_seed_and_step(config, params, make_batch):
+def test_rotations_follow_the_key_and_can_be_turned_off(config, make_batch):
     batch = make_batch(0)
+    angle_key, other_key = jax.random.split(jax.random.key(0))
+    turned, again, other = (
+        _chunks(batch, key, other_key, config).images for key in (angle_key, angle_key, jax.random.key(5))
+    )
+    np.testing.assert_array_equal(turned, again)
+    assert (turned != other).any(axis=(0, 2, 3)).all()
+    still = [
+        _chunks(batch, key, other_key, dataclasses.replace(config, rotate=False)).images
+        for key in (angle_key, jax.random.key(5))
+    ]
+    np.testing.assert_array_equal(*still)
 
-    def run(step, seed=0):
-        state = new_state(config, params=jax.tree.map(jnp.copy, params)).replace(step=jnp.int32(step))
-        state, metrics = train_step(state, batch, config=dataclasses.replace(config, seed=seed))
-        return state.params.weights, metrics
 
-    first = run(0)
-    chex.assert_trees_all_equal(first, run(0))
-    assert run(1)[1]["loss"] != first[1]["loss"]
-    assert run(0, seed=1)[1]["loss"] != first[1]["loss"]
+def test_labels_count_only_where_the_network_sees(config, make_batch):
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, field="circle"))
+    maps = np.asarray(chunks_of(make_batch(0), config).maps)
+    down, right = np.mgrid[:32, :32] - 15.5
+    outside = np.hypot(down, right) >= 16
+    assert (maps[..., outside] == 0).all()
+    assert (maps[..., ~outside] > 0).any()
