@@ -15,9 +15,10 @@ _SMALL = load_preset("small")
 CONFIG = dataclasses.replace(
     _SMALL,
     model=model_preset("demo"),
-    optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=20, decay_rate=0.5, decay_steps=75, clip_norm=1.0),
-    steps=350,
-    tuples=8,
+    loss=dataclasses.replace(_SMALL.loss, segment_every=4),
+    optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=20, decay_rate=0.5, decay_steps=100, clip_norm=1.0),
+    steps=500,
+    tuples=16,
     max_points=32768,
-    score_every=100,
+    score_every=250,
 )

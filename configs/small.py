@@ -16,7 +16,7 @@ CONFIG = TrainConfig(
     sampling=TupleConfig(negatives=0),  # the batch's other places are the negatives
     loss=LossConfig(margin=0.3, squared=True, temperature=0.1),
     optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=100, decay_rate=0.5, decay_steps=650, clip_norm=1.0),
-    steps=4000,
+    steps=3000,
     tuples=20,
     share_negatives=True,
     max_points=131072,

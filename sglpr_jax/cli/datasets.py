@@ -5,8 +5,6 @@ import sys
 from collections.abc import Sequence as Many
 from pathlib import Path
 
-from rich.console import Console
-
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.kitti import PoseChoice
@@ -69,5 +67,5 @@ def leave_one_out(
     for drive in (*drives, test):
         if drive.positions is None:
             raise ValueError(f"{root}: sequence {drive.name} has no poses; training and testing need them")
-    Console(stderr=True).print(f"training on {', '.join(names)}; testing on {seq}, never seen", highlight=False)
+    print(f"training on {', '.join(names)}; testing on {seq}, never seen", file=sys.stderr)
     return drives, test

@@ -14,7 +14,7 @@ from sglpr_jax.cli.presets import load_preset
 from sglpr_jax.cli.runtime import run
 from sglpr_jax.cli.train import TrainCommand, train_and_test
 
-SCANS = 200
+SCANS = 300
 AZIMUTH_STEPS = 450
 
 

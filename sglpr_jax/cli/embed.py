@@ -50,6 +50,8 @@ class EmbedCommand:
 
 def embed_sequence(command: EmbedCommand) -> Path:
     """Do what the command says; returns the file written."""
+    if command.out.suffix != ".npz":
+        raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
     sequence = open_sequence(command.data, command.seq, poses=command.poses, format=command.format)

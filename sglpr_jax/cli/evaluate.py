@@ -2,14 +2,12 @@
 
 import dataclasses
 import importlib.util
-import json
-import os
+import sys
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 
-from sglpr_jax.cli.runtime import console, run
+from sglpr_jax.cli.runtime import console, run, write_json
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.report import evaluate, table, to_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
@@ -31,23 +29,25 @@ class EvaluateCommand:
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Do what the command says; returns the folder written."""
     file = DescriptorFile.load(command.file)
+    if file.positions is None:
+        raise ValueError(
+            f"{command.file}: expected positions to score against, found descriptors of scans without poses"
+        )
     results = evaluate(file)
     folder = command.out or command.file.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
     console().print(table(results, title=f"sequence {file.sequence}, {len(file)} scans"))
     about = {"file": str(command.file), "config": file.config, "weights_hash": file.weights_hash}
-    temporary = folder / ".results.json.tmp"
-    temporary.write_text(json.dumps({**about, "results": to_json(results)}, indent=2) + "\n")
-    os.replace(temporary, folder / "results.json")
-    written = ["results.json", *_draw(file, results, folder)]
-    console().print("\n".join(f"written: {folder / name}" for name in written))
+    write_json(folder / "results.json", {**about, "results": to_json(results)})
+    for name in ("results.json", *_draw(file, results, folder)):
+        print(f"written: {folder / name}")
     return folder
 
 
 def _draw(file: DescriptorFile, results: list, folder: Path) -> list[str]:
     """Draw what can be drawn; without matplotlib, say so."""
     if not importlib.util.find_spec("matplotlib"):
-        Console(stderr=True).print("no pictures: they need the extra `viz` (pip install sglpr-jax[viz])")
+        print("no pictures: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
         return []
     curves = {result.name: result.curve for result in results if result.curve is not None}
     drawn = {}

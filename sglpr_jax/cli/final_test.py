@@ -2,25 +2,27 @@
 
 import dataclasses
 import importlib.util
-import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.cli.methods import Method, network, reference
-from sglpr_jax.cli.runtime import console, progress_bar
+from sglpr_jax.cli.runtime import console, progress_bar, write_json
 from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.report import comparison, evaluate, table, to_json
-from sglpr_jax.evaluation.segmentation import SegmentationResult, score_segmentation
+from sglpr_jax.evaluation.segmentation import UNLABELLED, SegmentationResult, score_segmentation
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.models.sglpr import Params, field_of_view, init, segment
 
 ROTATION_SEED = 0
 TRAINED = "sglpr"
+_POINTS_STEP = 16384
+"""Clouds are padded to a multiple of this, so that few sizes are compiled."""
 
 
 def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> None:
@@ -42,7 +44,7 @@ def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> N
             _draw(results, sequence, folder, title)
     if isinstance(sequence, ScanSequence) and sequence.has_labels:
         report["segmentation"] = _test_segmentation(params, sequence, folder)
-    (folder / "results.json").write_text(json.dumps(report, indent=2) + "\n")
+    write_json(folder / "results.json", report)
     console().print(f"written to {folder}")
 
 
@@ -70,10 +72,9 @@ def _print(results: dict[str, list[Result]], title: str) -> None:
 def _draw(results: dict[str, list[Result]], sequence: Drive, folder: Path, title: str) -> None:
     top1 = {name: scored[0] for name, scored in results.items()}
     curves = {name: result.curve for name, result in top1.items() if result.curve is not None}
-    figures.save(
-        figures.precision_recall(curves, title=f"{sequence.name}, {title}: top-1"),
-        folder / f"precision-recall-{title}.png",
-    )
+    if curves:  # none where the drive has no revisit
+        picture = figures.precision_recall(curves, title=f"{sequence.name}, {title}: top-1")
+        figures.save(picture, folder / f"precision-recall-{title}.png")
     decisions = top1[TRAINED].decisions
     if decisions is not None and sequence.positions is not None:
         figures.save(figures.trajectory(sequence.positions, decisions), folder / f"trajectory-{title}.png")
@@ -100,16 +101,23 @@ def _test_segmentation(params: Params, sequence: ScanSequence, folder: Path) -> 
     return _segmentation_json(result)
 
 
-_segment = jax.jit(lambda params, image: segment(params, image).argmax(-1))
-
-
 def _maps(params: Params, sequence: ScanSequence, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Point counts, true classes and predicted classes of one scan."""
     points, labels = sequence.points(row), sequence.labels(row)
     assert labels is not None
+    padding = -len(points) % _POINTS_STEP
+    padded = np.pad(points, ((0, padding), (0, 0))), np.pad(to_classes(labels), (0, padding))
+    counts, truth, prediction = jax.device_get(_maps_of_cloud(params, *padded, jnp.int32(len(points))))
+    return counts, truth, prediction
+
+
+@jax.jit
+def _maps_of_cloud(params: Params, points, classes, count):
     grid = params.config.grid
-    image = rasterize(points, grid=grid)
-    truth = rasterize_labels(points, to_classes(labels), grid=grid)
-    return np.asarray(image), np.asarray(truth), np.asarray(_segment(params, image))
+    counts = rasterize(points, grid=grid, count=count)
+    truth = rasterize_labels(points, classes, grid=grid, count=count)
+    known = segment(params, counts)[..., UNLABELLED + 1 :]  # a cell with points in it is not "unlabelled"
+    return counts, truth, known.argmax(-1) + UNLABELLED + 1
 
 
 def _segmentation_json(result: SegmentationResult) -> dict:

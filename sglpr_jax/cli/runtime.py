@@ -1,11 +1,13 @@
 """What every command does around its work: a compilation cache, orderly interruption, errors in one line."""
 
 import contextlib
+import json
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 from rich.console import Console
@@ -26,7 +28,7 @@ def run(command: Callable[[], object]) -> None:
     try:
         command()
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
-        sys.exit(f"error: {error}")
+        sys.exit(f"error: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)
 
@@ -34,6 +36,13 @@ def run(command: Callable[[], object]) -> None:
 def console() -> Console:
     """Standard output; wide enough for the tables where it is no terminal with a width of its own."""
     return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(json.dumps(value, indent=2) + "\n")
+    os.replace(temporary, path)
 
 
 @contextlib.contextmanager

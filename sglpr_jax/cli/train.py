@@ -10,12 +10,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from sglpr_jax.cli.datasets import dataset_root, leave_one_out
 from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.presets import load_preset, preset_names
-from sglpr_jax.cli.runtime import run, stop_on_signal
+from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
 from sglpr_jax.cli.training_recall import training_recall
 from sglpr_jax.data.batch import read_batch
 from sglpr_jax.data.kitti import PoseChoice
@@ -72,8 +71,8 @@ def train_and_test(command: TrainCommand) -> Path:
     root = dataset_root(command.data)
     drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
     config = command.config
-    _claim(folder, command, resume=command.resume)
     pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
+    _claim(folder, command, resume=command.resume)
 
     def make_batch(step: int):
         frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
@@ -84,7 +83,7 @@ def train_and_test(command: TrainCommand) -> Path:
         state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)
     save(state.params, folder / "weights")
     if int(state.step) < config.steps:
-        Console(stderr=True).print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume")
+        print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
         sys.exit(130)
     draw_learning_curve(folder)
     final_test(state.params, test, folder / "test", seed=config.seed)
@@ -107,6 +106,8 @@ def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
     settings = json.loads(
         json.dumps(dataclasses.asdict(dataclasses.replace(command, out=None, resume=False)), default=str)
     )
+    if path.exists() and not resume:
+        raise FileExistsError(f"{folder}: there is a run already; go on with --resume, or choose another --out")
     if resume:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: expected a run to resume, found none")
@@ -115,10 +116,8 @@ def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
             raise ValueError(
                 f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
             )
-    elif path.exists():
-        raise FileExistsError(f"{folder}: there is a run already; go on with --resume, or choose another --out")
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(settings, indent=2) + "\n")
+    write_json(path, settings)
 
 
 def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:

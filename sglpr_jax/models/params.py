@@ -67,6 +67,8 @@ def config_from_dict(values: dict[str, Any], *, source: Path | str) -> ModelConf
         return ModelConfig(**_tuples({**values, "grid": grid, "head": head}))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{source}: expected the fields of a ModelConfig, found {sorted(values)} ({error})") from error
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
 
 
 def weights_hash(params: Params) -> str:
@@ -88,9 +90,12 @@ def _tuples(values: dict[str, Any]) -> dict[str, Any]:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        values = json.loads(path.read_text())
+    except ValueError as error:  # not JSON, or not even text
         raise ValueError(f"{path}: expected JSON ({error})") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected JSON with the fields of a ModelConfig, found {values!r:.40}")
+    return values
 
 
 def _match(flat: dict[str, np.ndarray], config: ModelConfig, *, source: Path) -> Any:

@@ -42,7 +42,8 @@ class SGLPR(nn.Module):
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, image: Float[Array, "b h w c"], *, segment: bool = False, train: bool = False) -> Outputs:
+    def __call__(self, image: Float[Array, "b h w c"], *, segment: int = 0, train: bool = False) -> Outputs:
+        """`segment` n: semantic logits of every n-th image (True: of all); 0: that head does not exist."""
         config = self.config
         if config.polar:
             image = to_polar(image, config.grid, *config.polar)
@@ -59,13 +60,17 @@ class SGLPR(nn.Module):
         )(image, train=train)
         pixels: Any = None
         logits = None  # both made only where something reads them
-        if segment or config.head.tap == "pixels":
+        if config.head.tap == "pixels":
             pixels = FinalPatchExpand(config.patch, name="expand")(tokens)
-            intermediates["pixels"] = pixels
+        elif segment:
+            pixels = FinalPatchExpand(config.patch, name="expand")(tokens[::segment])
         features: Any = tokens if config.head.tap == "tokens" else pixels
         descriptor, head = PlaceHead(config.head, config.polar is not None, name="place_head")(features)
+        if pixels is not None:
+            intermediates["pixels"] = pixels
         if segment:
-            cells: Any = from_polar(pixels, config.grid) if config.polar else pixels
+            segmented = pixels[::segment] if config.head.tap == "pixels" else pixels
+            cells: Any = from_polar(segmented, config.grid) if config.polar else segmented
             logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")(cells)
         return Outputs(descriptor, logits, intermediates | head)
 
@@ -95,7 +100,7 @@ def describe(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"])
     two descriptors is the dissimilarity of their places (equation 2). Raises ValueError for images of another size
     than `params.config.grid`.
     """
-    return forward(params, bev, segment=False).descriptor.reshape(*bev.shape[:-2], -1)
+    return forward(params, bev, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
 
 
 def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
@@ -108,12 +113,13 @@ def forward(
     bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
     *,
     key: Array | None = None,
-    segment: bool = True,
+    segment: int = 1,
 ) -> Outputs:
     """Everything at once, for training and pictures: descriptors, logits and named maps, leading axes made one.
 
-    With a `key` it is the training pass, in which stochastic depth drops residual branches. Without `segment` the
-    segmentation head does not exist. Raises ValueError for images of another size than `params.config.grid`.
+    With a `key` it is the training pass, in which stochastic depth drops residual branches. `segment` n gives the
+    logits of every n-th image; with 0 the segmentation head does not exist. Raises ValueError for images of another
+    size than `params.config.grid`.
     """
     grid = params.config.grid
     if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):

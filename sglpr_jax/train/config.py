@@ -21,6 +21,8 @@ class LossConfig:
     """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
     ce_weight: float = 0.4
     dice_weight: float = 0.6
+    segment_every: int = 1
+    """Take the segmentation losses on every n-th image of a step only; all are segmented in the paper."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +67,11 @@ class TrainConfig:
     def __post_init__(self):
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
+        if (self.chunk or self.images) % self.loss.segment_every:
+            raise ValueError(
+                f"loss.segment_every must divide the {self.chunk or self.images} images of a chunk, "
+                f"found {self.loss.segment_every}"
+            )
 
     @property
     def images(self) -> int:

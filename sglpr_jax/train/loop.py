@@ -36,12 +36,13 @@ def train(
 ) -> TrainState:
     """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch.
 
-    Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest one. Raises
-    FloatingPointError, naming the step, when the loss is no longer finite.
+    Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest one, if there is one yet.
+    Raises FloatingPointError, naming the step, when the loss is no longer finite.
     """
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints = Checkpoints(folder / CHECKPOINTS)
-    state = checkpoints.restore(config) if resume else new_state(config)
+    go_on = resume and checkpoints.latest_step() is not None
+    state = checkpoints.restore(config) if go_on else new_state(config)
     start = int(state.step)
     log = MetricsLog(folder / METRICS_FILE, start_step=start)
     batches = read_ahead(make_batch, start=start, stop=config.steps)

@@ -63,7 +63,7 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
     """
 
     def summary(weights, chunk: Chunk) -> Summary:
-        return summarize(dataclasses.replace(params, weights=weights), chunk)
+        return summarize(dataclasses.replace(params, weights=weights), chunk, config.segment_every)
 
     def loss(summaries: Summary):
         return joint_loss(_merge(summaries), batch, config)
@@ -84,13 +84,14 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
     return jax.lax.scan(add, zeros, (chunks, cotangents))[0], metrics
 
 
-def summarize(params: Params, chunk: Chunk) -> Summary:
-    """One chunk through the network; the segmentation head only where there are labels."""
+def summarize(params: Params, chunk: Chunk, segment_every: int = 1) -> Summary:
+    """One chunk through the network; the segmentation head only where there are labels, on every n-th image."""
     if chunk.maps is None:
-        return Summary(forward(params, chunk.images, key=chunk.key, segment=False).descriptor)
-    outputs = forward(params, chunk.images, key=chunk.key)
-    cross_entropy = jnp.where(chunk.labelled, losses.cross_entropy(outputs.logits, chunk.maps), 0.0).sum()
-    return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, chunk.maps, chunk.labelled))
+        return Summary(forward(params, chunk.images, key=chunk.key, segment=0).descriptor)
+    outputs = forward(params, chunk.images, key=chunk.key, segment=segment_every)
+    maps, labelled = chunk.maps[::segment_every], chunk.labelled[::segment_every]
+    cross_entropy = jnp.where(labelled, losses.cross_entropy(outputs.logits, maps), 0.0).sum()
+    return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, maps, labelled))
 
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
@@ -98,8 +99,9 @@ def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Floa
     triplet, metrics = triplet_loss(summary.descriptors, batch, config)
     if summary.cross_entropy is None:
         return triplet, metrics | {"loss": triplet}
-    ce = summary.cross_entropy / jnp.maximum(batch.labelled.sum(), 1)
-    dice = jnp.where(batch.labelled.any(), losses.dice_from_sums(summary.dice_sums), 0.0)
+    segmented = jnp.asarray(batch.labelled)[:: config.segment_every]
+    ce = summary.cross_entropy / jnp.maximum(segmented.sum(), 1)
+    dice = jnp.where(segmented.any(), losses.dice_from_sums(summary.dice_sums), 0.0)
     total = losses.joint(triplet, ce, dice, ce_weight=config.ce_weight, dice_weight=config.dice_weight)
     return total, metrics | {"cross_entropy": ce, "dice": dice, "loss": total}
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.cbam import CBAM, ChannelGate
+from sglpr_jax.models.cbam import CBAM, ChannelGate, largest
 
 SPATIAL = "SpatialGate.spatial"
 
@@ -60,3 +60,14 @@ def test_jit_and_vmap_agree_and_an_empty_map_has_finite_gradients(random_variabl
     np.testing.assert_allclose(one_by_one, expected, atol=1e-6)
     gradients = jax.grad(lambda v: module.apply(v, jnp.zeros_like(image)).sum())(variables)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+
+
+def test_the_gradient_of_the_maximum_survives_rounding():
+    """An entry that rounding keeps from being equal to the maximum still has its gradient; ties share it."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 5)), jnp.float32)
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(lambda x: jnp.square(largest(x, (1, 2))).sum())(x)
+        np.testing.assert_allclose(found, derivative(lambda x: jnp.square(x.max((1, 2))).sum())(x), rtol=1e-6)
+    tied = jnp.asarray([2.0, 1.0, np.nextafter(np.float32(2), np.float32(0)), 2.0], jnp.float32)
+    np.testing.assert_allclose(jax.grad(lambda x: largest(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
+    assert largest(tied, (-1,)) == 2

@@ -1,4 +1,4 @@
-"""A tiny model with random weights, and batches for it made in memory."""
+"""A model that compiles fast, with random weights, and batches for it made in memory."""
 
 import dataclasses
 
@@ -7,22 +7,32 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.bev import Grid
 from sglpr_jax.data.batch import Batch
 from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import SGLPR, Params
 from sglpr_jax.train.config import OptimizerConfig, TrainConfig
 
 POINTS = 200
+MODEL = dataclasses.replace(
+    model_preset("tiny"),
+    grid=Grid(resolution_m=3.2, height=16, width=16),
+    depths=(2,),
+    heads=(2,),
+    drop_path=0.0,
+    head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4, descriptor_size=16),
+)
 
 
 @pytest.fixture(scope="session")
 def config() -> TrainConfig:
     """Two tuples of four places, the whole batch at once, no stochastic depth."""
     return TrainConfig(
-        model=dataclasses.replace(model_preset("tiny"), drop_path=0.0),
+        model=MODEL,
         sampling=TupleConfig(positives=1, negatives=2),
-        optimizer=OptimizerConfig(learning_rate=1e-3),
+        optimizer=OptimizerConfig(learning_rate=3e-3),
         steps=6,
         tuples=2,
         max_points=POINTS,
@@ -33,12 +43,17 @@ def config() -> TrainConfig:
 
 @pytest.fixture(scope="session")
 def params(config) -> Params:
-    """Random weights; made by numpy, for compiling `init` takes seconds."""
+    """Weights that tell places apart; made by numpy, for compiling `init` takes seconds."""
     rng = np.random.default_rng(0)
     image = jnp.zeros((1, config.model.grid.height, config.model.grid.width, 1))
     shapes = jax.eval_shape(lambda key: SGLPR(config.model).init(key, image, segment=True), jax.random.key(0))
-    draw = lambda leaf: jnp.asarray(rng.normal(scale=0.3, size=leaf.shape), leaf.dtype)  # noqa: E731
-    return Params(jax.tree.map(draw, shapes["params"]), config.model)
+
+    def draw(path, leaf):
+        inputs = np.prod(leaf.shape[:-1])
+        centre = 1 if path[-1].key == "scale" else 0
+        return jnp.asarray(centre + rng.normal(scale=inputs**-0.5 if inputs > 1 else 0.1, size=leaf.shape), leaf.dtype)
+
+    return Params(jax.tree_util.tree_map_with_path(draw, shapes["params"]), config.model)
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,10 @@ from sglpr_jax.train.config import LossConfig
 from sglpr_jax.train.state import new_state
 from sglpr_jax.train.step import Summary, _chunks, gradients, joint_loss, summarize, train_step, triplet_loss
 
+FAST_COMPILE = {"xla_backend_optimization_level": 0}
 
-@functools.partial(jax.jit, static_argnames="config")
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILE)
 def gradients_of(params, batch, config):
     return gradients(params, chunks_of(batch, config), batch, config.loss)
 
@@ -95,10 +97,20 @@ def test_a_batch_without_one_labelled_place_has_no_segmentation_loss(config, par
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+def test_segmenting_every_second_image_is_as_if_the_others_had_no_labels(config, params, make_batch):
+    batch = make_batch(0)
+    every_second = batch.replace(labelled=batch.labelled & (np.arange(config.images) % 2 == 0))
+    expected = gradients_of(params, every_second, config)
+    sparse = dataclasses.replace(config, chunk=4, loss=dataclasses.replace(config.loss, segment_every=2))
+    found = gradients_of(params, batch, sparse)
+    assert_same(found[1], expected[1])
+    assert_same(found[0], expected[0])
+
+
 def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_batch, whole):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
     config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(config.model, drop_path=0.5))
-    batch = make_batch(0)
+    batch = jax.tree.map(jnp.asarray, make_batch(0))
 
     @functools.partial(jax.grad, has_aux=True)
     def plain(weights):
@@ -111,13 +123,13 @@ def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_ba
         return joint_loss(Summary(jnp.concatenate(descriptors), sum(cross_entropy), sum(dice_sums)), batch, config.loss)
 
     found = gradients_of(dataclasses.replace(params, config=config.model), batch, config)
-    assert_same(found, jax.jit(plain)(params.weights))
+    assert_same(found, jax.jit(plain, compiler_options=FAST_COMPILE)(params.weights))
     assert abs(float(found[1]["loss"] - whole[1]["loss"])) > 1e-4
 
 
 def test_the_share_of_violations_is_that_of_the_margin_for_the_smooth_loss_too(make_batch):
-    batch = make_batch(0)
-    apart = jnp.eye(8).at[1].set(jnp.eye(8)[0])  # only the second anchor's positive is as far away as its negatives
+    batch = jax.tree.map(jnp.asarray, make_batch(0))
+    apart = jnp.eye(8).at[1].set(jnp.eye(8)[0])  # the first anchor has its positive at its place
     for temperature in (0.0, 0.2):
         loss, metrics = triplet_loss(apart, batch, LossConfig(margin=0.3, temperature=temperature))
         assert metrics["violations"] == 0.5
@@ -127,7 +139,7 @@ def test_the_share_of_violations_is_that_of_the_margin_for_the_smooth_loss_too(m
 def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     chex.clear_trace_counter()
     traced = chex.assert_max_traces(train_step.__wrapped__, n=1)
-    step = jax.jit(traced, static_argnames="config", donate_argnames="state")
+    step = jax.jit(traced, static_argnames="config", donate_argnames="state", compiler_options=FAST_COMPILE)
 
     def run(*, steps: int, start: int = 0):
         state = new_state(config, params=jax.tree.map(jnp.copy, params)).replace(step=jnp.int32(start))
@@ -168,7 +180,7 @@ def test_rotations_follow_the_key_and_can_be_turned_off(config, make_batch):
 def test_labels_count_only_where_the_network_sees(config, make_batch):
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, field="circle"))
     maps = np.asarray(chunks_of(make_batch(0), config).maps)
-    down, right = np.mgrid[:32, :32] - 15.5
-    outside = np.hypot(down, right) >= 16
+    down, right = np.mgrid[:16, :16] - 7.5
+    outside = np.hypot(down, right) >= 8
     assert (maps[..., outside] == 0).all()
     assert (maps[..., ~outside] > 0).any()

@@ -1,0 +1,148 @@
+"""Command lines run in this process, on datasets and with a model that take seconds."""
+
+import contextlib
+import importlib
+import io
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from PIL import Image
+
+from sglpr_jax.sim import Sensor, write_dataset
+
+SCANS = 40
+SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
+PRESET = """
+import dataclasses
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.train.config import OptimizerConfig, TrainConfig
+
+MODEL = dataclasses.replace(
+    model_preset("tiny"),
+    grid=Grid(resolution_m=3.2, height=16, width=16),
+    depths=(1,),
+    heads=(2,),
+    head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4),
+)
+CONFIG = TrainConfig(
+    model=MODEL,
+    sampling=TupleConfig(negatives=2, positive_m=16.0),
+    optimizer=OptimizerConfig(learning_rate=1e-3),
+    steps=4,
+    tuples=2,
+    max_points=512,
+    log_every=1,
+    score_every=2,
+)
+"""
+
+
+class Ended(NamedTuple):
+    """How a command line ended: its exit status and what it printed."""
+
+    status: int
+    out: str
+    error: str
+
+
+def run_command(name: str, *arguments: object) -> Ended:
+    """Run `bin/<name> <arguments>` in this process."""
+    module = importlib.import_module(f"sglpr_jax.cli.{name}")
+    out, error = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+        patch.setattr(sys, "argv", [name, *map(str, arguments)])
+        try:
+            module.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 1
+            if isinstance(end.code, str):
+                print(end.code, file=sys.stderr)  # as Python does
+    return Ended(status, out.getvalue(), error.getvalue())
+
+
+def assert_one_line_error(ended: Ended, *words: object) -> None:
+    """The command refused its input: status 1, and the last line is the error, with all of `words` in it."""
+    assert ended.status == 1, ended
+    last = ended.error.rstrip("\n").splitlines()[-1]
+    assert last.startswith("error: "), ended.error
+    assert "Traceback" not in ended.error
+    assert not [str(word) for word in words if str(word) not in last], last
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory):
+    """Compiled programs and simulated drives go to a folder of this session, not to the user's."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(os.environ, "XDG_CACHE_HOME", str(folder))
+        patch.setitem(os.environ, "JAX_COMPILATION_CACHE_DIR", str(folder / "sglpr-jax" / "compiled"))
+        before = jax.config.jax_compilation_cache_dir
+        jax.config.update("jax_compilation_cache_dir", str(folder / "sglpr-jax" / "compiled"))
+        compilation_cache.reset_cache()
+        yield
+        jax.config.update("jax_compilation_cache_dir", before)
+        compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="session")
+def town(tmp_path_factory) -> Path:
+    """Drives 00, 05 and 08 of 40 thin scans, with labels; 08 revisits places."""
+    return write_dataset(tmp_path_factory.mktemp("data") / "town", scans=SCANS, sensor=SENSOR)
+
+
+@pytest.fixture(scope="session")
+def images(tmp_path_factory) -> Path:
+    """Ready-made BEV images of two straight drives, 00 and 06, which never come back."""
+    root = tmp_path_factory.mktemp("data") / "images"
+    rng = np.random.default_rng(0)
+    for name in ("00", "06"):
+        (root / name / "imgs").mkdir(parents=True)
+        poses = np.tile(np.eye(3, 4), (30, 1, 1))
+        poses[:, 0, 3] = 6.0 * np.arange(30)
+        np.savetxt(root / name / "pose.txt", poses.reshape(30, 12))
+        for frame in range(30):
+            picture = rng.integers(0, 255, (20, 22), dtype=np.uint8)
+            Image.fromarray(picture).save(root / name / "imgs" / f"{frame:06d}.png")
+    return root
+
+
+@pytest.fixture(scope="session")
+def preset(tmp_path_factory) -> Path:
+    """A preset of one's own: a model of next to no arithmetic, four steps."""
+    path = tmp_path_factory.mktemp("presets") / "tiny.py"
+    path.write_text(PRESET)
+    return path
+
+
+class Trained(NamedTuple):
+    """A training run and what its command printed."""
+
+    folder: Path
+    ended: Ended
+
+
+@pytest.fixture(scope="session")
+def trained(town, preset, tmp_path_factory) -> Trained:
+    """The run that several tests look at; nobody changes it."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny-08"
+    ended = run_command("train", "--seq", "08", "--data", town, "--preset", preset, "--out", folder)
+    assert ended.status == 0, ended.error
+    return Trained(folder, ended)
+
+
+@pytest.fixture
+def command() -> Callable[..., Ended]:
+    """`command(name, *arguments)` runs a command line in this process."""
+    return run_command

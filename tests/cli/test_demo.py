@@ -1,0 +1,45 @@
+import re
+from pathlib import Path
+
+import pytest
+
+from sglpr_jax.cli import demo
+from sglpr_jax.cli.presets import load_preset
+
+
+@pytest.fixture
+def tiny_demo(monkeypatch, town, preset):
+    """bin/demo on the tests' dataset and model."""
+    asked = {}
+
+    def simulate(root, **options):
+        asked.update(options)
+        root.parent.mkdir(parents=True, exist_ok=True)
+        if not root.exists():
+            root.symlink_to(town)
+
+    monkeypatch.setattr(demo, "simulate", simulate)
+    monkeypatch.setattr(demo, "load_preset", lambda name: load_preset({"demo": str(preset)}[name]))
+    return asked
+
+
+def test_the_demo_ends_with_a_table_and_its_pictures_and_can_be_run_again(command, tiny_demo, tmp_path):
+    out = tmp_path / "demo"
+    first = command("demo", "--out", out, "--scans", 40, "--steps", 2)
+    assert first.status == 0, first.error
+    assert tiny_demo["scans"] == 40
+    table, pictures = first.out.split("pictures:\n")
+    for words in ("top-1 F1max", "polar-fft", "untrained", "rotated", "mean IoU", "sequence 08, 40 scans"):
+        assert words in table
+    paths = [Path(line.strip()) for line in pictures.splitlines()]
+    assert len(paths) >= 6 and all(path.stat().st_size > 5000 for path in paths)
+    assert out / "08" / "trajectory.png" in paths
+
+    again = command("demo", "--out", out, "--scans", 40, "--steps", 1)
+    assert again.status == 0, again.error
+    assert (out / "run" / "checkpoints" / "1").is_dir() and not (out / "run" / "checkpoints" / "2").exists()
+
+
+def test_the_demos_preset_is_what_it_trains():
+    assert load_preset("demo").steps <= 1000
+    assert re.search(r"bin/demo", demo.__doc__ or "")

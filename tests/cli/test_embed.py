@@ -1,0 +1,169 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import sglpr_jax
+
+from .conftest import assert_one_line_error
+
+load = sglpr_jax.DescriptorFile.load
+
+
+@pytest.fixture
+def embed(command, tmp_path):
+    """Run bin/embed; return how it ended and the file that it should have written."""
+
+    def call(*arguments, out="out.npz"):
+        return command("embed", "--out", tmp_path / out, *arguments), tmp_path / out
+
+    return call
+
+
+@pytest.fixture
+def scans(town, tmp_path):
+    """A plain folder of twelve scans, without poses."""
+    folder = tmp_path / "my_scans"
+    shutil.copytree(town / "sequences" / "08" / "velodyne", folder)
+    for path in sorted(folder.iterdir())[12:]:
+        path.unlink()
+    return folder
+
+
+def test_embedding_is_what_the_training_tested_and_twice_the_same(embed, trained, town):
+    ended, first = embed("--weights", trained.folder, "--data", town, "--seq", "08")
+    assert ended.status == 0, ended.error
+    assert ended.out.strip() == f"{first}: 40 descriptors of 256 numbers, 0 scans skipped"
+    _, second = embed("--weights", trained.folder / "weights", "--data", town, "--seq", "08", out="again.npz")
+    assert first.read_bytes() == second.read_bytes() or np.array_equal(
+        load(first).descriptors, load(second).descriptors
+    )
+    file, tested = load(first), load(trained.folder / "test" / "sglpr-raw.npz")
+    np.testing.assert_array_equal(file.descriptors, tested.descriptors)
+    np.testing.assert_allclose(np.linalg.norm(file.descriptors, axis=1), 1, rtol=1e-5)
+    assert file.sequence == "08" and file.ids[:2] == ("000000", "000001")
+    assert file.times is not None and file.pose_source == "sequences/08/poses.txt"
+    assert file.weights_hash == tested.weights_hash
+    assert file.config["model"]["grid"]["resolution_m"] == 3.2
+
+
+def test_a_descriptor_does_not_depend_on_the_batch(embed, trained, town):
+    options = ("--weights", trained.folder, "--data", town, "--seq", "08")
+    alone = load(embed(*options, "--batch", 1)[1])
+    together = load(trained.folder / "test" / "sglpr-raw.npz")
+    np.testing.assert_allclose(alone.descriptors, together.descriptors, atol=1e-5)
+
+
+def test_rotations_follow_their_seed(embed, town):
+    options = ("--method", "thumbnail", "--data", town, "--seq", "08", "--rotate-seed")
+    first, again, other = (load(embed(*options, seed, out=f"{i}.npz")[1]) for i, seed in enumerate((3, 3, 4)))
+    np.testing.assert_array_equal(first.descriptors, again.descriptors)
+    assert np.abs(first.descriptors - other.descriptors).max() > 0.1
+    assert first.config["rotation_seed"] == 3 and first.weights_hash == ""
+
+
+def test_a_folder_of_scans_needs_no_poses(embed, scans, trained):
+    ended, out = embed("--weights", trained.folder, "--data", scans)
+    assert ended.status == 0, ended.error
+    file = load(out)
+    assert len(file) == 12 and file.positions is None and file.sequence == "my_scans"
+
+
+@pytest.mark.parametrize(("size", "found"), [(100, "100 bytes"), (0, "0 bytes")])
+def test_a_bad_scan_is_named_and_left_out_only_when_asked(embed, scans, tmp_path, size, found):
+    whole = load(embed("--method", "thumbnail", "--data", scans)[1])
+    bad = scans / "000004.bin"
+    bad.write_bytes(bad.read_bytes()[:size])
+    options = ("--method", "thumbnail", "--data", scans)
+    ended, out = embed(*options, out="strict.npz")
+    assert_one_line_error(ended, bad, "16 bytes for each point", found)
+    assert not out.exists() and not list(tmp_path.glob(".*.tmp"))
+
+    ended, out = embed(*options, "--skip-bad", out="lenient.npz")
+    assert ended.status == 0
+    assert f"skipped 000004: {bad}" in ended.error and "11 descriptors of 625 numbers, 1 scans skipped" in ended.out
+    file = load(out)
+    assert file.ids == tuple(f"{i:06d}" for i in range(12) if i != 4)
+    np.testing.assert_array_equal(file.descriptors, np.delete(whole.descriptors, 4, axis=0))
+
+
+def test_an_error_leaves_an_older_file_as_it_was(embed, scans):
+    _, out = embed("--method", "thumbnail", "--data", scans)
+    before = out.read_bytes()
+    (scans / "000011.bin").write_bytes(b"cut")
+    assert_one_line_error(embed("--method", "thumbnail", "--data", scans)[0], "000011.bin")
+    assert out.read_bytes() == before
+
+
+def test_only_bad_scans_make_no_file(embed, scans):
+    for path in scans.iterdir():
+        path.write_bytes(b"cut")
+    ended, out = embed("--method", "thumbnail", "--data", scans, "--skip-bad")
+    assert_one_line_error(ended, "my_scans", "at least one readable scan")
+    assert ended.error.count("skipped") == 12 and not out.exists()
+
+
+def test_poses_that_are_missing_or_not_numbers_are_named(embed, town, tmp_path):
+    root = tmp_path / "town"
+    shutil.copytree(town, root)
+    poses = root / "sequences" / "08" / "poses.txt"
+    lines = poses.read_text().splitlines()
+    poses.write_text("\n".join([*lines[:2], "nan " + lines[2].split(maxsplit=1)[1], *lines[3:]]))
+    options = ("--method", "thumbnail", "--data", root, "--seq", "08")
+    assert_one_line_error(embed(*options)[0], f"{poses}, line 3", "finite numbers", "nan")
+    poses.write_text("\n".join(lines[:30]))
+    assert_one_line_error(embed(*options)[0], poses, "at least 40 rows", "found 30")
+    poses.unlink()
+    assert_one_line_error(embed(*options)[0], root, "sequences/08/poses.txt", "found none")
+
+
+def test_a_sequence_or_dataset_that_does_not_exist_is_named(embed, town, tmp_path):
+    options = ("--method", "thumbnail", "--data")
+    assert_one_line_error(embed(*options, town, "--seq", "8")[0], town, "'8'", "00, 05, 08")
+    assert_one_line_error(embed(*options, town)[0], town, "the name of one sequence", "00, 05, 08")
+    assert_one_line_error(embed(*options, tmp_path / "no")[0], tmp_path / "no", "no such folder")
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_the_work(embed, town):
+    options = ("--method", "thumbnail", "--data", town, "--seq", "08")
+    assert_one_line_error(embed(*options, out="no/out.npz")[0], "no/out.npz", "does not exist")
+    assert_one_line_error(embed(*options, out="out")[0], ".npz")
+
+
+def test_the_network_needs_weights(embed, town, tmp_path):
+    options = ("--data", town, "--seq", "08")
+    assert_one_line_error(embed(*options)[0], "--weights")
+    ended, _ = embed(*options, "--weights", tmp_path)
+    assert_one_line_error(ended, tmp_path, "config.json", "model.safetensors", "missing")
+
+
+def test_weights_of_another_model_or_damaged_ones_are_named(embed, town, trained, tmp_path):
+    folder = tmp_path / "weights"
+    shutil.copytree(trained.folder / "weights", folder)
+    options = ("--data", town, "--seq", "08", "--weights", folder)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "embed_dim": 16}))
+    assert_one_line_error(embed(*options)[0], folder / "model.safetensors", "should have shape", "found")
+    (folder / "config.json").write_text(json.dumps({**config, "unknown": 1}))
+    assert_one_line_error(embed(*options)[0], folder / "config.json", "ModelConfig", "unknown")
+    (folder / "config.json").write_text(json.dumps(config)[:-20])
+    assert_one_line_error(embed(*options)[0], folder / "config.json", "JSON")
+    (folder / "config.json").write_text(json.dumps(config))
+    content = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").write_bytes(content[: len(content) // 2])
+    assert_one_line_error(embed(*options)[0], folder / "model.safetensors", "safetensors")
+    one = dict(list(safetensors.numpy.load(content).items())[1:])
+    safetensors.numpy.save_file(one, folder / "model.safetensors")
+    assert_one_line_error(embed(*options)[0], folder / "model.safetensors", "missing")
+
+
+def test_images_smaller_than_the_models_window_are_refused(embed, images, trained, tmp_path):
+    folder = tmp_path / "weights"
+    shutil.copytree(trained.folder / "weights", folder)
+    config = json.loads((folder / "config.json").read_text())
+    config["grid"] |= {"height": 32, "width": 32}
+    (folder / "config.json").write_text(json.dumps(config))
+    ended, _ = embed("--data", images, "--seq", "06", "--weights", folder)
+    assert_one_line_error(ended, "32 x 32", "(22, 20)")

@@ -1,0 +1,103 @@
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+from .conftest import assert_one_line_error
+
+BIN = Path(__file__).resolve().parents[2] / "bin"
+
+
+@pytest.fixture
+def drive() -> DescriptorFile:
+    """Two equal laps, described so that every place is found."""
+    angle = np.arange(800) * (2 * np.pi / 400)
+    place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return DescriptorFile(
+        sequence="08",
+        ids=tuple(f"{i:06d}" for i in range(800)),
+        positions=np.pad(200 * place, ((0, 0), (0, 1))),
+        times=np.arange(800) * 0.5,
+        descriptors=place.astype(np.float32),
+        pose_source="sequences/08/poses.txt",
+        config={"method": "made up"},
+        weights_hash="abc",
+    )
+
+
+def test_every_protocol_is_printed_written_and_drawn(command, drive, tmp_path):
+    drive.save(tmp_path / "08.npz")
+    ended = command("evaluate", tmp_path / "08.npz")
+    assert ended.status == 0, ended.error
+    for words in ("top-1 F1max", "pairs F1max", "Recall@1", "3 m / 20 m", "400 revisits", "3-D", "2-D"):
+        assert words in ended.out
+    assert ended.out.count("sequences/08/poses.txt") == 3 and ended.out.count("1.000") == 3
+    folder = tmp_path / "08"
+    written = [Path(path) for path in re.findall(r"^written: (.*)$", ended.out, re.MULTILINE)]
+    assert written == [folder / name for name in ("results.json", "precision-recall.png", "trajectory.png")]
+    report = json.loads((folder / "results.json").read_text())
+    assert [result["score"] for result in report["results"]] == [1, 1, 1]
+    assert report["weights_hash"] == "abc" and report["config"] == {"method": "made up"}
+    for path in written[1:]:
+        with Image.open(path) as picture:
+            assert min(picture.size) > 200
+
+
+def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, drive, tmp_path):
+    dataclasses.replace(drive, times=None).save(tmp_path / "08.npz")
+    ended = command("evaluate", tmp_path / "08.npz", "--out", tmp_path / "a" / "b")
+    assert ended.status == 0 and (tmp_path / "a" / "b" / "results.json").is_file()
+    assert "290 frames" in ended.out
+
+
+def test_a_drive_without_revisits_says_so(command, drive, tmp_path):
+    straight = np.arange(800.0)[:, None] * [[6.0, 0.0, 0.0]]  # farther apart than any "same place"
+    dataclasses.replace(drive, positions=straight).save(tmp_path / "08.npz")
+    ended = command("evaluate", tmp_path / "08.npz")
+    assert ended.status == 0, ended.error
+    assert ended.out.count("no revisit") == 3
+    assert [x["score"] for x in json.loads((tmp_path / "08" / "results.json").read_text())["results"]] == [None] * 3
+    assert not (tmp_path / "08" / "precision-recall.png").exists()
+
+
+def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, drive, tmp_path, monkeypatch):
+    drive.save(tmp_path / "08.npz")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    ended = command("evaluate", tmp_path / "08.npz")
+    assert ended.status == 0 and "sglpr-jax[viz]" in ended.error
+    assert [path.name for path in (tmp_path / "08").iterdir()] == ["results.json"]
+
+
+def test_descriptors_without_positions_cannot_be_scored(command, drive, tmp_path):
+    dataclasses.replace(drive, positions=None, pose_source=None).save(tmp_path / "mine.npz")
+    assert_one_line_error(
+        command("evaluate", tmp_path / "mine.npz"), tmp_path / "mine.npz", "positions", "without poses"
+    )
+    assert not (tmp_path / "mine").exists()
+
+
+def test_a_file_of_another_kind_is_refused_without_a_traceback(command, tmp_path):
+    assert_one_line_error(command("evaluate", tmp_path / "no.npz"), tmp_path / "no.npz", "found none")
+    (tmp_path / "cut.npz").write_bytes(b"PK\3\4")
+    call = [sys.executable, "-m", "sglpr_jax.cli.evaluate", str(tmp_path / "cut.npz")]
+    ended = subprocess.run(call, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr.startswith(f"error: {tmp_path / 'cut.npz'}: expected a descriptor file")
+    assert ended.stderr.count("\n") == 1
+
+
+def test_every_script_of_bin_starts_a_command(command):
+    for path in BIN.iterdir():
+        assert path.stat().st_mode & 0o111, path
+        module = re.search(r"-m (sglpr_jax\.cli\.)(\w+)", path.read_text())
+        assert module or path.name in ("_python", "test")
+        if module:
+            assert module[2] == path.name and command(module[2], "--help").status == 0

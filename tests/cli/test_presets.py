@@ -1,0 +1,46 @@
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from sglpr_jax.cli.presets import load_preset, preset_names
+from sglpr_jax.train.config import TrainConfig
+
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.py"))
+
+
+def test_every_file_of_configs_is_a_preset():
+    assert set(preset_names()) == {path.stem for path in CONFIGS}
+    assert {"small", "paper", "demo"} <= set(preset_names())
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_a_preset_loads_and_says_what_to_expect_and_how_to_run_it(path):
+    assert isinstance(load_preset(path.stem), TrainConfig)
+    said = ast.get_docstring(ast.parse(path.read_text())) or ""
+    command = re.search(r"^Command: (bin/.+)$", said, re.MULTILINE)
+    assert command and re.search("Expect|Reproduces", said)
+    assert command[1] == f"bin/{path.stem}" or command[1].endswith(f"--preset {path.stem}")
+
+
+def test_the_paper_presets_differ_in_the_model_alone():
+    paper, other = load_preset("paper"), load_preset("paper-11m")
+    assert other.model.grid.resolution_m == paper.model.grid.resolution_m / 2
+    assert other.optimizer == paper.optimizer and other.loss == paper.loss and other.sampling == paper.sampling
+
+
+def test_a_file_of_ones_own_is_a_preset(preset):
+    assert load_preset(str(preset)).steps == 4
+
+
+@pytest.mark.parametrize("name", ["smal", "nowhere/mine.py"])
+def test_an_unknown_preset_lists_those_that_exist(name):
+    with pytest.raises(ValueError, match=rf"no preset '{name}'.*demo, paper.*small"):
+        load_preset(name)
+
+
+def test_a_file_without_a_config_is_named(tmp_path):
+    (tmp_path / "mine.py").write_text("CONFIG = {'steps': 3}\n")
+    with pytest.raises(ValueError, match=r"mine\.py: expected CONFIG, a TrainConfig, found dict"):
+        load_preset(str(tmp_path / "mine.py"))

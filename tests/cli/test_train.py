@@ -1,0 +1,184 @@
+import dataclasses
+import json
+import os
+import shutil
+import signal
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from PIL import Image
+
+import sglpr_jax
+from sglpr_jax.cli import train as train_command
+from sglpr_jax.cli.presets import load_preset
+from sglpr_jax.cli.train import TrainCommand, parse
+from sglpr_jax.models.params import weights_hash
+from sglpr_jax.train.metrics_log import read_metrics
+
+from .conftest import assert_one_line_error
+
+METHODS = ("sglpr", "untrained", "thumbnail", "polar-fft")
+
+
+def test_without_flags_the_small_preset_runs_and_08_stays_a_string():
+    assert parse([]) == TrainCommand(seq="08", preset="small", config=load_preset("small"))
+    assert parse(["--seq", "00", "--train-seqs", "02", "08"]).train_seqs == ("02", "08")
+
+
+def test_flags_override_the_preset_and_the_preset_the_defaults(preset):
+    config = parse(["--preset", str(preset), "--steps", "7", "--optimizer.learning-rate", "1e-2"]).config
+    own = load_preset(str(preset))
+    assert config == dataclasses.replace(own, steps=7, optimizer=dataclasses.replace(own.optimizer, learning_rate=1e-2))
+    assert parse(["--preset", "paper", "--model.grid.resolution-m", "0.4"]).config.model.grid.resolution_m == 0.4
+
+
+def test_a_mistyped_flag_or_preset_is_refused(command):
+    ended = command("train", "--stepps", 3)
+    assert ended.status == 2 and "--stepps" in ended.error and "--steps" in ended.error
+    assert_one_line_error(command("train", "--preset", "smal"), "smal", "paper", "small")
+
+
+def test_help_names_the_presets_and_the_examples(command):
+    ended = command("train", "--help")
+    assert ended.status == 0
+    for words in ("paper-head-b", "bin/train --seq 08", "--optimizer.learning-rate", "--resume"):
+        assert words in ended.out
+
+
+def test_a_run_leaves_everything_that_it_printed(trained, town):
+    folder, ended = trained
+    assert f"run: {folder}" in ended.out and "training on 00, 05; testing on 08" in ended.error
+    report = json.loads((folder / "test" / "results.json").read_text())
+    for title in ("raw", "rotated"):
+        assert set(report[title]) == set(METHODS)
+        for method in METHODS:
+            file = sglpr_jax.DescriptorFile.load(folder / "test" / f"{method}-{title}.npz")
+            assert len(file) == 40 and file.sequence == "08"
+            assert file.config["rotation_seed"] == (None if title == "raw" else 0)
+        top1 = report[title]["sglpr"][0]
+        assert top1["protocol"] == "top-1 F1max" and top1["counts"]["revisits"] > 0
+        assert f"{top1['score']:.3f}" in ended.out
+    raw, rotated = (folder / "test" / f"thumbnail-{title}.npz" for title in ("raw", "rotated"))
+    change = sglpr_jax.DescriptorFile.load(raw).descriptors - sglpr_jax.DescriptorFile.load(rotated).descriptors
+    assert np.abs(change).max() > 0.1
+    segmentation = report["segmentation"]
+    assert 0 <= segmentation["mean_iou"] <= 1 and segmentation["cells"] > 1000
+    assert f"mean IoU {segmentation['mean_iou']:.3f}" in ended.out
+    for name in ("precision-recall-raw", "trajectory-raw", "precision-recall-rotated", "segmentation"):
+        with Image.open(folder / "test" / f"{name}.png") as picture:
+            assert min(picture.size) > 200
+
+
+def test_a_run_can_be_loaded_and_says_what_it_was(trained, preset, town):
+    folder = trained.folder
+    params = sglpr_jax.load(folder)
+    assert params.config == load_preset(str(preset)).model
+    trained_file = sglpr_jax.DescriptorFile.load(folder / "test" / "sglpr-raw.npz")
+    untrained_file = sglpr_jax.DescriptorFile.load(folder / "test" / "untrained-raw.npz")
+    assert trained_file.weights_hash == weights_hash(params) != untrained_file.weights_hash
+    settings = json.loads((folder / "config.json").read_text())
+    assert settings["seq"] == "08" and settings["data"] == str(town)
+    assert settings["config"]["optimizer"]["learning_rate"] == 1e-3
+    lines = read_metrics(folder / "metrics.jsonl")
+    assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4]
+    assert [line["step"] for line in lines if "score" in line] == [2, 4]
+    assert {"triplet", "cross_entropy", "dice", "steps_per_second", "data_wait"} <= lines[0].keys()
+
+
+def test_a_run_is_not_overwritten(command, trained, town, preset):
+    before = (trained.folder / "config.json").read_bytes()
+    ended = command("train", "--data", town, "--preset", preset, "--out", trained.folder)
+    assert_one_line_error(ended, trained.folder, "--resume", "--out")
+    assert (trained.folder / "config.json").read_bytes() == before
+
+
+def test_a_run_is_resumed_with_its_own_settings_only(command, trained, town, preset, tmp_path):
+    options = ("--data", town, "--preset", preset, "--resume", "--out")
+    ended = command("train", *options, trained.folder, "--optimizer.learning-rate", 1, "--model.embed-dim", 16)
+    assert_one_line_error(ended, "config.json", "config.model.embed_dim, config.optimizer.learning_rate")
+    other = command("train", "--seq", "05", *options, trained.folder)
+    assert_one_line_error(other, "others: seq")
+    assert_one_line_error(command("train", *options, tmp_path), tmp_path / "config.json", "expected a run to resume")
+
+
+def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, town, preset, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    read_batch = train_command.read_batch
+    out = tmp_path / "run"
+    options = ("--data", town, "--preset", preset, "--out", out)
+
+    def interrupted(*arguments, **named):
+        os.kill(os.getpid(), signal.SIGINT)
+        monkeypatch.setattr(train_command, "read_batch", read_batch)
+        return read_batch(*arguments, **named)
+
+    monkeypatch.setattr(train_command, "read_batch", interrupted)
+    handler = signal.getsignal(signal.SIGINT)
+    ended = command("train", *options)
+    assert ended.status == 130
+    assert "stopping after this step" in ended.error and "stopped at step 1 of 4; go on with --resume" in ended.error
+    assert signal.getsignal(signal.SIGINT) is handler
+
+    resumed = command("train", *options, "--resume")
+    assert resumed.status == 0, resumed.error
+    found, expected = (
+        safetensors.numpy.load_file(folder / "weights" / "model.safetensors") for folder in (out, trained.folder)
+    )
+    assert found.keys() == expected.keys()
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name])
+    assert [line["step"] for line in read_metrics(out / "metrics.jsonl") if "loss" in line] == [1, 2, 3, 4]
+
+    longer = command("train", *options, "--resume", "--steps", 5)
+    assert longer.status == 0, longer.error
+    assert read_metrics(out / "metrics.jsonl")[-1]["step"] == 5
+    assert json.loads((out / "config.json").read_text())["config"]["steps"] == 5
+
+
+def test_bad_labels_end_a_training_that_can_go_on_once_they_are_right(command, town, preset, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    root = tmp_path / "town"
+    shutil.copytree(town, root)
+    good = {path: path.read_bytes() for path in (root / "sequences" / "00" / "labels").iterdir()}
+    for path, content in good.items():
+        path.write_bytes(content[:-4])
+    options = ("--data", root, "--preset", preset, "--out", tmp_path / "run", "--steps", 1, "--train-seqs", "00")
+    ended = command("train", *options)
+    assert_one_line_error(ended, root / "sequences" / "00" / "labels", "one per point", "bytes")
+    for path, content in good.items():
+        path.write_bytes(content)
+    resumed = command("train", *options, "--resume")
+    assert resumed.status == 0, resumed.error
+    assert (tmp_path / "run" / "weights" / "model.safetensors").is_file()
+
+
+def test_ready_made_images_train_too_and_a_drive_without_revisits_says_so(command, images, preset, tmp_path):
+    out = tmp_path / "run"
+    ended = command("train", "--seq", "06", "--data", images, "--preset", preset, "--out", out, "--steps", 2)
+    assert ended.status == 0, ended.error
+    assert "no revisit" in ended.out and "mean IoU" not in ended.out
+    report = json.loads((out / "test" / "results.json").read_text())
+    assert [result["score"] for result in report["raw"]["sglpr"]] == [None] * 3
+    assert "segmentation" not in report
+    assert "cross_entropy" not in read_metrics(out / "metrics.jsonl")[0]
+    assert sorted(path.name for path in (out / "test").glob("*.png")) == [
+        "trajectory-raw.png",
+        "trajectory-rotated.png",
+    ]
+
+
+@pytest.mark.parametrize("missing", ["poses", "positives"])
+def test_what_cannot_be_trained_on_leaves_no_run(command, town, preset, tmp_path, missing):
+    root, out = tmp_path / "town", tmp_path / "run"
+    shutil.copytree(town, root)
+    poses = root / "sequences" / "00" / "poses.txt"
+    flags = ("--train-seqs", "00")
+    if missing == "poses":
+        poses.unlink()
+        words = (root, "sequences/00/poses.txt", "poses/00.txt")
+    else:
+        flags = (*flags, "--sampling.positive-m", "0.001")
+        words = ("0.001 m", "nothing can be a positive")
+    assert_one_line_error(command("train", "--data", root, "--preset", preset, "--out", out, *flags), *words)
+    assert not out.exists()

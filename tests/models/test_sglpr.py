@@ -1,0 +1,194 @@
+"""The public calls: what `describe` promises, and that it pays for nothing that training alone needs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.sglpr import SGLPR, Params, describe, field_of_view, forward, init, prepare, segment
+
+# One stage instead of two, so that a program compiles in a second.
+CONFIG = dataclasses.replace(
+    model_preset("tiny"),
+    depths=(2,),
+    heads=(2,),
+    head=HeadConfig(channels=(8, 16), kernels=(4, 3), strides=(4, 2), clusters=4, cbam_reduction=4),
+)
+POLAR = dataclasses.replace(
+    CONFIG,
+    polar=(16, 32),
+    field="circle",
+    head=dataclasses.replace(CONFIG.head, tap="tokens", kernels=(3, 3), strides=(1, 1)),
+)
+SIZE = CONFIG.grid.height
+FAST_COMPILE = {"xla_backend_optimization_level": 0}
+
+fast_describe = jax.jit(describe, compiler_options=FAST_COMPILE)
+
+
+def random_params(config) -> Params:
+    """Weights that tell images apart; made by numpy, for compiling `init` takes seconds."""
+    image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
+    shapes = jax.eval_shape(lambda key: SGLPR(config).init(key, image, segment=True), jax.random.key(0))
+    rng = np.random.default_rng(0)
+
+    def draw(leaf):
+        inputs = np.prod(leaf.shape[:-1])
+        return jnp.asarray(rng.normal(scale=inputs**-0.5 if inputs > 1 else 0.5, size=leaf.shape), leaf.dtype)
+
+    return Params(jax.tree.map(draw, shapes["params"]), config)
+
+
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return random_params(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Counts of points: six images, of which none is like another."""
+    rng = np.random.default_rng(0)
+    return jnp.asarray(rng.poisson(rng.uniform(0, 4, (6, 1, 1)), (6, SIZE, SIZE)), jnp.int32)
+
+
+@pytest.fixture(scope="module")
+def descriptors(params, images):
+    return fast_describe(params, images)
+
+
+def test_descriptors_are_256_numbers_of_unit_length_that_differ(descriptors):
+    assert descriptors.shape == (6, 256) and descriptors.dtype == jnp.float32
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=-1), 1, atol=1e-6)
+    apart = np.linalg.norm(descriptors[:, None] - descriptors[None], axis=-1) + np.eye(6)
+    assert apart.min() > 1e-3
+
+
+def test_any_leading_axes_and_counts_of_any_type_give_the_same(params, images, descriptors):
+    one = fast_describe(params, images[0])
+    assert one.shape == (256,)
+    np.testing.assert_allclose(one, descriptors[0], atol=1e-5)
+    many = fast_describe(params, images.astype(jnp.float32).reshape(1, 2, 3, SIZE, SIZE))
+    np.testing.assert_allclose(many.reshape(6, 256), descriptors, atol=1e-5)
+
+
+def test_vmap_agrees(params, images, descriptors):
+    mapped = jax.jit(jax.vmap(describe, in_axes=(None, 0)), compiler_options=FAST_COMPILE)
+    np.testing.assert_allclose(mapped(params, images), descriptors, atol=1e-5)
+
+
+def test_without_jit_it_is_the_same(params, images, descriptors):
+    np.testing.assert_allclose(describe(params, images[:1]), descriptors[:1], atol=1e-5)
+
+
+def test_gradients_are_finite_and_reach_image_and_weights_even_from_an_empty_image(params, images):
+    loss = jax.grad(lambda p, x: describe(p, x)[..., 0].sum(), (0, 1))
+    both = jnp.stack([jnp.zeros((SIZE, SIZE)), images[0].astype(jnp.float32)])
+    weights, image = jax.jit(loss, compiler_options=FAST_COMPILE)(params, both)
+    assert isinstance(weights, Params) and weights.config == CONFIG
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((weights, image)))
+    assert np.abs(image[1]).max() > 0
+    assert np.abs(weights.weights["backbone"]["patch_embed"]["projection"]["kernel"]).max() > 0
+
+
+@pytest.mark.parametrize("shape", [(SIZE, SIZE + 2), (3, SIZE // 2, SIZE), (SIZE, SIZE, 1)])
+@pytest.mark.parametrize("call", [describe, segment, forward])
+def test_images_of_the_wrong_size_are_refused(params, call, shape):
+    with pytest.raises(ValueError, match=rf"expected images \[\.\.\., H, W\] of {SIZE} x {SIZE} cells, found shape"):
+        call(params, jnp.zeros(shape))
+
+
+def operations(compiled) -> float:
+    return compiled.cost_analysis()["flops"]
+
+
+def compiled(call, params, images, **options):
+    return jax.jit(lambda p, x: call(p, x, **options), compiler_options=FAST_COMPILE).lower(params, images).compile()
+
+
+def test_describe_computes_nothing_of_the_segmentation_head(params, images):
+    backbone = {name: part for name, part in params.weights.items() if name != "segmentation_head"}
+    without_head = operations(compiled(describe, Params(backbone, CONFIG), images))
+    assert operations(compiled(describe, params, images)) == without_head
+    head = 2 * len(images) * SIZE**2 * CONFIG.embed_dim * CONFIG.classes
+    assert operations(compiled(forward, params, images)) >= without_head + head
+
+
+def test_a_head_that_taps_tokens_spares_describe_the_expansion_too():
+    params, image = random_params(POLAR), jnp.zeros((1, SIZE, SIZE))
+    needed = {name: part for name, part in params.weights.items() if name in ("backbone", "place_head")}
+    assert params.weights.keys() - needed.keys() == {"segmentation_head", "expand"}
+    assert operations(compiled(describe, params, image)) == operations(compiled(describe, Params(needed, POLAR), image))
+
+
+def test_forward_gives_descriptors_logits_and_every_named_map(params, images, descriptors):
+    outputs = jax.jit(forward, compiler_options=FAST_COMPILE)(params, images)
+    np.testing.assert_allclose(outputs.descriptor, descriptors, atol=1e-5)
+    assert outputs.logits.shape == (6, SIZE, SIZE, 20)
+    assert {"patch_embed", "enc0_block1", "norm_up", "pixels", "cbam", "head_convolution1"} <= set(
+        outputs.intermediates
+    )
+    kernel = params.weights["segmentation_head"]["kernel"]
+    np.testing.assert_allclose(outputs.logits, outputs.intermediates["pixels"] @ kernel, atol=1e-4)
+    sparse = jax.eval_shape(lambda p, x: forward(p, x, segment=3), params, images)
+    assert sparse.logits.shape == (2, SIZE, SIZE, 20) and sparse.descriptor.shape == (6, 256)
+
+
+def test_segment_keeps_the_leading_axes(params, images):
+    shape = jax.eval_shape(segment, params, images.reshape(2, 3, SIZE, SIZE)).shape
+    assert shape == (2, 3, SIZE, SIZE, 20)
+
+
+def test_params_are_a_pytree_whose_static_part_is_the_configuration(params):
+    leaves, structure = jax.tree.flatten(params)
+    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
+    assert jax.tree.unflatten(structure, leaves).config is CONFIG
+    other = dataclasses.replace(params, config=dataclasses.replace(CONFIG, counts="raw"))
+    assert jax.tree.structure(other) != structure
+    assert hash(CONFIG) == hash(dataclasses.replace(CONFIG))
+
+
+def test_counts_are_rescaled_as_configured():
+    counts = jnp.asarray([[[0, 1, 9, 10, 1000] + [0] * (SIZE - 5)] * SIZE], jnp.int32)
+    n = np.asarray(counts[0], np.float64)
+    for name, expected in {"raw": n, "log1p": np.log1p(n), "clipped": np.minimum(n, 10) / 10}.items():
+        prepared = prepare(counts, dataclasses.replace(CONFIG, counts=name))
+        assert prepared.shape == (1, SIZE, SIZE, 1) and prepared.dtype == jnp.float32
+        np.testing.assert_allclose(prepared[0, ..., 0], expected, rtol=1e-6)
+
+
+def test_the_circle_blanks_what_a_rotation_would_move_out_of_view():
+    grid = Grid(height=32, width=48)
+    round_view = dataclasses.replace(CONFIG, field="circle", grid=grid)
+    sees = field_of_view(round_view)[0]
+    for v, u in ((0, 23), (15, 23), (15, 8), (15, 7), (0, 0), (31, 24)):
+        assert sees[v, u] == (np.hypot(v - 15.5, u - 23.5) < 16)
+    assert field_of_view(dataclasses.replace(round_view, field="square")).all()
+    prepared = prepare(jnp.ones((2, 32, 48)), round_view)
+    np.testing.assert_allclose(prepared[..., 0], np.broadcast_to(sees * np.log(2), (2, 32, 48)), rtol=1e-6)
+
+
+def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(images):
+    params = random_params(POLAR)
+    outside = ~field_of_view(POLAR)[0]
+    changed = jnp.where(outside, 7, images)
+    assert (changed != images).any()
+    np.testing.assert_array_equal(fast_describe(params, changed), fast_describe(params, images))
+    shifted = jnp.roll(images, 3, axis=2)
+    assert np.abs(fast_describe(params, shifted) - fast_describe(params, images)).max() > 1e-3
+
+
+def test_init_makes_every_weight_of_its_preset_from_its_key():
+    config = dataclasses.replace(CONFIG, drop_path=0.0)
+    params = init(jax.random.key(0), config=config)
+    shapes = jax.tree.map(jnp.shape, params.weights)
+    assert shapes == jax.tree.map(jnp.shape, random_params(config).weights)
+    assert params.config is config
+    kernel = params.weights["segmentation_head"]["kernel"]
+    assert 0.9 * config.embed_dim**-0.5 < np.abs(kernel).max() <= config.embed_dim**-0.5
+    with pytest.raises(ValueError, match="no model preset 'huge'; there are paper, "):
+        init(jax.random.key(0), preset="huge")

@@ -1,0 +1,164 @@
+"""Every scan gets the descriptor of its own image, whatever the batches; a bad scan never passes in silence."""
+
+import dataclasses
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.bev import Grid, rasterize, rotate_image, rotate_points
+from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.embed import embed
+
+GRID = Grid(resolution_m=1.0, height=16, width=16)
+SCANS = 7
+
+
+def flatten(images):
+    """A method whose descriptor is the image itself."""
+    return images.reshape(len(images), -1)
+
+
+def clouds() -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [rng.uniform(-9, 9, (n, 3)).astype(np.float32) for n in range(20, 20 + SCANS)]
+
+
+@pytest.fixture
+def scans() -> ScanSequence:
+    by_path = {Path(f"{2 * i:06d}.bin"): cloud for i, cloud in enumerate(clouds())}
+    return ScanSequence(
+        name="08",
+        ids=tuple(path.stem for path in by_path),
+        positions=np.arange(3.0 * SCANS).reshape(SCANS, 3),
+        times=np.arange(SCANS) / 10,
+        pose_source="poses/08.txt",
+        scan_paths=tuple(by_path),
+        label_paths=(None,) * SCANS,
+        read_scan=by_path.__getitem__,
+    )
+
+
+@pytest.fixture
+def pictures() -> ImageSequence:
+    values = np.random.default_rng(0).uniform(0, 10, (SCANS, 20, 24)).astype(np.float32)
+    return ImageSequence(
+        name="06",
+        ids=tuple(f"{i:06d}" for i in range(SCANS)),
+        positions=np.zeros((SCANS, 3)),
+        times=None,
+        pose_source="06/pose.txt",
+        image_paths=tuple(Path(f"{i}.png") for i in range(SCANS)),
+        resolution_m=0.4,
+        read_image=lambda path: values[int(path.stem)],
+    )
+
+
+def with_bad_scan(sequence: ScanSequence, *bad: int) -> ScanSequence:
+    def read(path: Path) -> np.ndarray:
+        if sequence.scan_paths.index(path) in bad:
+            raise ValueError(f"{path}: not a whole scan")
+        return sequence.read_scan(path)
+
+    return dataclasses.replace(sequence, read_scan=read)
+
+
+def drawn_angles(seed: int):
+    return np.random.default_rng(seed).uniform(0, 2 * np.pi, SCANS).astype(np.float32)
+
+
+def test_scans_are_rasterised_and_keep_what_evaluation_needs(scans, tmp_path):
+    found = embed(flatten, scans, GRID, config={"method": "pixels"}, weights_hash="abc")
+    expected = [np.asarray(rasterize(jnp.asarray(cloud), grid=GRID)).reshape(-1) for cloud in clouds()]
+    np.testing.assert_array_equal(found.descriptors, expected)
+    assert found.descriptors.dtype == np.float32 and found.descriptors.sum() > 0
+    assert (found.sequence, found.ids, found.pose_source) == ("08", scans.ids, "poses/08.txt")
+    assert (found.config, found.weights_hash) == ({"method": "pixels", "rotation_seed": None}, "abc")
+    np.testing.assert_array_equal(found.positions, scans.positions)
+    np.testing.assert_array_equal(found.times, scans.times)
+    found.save(tmp_path / "08.npz")
+    np.testing.assert_array_equal(DescriptorFile.load(tmp_path / "08.npz").descriptors, expected)
+
+
+def test_each_scan_is_turned_by_its_own_angle(scans):
+    found = embed(flatten, scans, GRID, config={}, rotation_seed=3)
+    for cloud, angle, descriptor in zip(clouds(), drawn_angles(3), found.descriptors, strict=True):
+        turned = rotate_points(jnp.asarray(cloud), jnp.float32(angle))
+        np.testing.assert_array_equal(descriptor, np.asarray(rasterize(turned, grid=GRID)).reshape(-1))
+    assert found.config == {"rotation_seed": 3}
+    other = embed(flatten, scans, GRID, config={}, rotation_seed=4)
+    assert (other.descriptors != found.descriptors).any(axis=1).all()
+
+
+def test_images_are_turned_whole_and_cropped_to_the_grid(pictures):
+    every = np.stack([pictures.image(i) for i in range(SCANS)])
+    whole = embed(flatten, pictures, None, config={})
+    np.testing.assert_array_equal(whole.descriptors, every.reshape(SCANS, -1))
+    cropped = embed(flatten, pictures, GRID, config={})
+    np.testing.assert_array_equal(cropped.descriptors, every[:, 2:18, 4:20].reshape(SCANS, -1))
+    turned = embed(flatten, pictures, GRID, config={}, rotation_seed=3)
+    expected = rotate_image(jnp.asarray(every), jnp.asarray(drawn_angles(3)))[:, 2:18, 4:20]
+    np.testing.assert_allclose(turned.descriptors, expected.reshape(SCANS, -1), atol=1e-4)
+    assert turned.times is None
+
+
+@pytest.mark.parametrize("batch", [1, 3, 7, 16])
+def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch):
+    shapes = set()
+
+    def describe(images):
+        shapes.add(images.shape)
+        return flatten(images)
+
+    found = embed(describe, scans, GRID, config={}, batch=batch)
+    np.testing.assert_array_equal(found.descriptors, embed(flatten, scans, GRID, config={}).descriptors)
+    assert shapes == {(batch, GRID.height, GRID.width)}
+
+
+def test_progress_ends_with_all_scans(scans):
+    seen = []
+    embed(flatten, scans, GRID, config={}, batch=3, on_progress=seen.append)
+    assert seen == [3, 6, 7]
+
+
+def test_a_scan_that_cannot_be_read_raises_its_own_error(scans):
+    with pytest.raises(ValueError, match=r"000004\.bin: not a whole scan"):
+        embed(flatten, with_bad_scan(scans, 2), GRID, config={})
+
+
+def test_bad_scans_are_reported_and_left_out_if_asked(scans):
+    reported = []
+    found = embed(
+        flatten,
+        with_bad_scan(scans, 2, 6),
+        GRID,
+        config={},
+        rotation_seed=3,
+        batch=4,
+        on_bad_scan=lambda name, error: reported.append((name, str(error))),
+    )
+    kept = [0, 1, 3, 4, 5]
+    assert reported == [("000004", "000004.bin: not a whole scan"), ("000012", "000012.bin: not a whole scan")]
+    assert found.ids == tuple(scans.ids[i] for i in kept)
+    np.testing.assert_array_equal(found.positions, scans.positions[kept])
+    np.testing.assert_array_equal(found.times, scans.times[kept])
+    everything = embed(flatten, scans, GRID, config={}, rotation_seed=3)
+    np.testing.assert_array_equal(found.descriptors, everything.descriptors[kept])  # the others keep their angles
+
+
+def test_nothing_but_bad_scans_is_an_error(scans):
+    with pytest.raises(ValueError, match="sequence 08: expected at least one readable scan, found none"):
+        embed(flatten, with_bad_scan(scans, *range(SCANS)), GRID, config={}, on_bad_scan=lambda *_: None)
+
+
+def test_scans_without_a_grid_are_refused(scans):
+    with pytest.raises(ValueError, match="scans need a grid"):
+        embed(flatten, scans, None, config={})
+
+
+def test_a_source_without_poses_can_be_embedded(scans):
+    bare = dataclasses.replace(scans, positions=None, times=None, pose_source=None)
+    found = embed(flatten, bare, GRID, config={})
+    assert found.positions is None and found.times is None and len(found) == SCANS

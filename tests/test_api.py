@@ -1,0 +1,62 @@
+"""The public API as a whole: documented, in one style, and enough for the README's lines of Python."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sglpr_jax
+
+PUBLIC = [(name, getattr(sglpr_jax, name)) for name in sglpr_jax.__all__]
+CALLABLES = [(name, member) for name, member in PUBLIC if callable(member)]
+FUNCTIONS = [(name, inspect.signature(member)) for name, member in CALLABLES if not inspect.isclass(member)]
+NAMES_NOT_OPTIONS = {("open_sequence", "name")}
+
+
+def test_all_is_sorted_out_and_complete():
+    assert len(set(sglpr_jax.__all__)) == len(sglpr_jax.__all__)
+    assert {"load", "init", "describe", "rasterize", "rasterize_labels", "Grid"} <= set(sglpr_jax.__all__)
+
+
+@pytest.mark.parametrize(("name", "member"), CALLABLES, ids=lambda x: x if isinstance(x, str) else "")
+def test_everything_public_is_documented(name, member):
+    said = inspect.getdoc(member) or ""
+    first = said.splitlines()[0] if said else ""
+    assert len(first) > 20 and not first.startswith(f"{name}("), "a dataclass's generated docstring is none"
+
+
+@pytest.mark.parametrize(("name", "signature"), FUNCTIONS, ids=lambda x: x if isinstance(x, str) else "")
+def test_key_comes_first_and_options_are_named(name, signature):
+    parameters = list(signature.parameters.values())
+    for position, parameter in enumerate(parameters):
+        if parameter.name == "key" and parameter.default is parameter.empty:
+            assert position == 0
+        elif parameter.default is not parameter.empty and (name, parameter.name) not in NAMES_NOT_OPTIONS:
+            assert parameter.kind is parameter.KEYWORD_ONLY, parameter.name
+
+
+def test_the_readmes_lines(tmp_path):
+    params = sglpr_jax.init(jax.random.key(0), preset="tiny")
+    rng = np.random.default_rng(0)
+    cloud = np.concatenate([rng.normal(scale=8, size=(2000, 3)), rng.random((2000, 1))], axis=1)
+    cloud.astype("<f4").tofile(tmp_path / "000000.bin")
+    sglpr_jax.save(params, tmp_path / "run" / "weights")
+
+    loaded = sglpr_jax.load(tmp_path / "run")
+    points = sglpr_jax.read_scan(tmp_path / "000000.bin")
+    bev = sglpr_jax.rasterize(points, grid=loaded.config.grid)
+    descriptor = sglpr_jax.describe(loaded, bev)
+
+    assert descriptor.shape == (256,) and descriptor.dtype == jnp.float32
+    np.testing.assert_allclose(jnp.linalg.norm(descriptor), 1, rtol=1e-5)
+    np.testing.assert_array_equal(sglpr_jax.describe(params, bev), descriptor)
+    turned = sglpr_jax.rotate_points(points, jnp.float32(1.0))
+    other = sglpr_jax.describe(params, sglpr_jax.rasterize(turned, grid=loaded.config.grid))
+    assert np.abs(other - descriptor).max() > 1e-4
+
+
+def test_an_unknown_preset_lists_those_that_exist():
+    with pytest.raises(ValueError, match=r"'smal'; there are paper, .*small"):
+        sglpr_jax.init(jax.random.key(0), preset="smal")

@@ -1,0 +1,73 @@
+"""Checkpoints come back bit by bit, the newest and the best stay, and those of another model are refused."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import pytest
+
+from sglpr_jax.train.checkpoint import Checkpoints
+from sglpr_jax.train.state import TrainState, new_state
+
+
+@pytest.fixture
+def checkpoints(tmp_path):
+    opened = Checkpoints(tmp_path / "checkpoints")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def state(config, params) -> TrainState:
+    """A state in which no array is at its first value."""
+    fresh = new_state(config, params=params)
+    moments = jax.tree.map(lambda leaf: leaf + jnp.asarray(3, leaf.dtype), fresh.optimizer)
+    return TrainState(jnp.int32(17), params, moments)
+
+
+def test_a_state_comes_back_bit_by_bit(checkpoints, state, config):
+    checkpoints.save(state, score=0.5)
+    found = checkpoints.restore(config)
+    chex.assert_trees_all_equal(found, state)
+    assert found.params.config == config.model
+    assert [leaf.dtype for leaf in jax.tree.leaves(found)] == [leaf.dtype for leaf in jax.tree.leaves(state)]
+
+
+def test_what_is_saved_is_the_state_of_that_moment(checkpoints, state, config):
+    """A step donates its state's buffers while the checkpoint of it may still be on its way to the disk."""
+    next_step = jax.jit(lambda s: jax.tree.map(lambda leaf: leaf + jnp.asarray(1, leaf.dtype), s), donate_argnums=0)
+    moving = jax.tree.map(jnp.copy, state)
+    checkpoints.save(moving)
+    for _ in range(5):
+        moving = next_step(moving)
+    chex.assert_trees_all_equal(checkpoints.restore(config), state)
+
+
+def test_the_two_newest_and_the_best_are_kept(checkpoints, state, config, tmp_path):
+    for step, score in enumerate([0.1, 0.9, 0.2, 0.3, 0.4, None]):
+        checkpoints.save(state.replace(step=jnp.int32(step)), score=score)
+    assert checkpoints.latest_step() == 5
+    assert checkpoints.restore(config).step == 5
+    checkpoints.close()
+    assert sorted(folder.name for folder in (tmp_path / "checkpoints").iterdir()) == ["1", "4", "5"]
+
+
+def test_a_step_is_saved_once(checkpoints, state, config):
+    checkpoints.save(state)
+    checkpoints.save(dataclasses.replace(state, params=jax.tree.map(jnp.zeros_like, state.params)))
+    chex.assert_trees_all_equal(checkpoints.restore(config), state)
+
+
+@pytest.mark.parametrize("change", [{"embed_dim": 16}, {"depths": (3,)}], ids=["other shapes", "other layers"])
+def test_the_checkpoint_of_another_model_is_refused(checkpoints, state, config, change, tmp_path):
+    checkpoints.save(state)
+    other = dataclasses.replace(config, model=dataclasses.replace(config.model, **change))
+    with pytest.raises(ValueError, match=rf"{tmp_path}/checkpoints/17: not a checkpoint of this configuration"):
+        checkpoints.restore(other)
+
+
+def test_nothing_to_resume_from_is_an_error(checkpoints, config, tmp_path):
+    assert checkpoints.latest_step() is None
+    with pytest.raises(ValueError, match=rf"{tmp_path}/checkpoints: expected a checkpoint to resume from, found none"):
+        checkpoints.restore(config)
