@@ -1,5 +1,6 @@
 """The public API as a whole: documented, in one style, and enough for the README's lines of Python."""
 
+import dataclasses
 import inspect
 
 import jax
@@ -38,7 +39,10 @@ def test_key_comes_first_and_options_are_named(name, signature):
 
 
 def test_the_readmes_lines(tmp_path):
-    params = sglpr_jax.init(jax.random.key(0), preset="tiny")
+    head = sglpr_jax.HeadConfig(channels=(8,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
+    grid = sglpr_jax.Grid(resolution_m=3.2, height=16, width=16)
+    config = dataclasses.replace(sglpr_jax.model_preset("tiny"), grid=grid, depths=(1,), heads=(2,), head=head)
+    params = sglpr_jax.init(jax.random.key(0), config=config)
     rng = np.random.default_rng(0)
     cloud = np.concatenate([rng.normal(scale=8, size=(2000, 3)), rng.random((2000, 1))], axis=1)
     cloud.astype("<f4").tofile(tmp_path / "000000.bin")

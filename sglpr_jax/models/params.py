@@ -26,7 +26,8 @@ def save(params: Params, folder: Path | str) -> Path:
     """Write weights and configuration under a temporary name, then put them in the place of `folder`."""
     folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    flat = {name: np.asarray(leaf) for name, leaf in _flatten(params.weights).items()}
+    # safetensors writes an array's memory as it lies, so a transposed view would come back scrambled.
+    flat = {name: np.asarray(leaf, order="C") for name, leaf in _flatten(params.weights).items()}
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"
         new.mkdir()

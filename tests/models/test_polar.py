@@ -54,7 +54,7 @@ def test_the_way_back_is_scipys(images):
     np.testing.assert_allclose(found[1, ..., 0], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("sectors_turned", [1, 24, 41, 95])
+@pytest.mark.parametrize("sectors_turned", [8, 24, 41, 88])
 def test_a_rotation_of_the_image_is_a_shift_of_its_polar_form(images, sectors_turned):
     planes = jnp.moveaxis(images, -1, 1)
     angle = jnp.full(planes.shape[:2], sectors_turned * 2 * np.pi / SECTORS, jnp.float32)
