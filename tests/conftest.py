@@ -3,7 +3,12 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
+
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.sglpr import SGLPR, Params
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -16,3 +21,22 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no development data at {SHARED} (licences forbid shipping it)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def random_params():
+    """Weights of a model that tell images apart; made by numpy, for compiling the model's `init` takes seconds."""
+
+    def make(config: ModelConfig) -> Params:
+        rng = np.random.default_rng(0)
+        image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
+        shapes = jax.eval_shape(lambda key: SGLPR(config).init(key, image, segment=True), jax.random.key(0))
+
+        def draw(path, leaf) -> jax.Array:
+            inputs = np.prod(leaf.shape[:-1])
+            values = rng.normal(scale=inputs**-0.5 if inputs > 1 else 0.1, size=leaf.shape)
+            return jnp.asarray(values + (path[-1].key == "scale"), leaf.dtype)
+
+        return Params(jax.tree_util.tree_map_with_path(draw, shapes["params"]), config)
+
+    return make

@@ -5,7 +5,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
 from sglpr_jax.bev import Grid
@@ -19,8 +18,6 @@ from sglpr_jax.retrieval.embed import DescribeFn, embed
 
 BEV_IMAGE_RADIUS = 62.0
 """Pixels from the centre to which the ready-made KITTI images have content."""
-
-_describe = jax.jit(describe)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +38,7 @@ class Method:
 def network(params: Params) -> Method:
     """The descriptors of `params`."""
     about = {"method": "sglpr", "model": dataclasses.asdict(params.config)}
-    return Method(functools.partial(_describe, params), params.config.grid, about, weights_hash(params))
+    return Method(functools.partial(describe, params), params.config.grid, about, weights_hash(params))
 
 
 def reference(name: str, sequence: Drive, grid: Grid) -> Method:

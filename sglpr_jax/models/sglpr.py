@@ -58,20 +58,18 @@ class SGLPR(nn.Module):
             circular=config.polar is not None,
             name="backbone",
         )(image, train=train)
-        pixels: Any = None
-        logits = None  # both made only where something reads them
-        if config.head.tap == "pixels":
-            pixels = FinalPatchExpand(config.patch, name="expand")(tokens)
-        elif segment:
-            pixels = FinalPatchExpand(config.patch, name="expand")(tokens[::segment])
-        features: Any = tokens if config.head.tap == "tokens" else pixels
+        expand = FinalPatchExpand(config.patch, name="expand")
+        reads_pixels = config.head.tap == "pixels"
+        features = expand(tokens) if reads_pixels else tokens
         descriptor, head = PlaceHead(config.head, config.polar is not None, name="place_head")(features)
-        if pixels is not None:
-            intermediates["pixels"] = pixels
+        logits = None
         if segment:
-            segmented = pixels[::segment] if config.head.tap == "pixels" else pixels
-            cells: Any = from_polar(segmented, config.grid) if config.polar else segmented
-            logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")(cells)
+            pixels = features[::segment] if reads_pixels else expand(tokens[::segment])
+            intermediates["pixels"] = pixels
+            to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
+            logits = to_logits(pixels)
+            if config.polar:  # after the linear layer, which commutes with the resampling and leaves fewer channels
+                logits = from_polar(logits, config.grid)
         return Outputs(descriptor, logits, intermediates | head)
 
 
@@ -93,6 +91,7 @@ def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
     return (distance < min(grid.height, grid.width) / 2)[None] | (config.field == "square")
 
 
+@jax.jit
 def describe(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b d"]:
     """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
 

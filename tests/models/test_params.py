@@ -12,19 +12,12 @@ import safetensors.numpy
 
 from sglpr_jax.models.params import CONFIG_FILE, WEIGHTS_FILE, config_from_dict, load, save, weights_hash
 from sglpr_jax.models.presets import MODELS, model_preset
-from sglpr_jax.models.sglpr import SGLPR, Params
-
-
-def random_params(config) -> Params:
-    image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
-    shapes = jax.eval_shape(lambda key: SGLPR(config).init(key, image, segment=True), jax.random.key(0))
-    rng = np.random.default_rng(0)
-    return Params(jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), shapes["params"]), config)
+from sglpr_jax.models.sglpr import Params
 
 
 @pytest.fixture(scope="module")
-def params() -> Params:
-    return random_params(model_preset("tiny"))
+def params(random_params) -> Params:
+    return jax.tree.map(np.asarray, random_params(model_preset("tiny")))
 
 
 def test_weights_and_configuration_come_back_bit_by_bit(params, tmp_path):

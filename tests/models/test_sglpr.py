@@ -10,7 +10,7 @@ import pytest
 from sglpr_jax.bev import Grid
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import SGLPR, Params, describe, field_of_view, forward, init, prepare, segment
+from sglpr_jax.models.sglpr import Params, describe, field_of_view, forward, init, prepare, segment
 
 # One stage instead of two, so that a program compiles in a second.
 CONFIG = dataclasses.replace(
@@ -31,21 +31,8 @@ FAST_COMPILE = {"xla_backend_optimization_level": 0}
 fast_describe = jax.jit(describe, compiler_options=FAST_COMPILE)
 
 
-def random_params(config) -> Params:
-    """Weights that tell images apart; made by numpy, for compiling `init` takes seconds."""
-    image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
-    shapes = jax.eval_shape(lambda key: SGLPR(config).init(key, image, segment=True), jax.random.key(0))
-    rng = np.random.default_rng(0)
-
-    def draw(leaf):
-        inputs = np.prod(leaf.shape[:-1])
-        return jnp.asarray(rng.normal(scale=inputs**-0.5 if inputs > 1 else 0.5, size=leaf.shape), leaf.dtype)
-
-    return Params(jax.tree.map(draw, shapes["params"]), config)
-
-
 @pytest.fixture(scope="module")
-def params() -> Params:
+def params(random_params) -> Params:
     return random_params(CONFIG)
 
 
@@ -81,10 +68,6 @@ def test_vmap_agrees(params, images, descriptors):
     np.testing.assert_allclose(mapped(params, images), descriptors, atol=1e-5)
 
 
-def test_without_jit_it_is_the_same(params, images, descriptors):
-    np.testing.assert_allclose(describe(params, images[:1]), descriptors[:1], atol=1e-5)
-
-
 def test_gradients_are_finite_and_reach_image_and_weights_even_from_an_empty_image(params, images):
     loss = jax.grad(lambda p, x: describe(p, x)[..., 0].sum(), (0, 1))
     both = jnp.stack([jnp.zeros((SIZE, SIZE)), images[0].astype(jnp.float32)])
@@ -118,7 +101,7 @@ def test_describe_computes_nothing_of_the_segmentation_head(params, images):
     assert operations(compiled(forward, params, images)) >= without_head + head
 
 
-def test_a_head_that_taps_tokens_spares_describe_the_expansion_too():
+def test_a_head_that_taps_tokens_spares_describe_the_expansion_too(random_params):
     params, image = random_params(POLAR), jnp.zeros((1, SIZE, SIZE))
     needed = {name: part for name, part in params.weights.items() if name in ("backbone", "place_head")}
     assert params.weights.keys() - needed.keys() == {"segmentation_head", "expand"}
@@ -172,7 +155,7 @@ def test_the_circle_blanks_what_a_rotation_would_move_out_of_view():
     np.testing.assert_allclose(prepared[..., 0], np.broadcast_to(sees * np.log(2), (2, 32, 48)), rtol=1e-6)
 
 
-def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(images):
+def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(random_params, images):
     params = random_params(POLAR)
     outside = ~field_of_view(POLAR)[0]
     changed = jnp.where(outside, 7, images)
@@ -182,7 +165,7 @@ def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(images):
     assert np.abs(fast_describe(params, shifted) - fast_describe(params, images)).max() > 1e-3
 
 
-def test_init_makes_every_weight_of_its_preset_from_its_key():
+def test_init_makes_every_weight_of_its_preset_from_its_key(random_params):
     config = dataclasses.replace(CONFIG, drop_path=0.0)
     params = init(jax.random.key(0), config=config)
     shapes = jax.tree.map(jnp.shape, params.weights)

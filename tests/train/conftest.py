@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from sglpr_jax.data.batch import Batch
 from sglpr_jax.data.tuples import TupleConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import SGLPR, Params
+from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import OptimizerConfig, TrainConfig
 
 POINTS = 200
@@ -42,18 +40,9 @@ def config() -> TrainConfig:
 
 
 @pytest.fixture(scope="session")
-def params(config) -> Params:
-    """Weights that tell places apart; made by numpy, for compiling `init` takes seconds."""
-    rng = np.random.default_rng(0)
-    image = jnp.zeros((1, config.model.grid.height, config.model.grid.width, 1))
-    shapes = jax.eval_shape(lambda key: SGLPR(config.model).init(key, image, segment=True), jax.random.key(0))
-
-    def draw(path, leaf):
-        inputs = np.prod(leaf.shape[:-1])
-        centre = 1 if path[-1].key == "scale" else 0
-        return jnp.asarray(centre + rng.normal(scale=inputs**-0.5 if inputs > 1 else 0.1, size=leaf.shape), leaf.dtype)
-
-    return Params(jax.tree_util.tree_map_with_path(draw, shapes["params"]), config.model)
+def params(config, random_params) -> Params:
+    """Ready-made weights of that model."""
+    return random_params(config.model)
 
 
 @pytest.fixture(scope="session")
