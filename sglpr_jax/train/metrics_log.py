@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,10 @@ class MetricsLog:
 
     def __init__(self, path: Path, *, start_step: int = 0):
         kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
-        self._file = path.open("w")
-        for line in kept:
-            self._write(line)
+        temporary = path.with_name(f".{path.name}.tmp")
+        temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        os.replace(temporary, path)
+        self._file = path.open("a")
 
     def append(self, step: int, values: Mapping[str, Any]) -> None:
         """Write the measurements of one step; values that are not finite become null."""
