@@ -27,6 +27,8 @@ CATEGORIES = (
 )
 """The names of the classes, by class id. Class 0 stands for no label and is left out of scores."""
 
+UNLABELLED = 0
+
 COLORS = np.array(
     [
         (0, 0, 0),

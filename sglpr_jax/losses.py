@@ -49,19 +49,24 @@ def lazy_triplet(
     return hinge.max(-1) if reduction == "max" else hinge.sum(-1)
 
 
-def cross_entropy(logits: Float[Array, "*b h w k"], labels: Int[Array, "*b h w"]) -> Float[Array, "*b"]:
-    """Equation 6: cross-entropy of each image, averaged over its pixels."""
-    return optax.softmax_cross_entropy_with_integer_labels(logits, labels).mean((-2, -1))
+def cross_entropy(
+    logits: Float[Array, "*b h w k"], labels: Int[Array, "*b h w"], *, where: Bool[Array, "*b h w"] | None = None
+) -> Float[Array, "*b"]:
+    """Equation 6: cross-entropy of each image, averaged over its pixels (those of `where`; zero if there are none)."""
+    each = optax.softmax_cross_entropy_with_integer_labels(logits, labels)
+    if where is None:
+        return each.mean((-2, -1))
+    return jnp.where(where, each, 0.0).sum((-2, -1)) / jnp.maximum(where.sum((-2, -1)), 1)
 
 
 def dice_sums(
-    logits: Float[Array, "b h w k"], labels: Int[Array, "b h w"], where: Bool[Array, "b"] | None = None
+    logits: Float[Array, "b h w k"], labels: Int[Array, "b h w"], where: Bool[Array, "b h w"] | None = None
 ) -> Float[Array, "3 k"]:
-    """What equation 7 sums over the pixels, per class: p t, p^2 and t^2. Adding chunks' sums gives the batch's."""
+    """What equation 7 sums over the pixels (of `where`), per class: p t, p^2 and t^2. Sums of chunks add up."""
     probability = jax.nn.softmax(logits)
     truth = jax.nn.one_hot(labels, logits.shape[-1], dtype=logits.dtype)
     if where is not None:
-        probability, truth = (jnp.where(where[:, None, None, None], x, 0.0) for x in (probability, truth))
+        probability, truth = (jnp.where(where[..., None], x, 0.0) for x in (probability, truth))
     return jnp.stack([(x * y).sum((0, 1, 2)) for x, y in ((probability, truth), (probability,) * 2, (truth,) * 2)])
 
 
@@ -76,10 +81,10 @@ def dice(
     logits: Float[Array, "b h w k"],
     labels: Int[Array, "b h w"],
     *,
-    where: Bool[Array, "b"] | None = None,
+    where: Bool[Array, "b h w"] | None = None,
     weights: Float[Array, "k"] | None = None,
 ) -> Float[Array, ""]:
-    """Equation 7 over a whole batch; `where` leaves out images without labels."""
+    """Equation 7 over a whole batch, or over its pixels of `where`."""
     return dice_from_sums(dice_sums(logits, labels, where), weights=weights)
 
 

@@ -79,7 +79,7 @@ def test_sums_of_chunks_give_the_dice_of_the_batch(images):
 
 def test_images_without_labels_count_for_nothing_in_dice(images):
     logits, labels = images
-    where = jnp.array([True, False, True])
+    where = jnp.array([True, False, True])[:, None, None] & jnp.ones(labels.shape, bool)
 
     def masked(logits):
         return losses.dice(logits, labels, where=where)
@@ -88,6 +88,16 @@ def test_images_without_labels_count_for_nothing_in_dice(images):
     np.testing.assert_allclose(value, losses.dice(logits[::2], labels[::2]), rtol=1e-6)
     assert np.abs(gradient[1]).max() == 0
     assert np.isfinite(gradient).all()
+
+
+def test_pixels_left_out_count_for_nothing(images):
+    logits, labels = images
+    where = jax.random.bernoulli(jax.random.key(0), 0.3, labels.shape).at[1].set(False)
+    scrambled = jnp.where(where[..., None], logits, 9 * logits[..., ::-1])
+    for loss in (losses.cross_entropy, losses.dice):
+        np.testing.assert_allclose(loss(logits, labels, where=where), loss(scrambled, labels, where=where), rtol=1e-6)
+        np.testing.assert_allclose(loss(logits, labels, where=labels >= 0), loss(logits, labels), rtol=1e-5)
+    assert losses.cross_entropy(logits, labels, where=where)[1] == 0
 
 
 @pytest.mark.parametrize("ignore_zero", [False, True])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-UNLABELLED = 0
+from sglpr_jax.labels import UNLABELLED
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,17 +14,29 @@ class SegmentationResult:
 
     iou: Float[np.ndarray, " k"]
     """Intersection over union of each class, NaN where no cell has it."""
+    shares: Float[np.ndarray, " k"]
+    """Which part of the cells each class has."""
     cells: int
-    majority: int
-    """The commonest class."""
-
-    majority_mean_iou: float
-    """The mean IoU of predicting `majority` everywhere."""
 
     @property
     def mean_iou(self) -> float:
         """The mean over the classes that occur."""
         return float(np.nanmean(self.iou))
+
+    @property
+    def present(self) -> int:
+        """How many classes occur."""
+        return int((self.shares > 0).sum())
+
+    @property
+    def majority(self) -> int:
+        """The commonest class."""
+        return int(self.shares.argmax())
+
+    @property
+    def majority_mean_iou(self) -> float:
+        """The mean IoU of predicting the commonest class everywhere."""
+        return float(self.shares.max() / self.present)
 
 
 def score_segmentation(
@@ -34,22 +46,32 @@ def score_segmentation(
     counted: Bool[np.ndarray, "*b h w"],
     classes: int,
 ) -> SegmentationResult:
-    """Score class maps over the `counted` cells (those with points) whose true class is known.
+    """Score class maps over the `counted` cells (those with points) whose true class is known."""
+    return score_confusion(confusion_matrix(truth, prediction, counted=counted, classes=classes))
 
-    As in SemanticKITTI, class 0 (unlabelled) is no class to be found. Raises ValueError where no cell is left.
+
+def confusion_matrix(
+    truth: Int[np.ndarray, "*b h w"],
+    prediction: Int[np.ndarray, "*b h w"],
+    *,
+    counted: Bool[np.ndarray, "*b h w"],
+    classes: int,
+) -> Int[np.ndarray, "k k"]:
+    """How many counted cells of true class i are predicted as class j; those of several scans add up.
+
+    As in SemanticKITTI, class 0 (unlabelled) is no class to be found: such cells are left out.
     """
     counted = counted & (truth != UNLABELLED)
-    if not counted.any():
-        raise ValueError("expected cells with points and labels, found none")
-    pairs = np.bincount(truth[counted] * classes + prediction[counted], minlength=classes**2)
-    confusion = pairs.reshape(classes, classes)
+    pairs = truth[counted].astype(np.int64) * classes + prediction[counted]
+    return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
+
+
+def score_confusion(confusion: Int[np.ndarray, "k k"]) -> SegmentationResult:
+    """The scores of a confusion matrix. Raises ValueError where no cell was counted."""
     cells_of_class = confusion.sum(1)
+    cells = int(cells_of_class.sum())
+    if not cells:
+        raise ValueError("expected cells with points and labels, found none")
     union = cells_of_class + confusion.sum(0) - np.diag(confusion)
-    present = cells_of_class > 0
-    iou = np.where(present, np.diag(confusion) / np.maximum(union, 1), np.nan)
-    return SegmentationResult(
-        iou=iou,
-        cells=int(counted.sum()),
-        majority=int(cells_of_class.argmax()),
-        majority_mean_iou=float(cells_of_class.max() / counted.sum() / present.sum()),
-    )
+    iou = np.where(cells_of_class > 0, np.diag(confusion) / np.maximum(union, 1), np.nan)
+    return SegmentationResult(iou=iou, shares=cells_of_class / cells, cells=cells)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from sglpr_jax import losses
 from sglpr_jax.data.batch import Batch, views
+from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import Params, field_of_view, forward
 from sglpr_jax.train.config import LossConfig, TrainConfig
 from sglpr_jax.train.state import TrainState, optimizer
@@ -63,7 +64,7 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
     """
 
     def summary(weights, chunk: Chunk) -> Summary:
-        return summarize(dataclasses.replace(params, weights=weights), chunk, config.segment_every)
+        return summarize(dataclasses.replace(params, weights=weights), chunk, config)
 
     def loss(summaries: Summary):
         return joint_loss(_merge(summaries), batch, config)
@@ -84,14 +85,15 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
     return jax.lax.scan(add, zeros, (chunks, cotangents))[0], metrics
 
 
-def summarize(params: Params, chunk: Chunk, segment_every: int = 1) -> Summary:
+def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
     """One chunk through the network; the segmentation head only where there are labels, on every n-th image."""
     if chunk.maps is None:
         return Summary(forward(params, chunk.images, key=chunk.key, segment=0).descriptor)
-    outputs = forward(params, chunk.images, key=chunk.key, segment=segment_every)
-    maps, labelled = chunk.maps[::segment_every], chunk.labelled[::segment_every]
-    cross_entropy = jnp.where(labelled, losses.cross_entropy(outputs.logits, maps), 0.0).sum()
-    return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, maps, labelled))
+    outputs = forward(params, chunk.images, key=chunk.key, segment=config.segment_every)
+    maps, labelled = (x[:: config.segment_every] for x in (chunk.maps, chunk.labelled))
+    counted = labelled[:, None, None] & ((maps != UNLABELLED) | (not config.ignore_unlabelled))
+    cross_entropy = losses.cross_entropy(outputs.logits, maps, where=counted).sum()
+    return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, maps, counted))
 
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
@@ -134,7 +136,7 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     images_per_chunk = config.chunk or config.images
     angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) * config.rotate
     images, maps = views(batch, angles, config.model.grid)
-    maps = None if maps is None else jnp.where(field_of_view(config.model), maps, 0)
+    maps = None if maps is None else jnp.where(field_of_view(config.model), maps, UNLABELLED)
     keys = jax.random.split(model_key, config.images // images_per_chunk)
     whole = (images, maps, jnp.asarray(batch.labelled))
     cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), whole)

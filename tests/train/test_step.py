@@ -107,6 +107,24 @@ def test_segmenting_every_second_image_is_as_if_the_others_had_no_labels(config,
     assert_same(found[0], expected[0])
 
 
+def test_unlabelled_cells_can_be_left_out_of_the_segmentation_losses(config, params, make_batch):
+    batch = make_batch(0)
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, ignore_unlabelled=True))
+    chunks = chunks_of(batch, config)
+    logits = forward(params, chunks.images[0], key=chunks.key[0]).logits
+    log_p = np.asarray(jax.nn.log_softmax(logits), np.float64)
+    maps = np.asarray(chunks.maps[0])
+    counted = (maps != 0) & batch.labelled[:, None, None]
+    assert 0 < counted.sum() < maps.size
+    truth = np.eye(20)[maps]
+    per_image = [-(log_p * truth)[i][counted[i]].sum() / counted[i].sum() for i in np.flatnonzero(batch.labelled)]
+    p = np.exp(log_p[counted])
+    overlap, total = 2 * (p * truth[counted]).sum(0), np.square(p).sum(0) + np.square(truth[counted]).sum(0)
+    metrics = gradients_of(params, batch, config)[1]
+    np.testing.assert_allclose(metrics["cross_entropy"], np.mean(per_image), rtol=1e-4)
+    np.testing.assert_allclose(metrics["dice"], np.mean(1 - (overlap + 1e-5) / (total + 1e-5)), rtol=1e-4)
+
+
 def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_batch, whole):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
     config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(config.model, drop_path=0.5))
@@ -116,7 +134,7 @@ def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_ba
     def plain(weights):
         chunks = chunks_of(batch, config)
         parts = [
-            summarize(dataclasses.replace(params, weights=weights, config=config.model), chunk)
+            summarize(dataclasses.replace(params, weights=weights, config=config.model), chunk, config.loss)
             for chunk in (jax.tree.map(lambda x, i=i: x[i], chunks) for i in range(config.images // config.chunk))
         ]
         descriptors, cross_entropy, dice_sums = zip(*parts, strict=True)

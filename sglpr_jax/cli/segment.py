@@ -1,0 +1,131 @@
+"""bin/segment: write the semantic map of every scan of a sequence, and score them where there are labels."""
+
+import dataclasses
+import importlib.util
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from PIL import Image
+from rich.table import Table
+
+from sglpr_jax.cli.runtime import console, progress_bar, run, write_json
+from sglpr_jax.data import ScanSequence, open_sequence
+from sglpr_jax.data.scan_files import ScanFormat
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.segmentation import SegmentationResult, confusion_matrix, score_confusion
+from sglpr_jax.labels import CATEGORIES, to_classes
+from sglpr_jax.models.params import load
+from sglpr_jax.models.sglpr import Params
+from sglpr_jax.retrieval.semantic_maps import SemanticMap, semantic_map
+
+RESULT_FILE = "segmentation.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class SegmentCommand:
+    """Write each scan's semantic map as seen from above, one PNG of class ids (0 to 19) per scan.
+
+    With labels beside the scans, also the intersection over union of every class and a picture of one scan (figure 7).
+
+    Example: bin/segment --weights runs/small-08 --data KITTI --seq 08 --out maps/
+    """
+
+    weights: Path
+    """A training run's folder, or a folder with config.json and model.safetensors."""
+    data: Path
+    """A dataset in KITTI's layout, or a folder of scans (.bin, .pcd)."""
+    out: Path
+    """The folder to write to; made if need be."""
+    seq: str | None = None
+    """Which sequence; may be left out where there is only one."""
+    format: ScanFormat = "auto"
+    """What the scans of a plain folder are, where their names do not tell."""
+
+
+def segment_sequence(command: SegmentCommand) -> Path:
+    """Do what the command says; returns the folder written."""
+    sequence = open_sequence(command.data, command.seq, format=command.format)
+    if not isinstance(sequence, ScanSequence):
+        raise ValueError(f"{command.data}: expected scans, found ready-made images, which have no points to label")
+    params = load(command.weights)
+    command.out.mkdir(parents=True, exist_ok=True)
+    for row, found in _maps(params, sequence, range(len(sequence))):
+        _write_png(command.out / f"{sequence.ids[row]}.png", found.predicted)
+    print(f"{command.out}: {len(sequence)} semantic maps")
+    if sequence.has_labels:
+        write_json(command.out / RESULT_FILE, score_semantics(params, sequence, command.out))
+    return command.out
+
+
+def score_semantics(params: Params, sequence: ScanSequence, folder: Path) -> dict[str, Any]:
+    """Score the segmentation head on every labelled scan; print, and draw input, truth and prediction of one."""
+    rows = [row for row, path in enumerate(sequence.label_paths) if path is not None]
+    classes = params.config.classes
+    confusion = np.zeros((classes, classes), np.int64)
+    for row, found in _maps(params, sequence, rows):
+        confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
+        if row == rows[len(rows) // 2]:
+            _draw(found, params.config.grid.resolution_m, folder)
+    result = score_confusion(confusion)
+    console().print(_table(result, f"segmentation of {len(rows)} scans of {sequence.name}"))
+    return _as_json(result)
+
+
+def _maps(params: Params, sequence: ScanSequence, rows: range | list[int]) -> Iterator[tuple[int, SemanticMap]]:
+    with progress_bar(f"segment {sequence.name}", len(rows)) as show:
+        for done, row in enumerate(rows):
+            labels = sequence.labels(row)
+            yield row, semantic_map(params, sequence.points(row), None if labels is None else to_classes(labels))
+            show(done + 1)
+
+
+def _draw(found: SemanticMap, resolution_m: float, folder: Path) -> None:
+    if importlib.util.find_spec("matplotlib"):
+        panel = figures.segmentation_panel(found.counts, found.truth, found.predicted, resolution_m=resolution_m)
+        figures.save(panel, folder / "segmentation.png")
+
+
+def _table(result: SegmentationResult, title: str) -> Table:
+    table = Table(title=title, caption=f"{result.cells} cells with points and a label")
+    for column in ("class", "share of the cells", "IoU"):
+        table.add_column(column, justify="left" if column == "class" else "right")
+    for name, share, iou in zip(CATEGORIES, result.shares, result.iou, strict=True):
+        if share:
+            table.add_row(name, f"{share:.2%}", f"{iou:.3f}")
+    table.add_section()
+    table.add_row(f"mean of {result.present} classes", "", f"{result.mean_iou:.3f}")
+    table.add_row(f"{CATEGORIES[result.majority]} everywhere", "", f"{result.majority_mean_iou:.3f}")
+    return table
+
+
+def _as_json(result: SegmentationResult) -> dict[str, Any]:
+    def by_name(values: np.ndarray) -> dict[str, float | None]:
+        return {name: None if np.isnan(x) else float(x) for name, x in zip(CATEGORIES, values, strict=True)}
+
+    return {
+        "mean_iou": result.mean_iou,
+        "majority": CATEGORIES[result.majority],
+        "majority_mean_iou": result.majority_mean_iou,
+        "cells": result.cells,
+        "iou": by_name(result.iou),
+        "shares": by_name(result.shares),
+    }
+
+
+def _write_png(path: Path, classes: np.ndarray) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    Image.fromarray(classes.astype(np.uint8)).save(temporary, format="PNG")
+    os.replace(temporary, path)
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: segment_sequence(tyro.cli(SegmentCommand, prog="segment")))
+
+
+if __name__ == "__main__":
+    main()
