@@ -22,6 +22,11 @@ class TupleConfig:
     """The share of tuples whose positives come from another visit; the others' come from neighbouring frames."""
     revisit_gap: int = 50
     """Frames at most this far apart belong to one visit."""
+    cluster: int = 1
+    """Tuples in a row whose anchors lie near each other. Where tuples share their places as negatives, neighbouring
+    places of one street are harder to tell apart than any two of a whole drive."""
+    cluster_m: float = 100.0
+    """How near: the distance to the first anchor of the row."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,13 +69,20 @@ class TuplePool:
         Raises ValueError for an anchor that has no negatives.
         """
         rng = np.random.default_rng([seed, step])
-        anchored = [self._draw_anchored(rng) for _ in range(tuples)]
+        anchored: list[list[int]] = []
+        for i in range(tuples):
+            first = anchored[i - i % self.config.cluster][0] if i % self.config.cluster else None
+            anchored.append(self._draw_anchored(rng, near=first))
         return np.array([[*row, *self._draw_negatives(rng, row[0])] for row in anchored])
 
-    def _draw_anchored(self, rng: np.random.Generator) -> list[int]:
+    def _draw_anchored(self, rng: np.random.Generator, *, near: int | None) -> list[int]:
         other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
         source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
-        anchor = int(rng.choice(source.anchors))
+        anchors = source.anchors
+        if near is not None:
+            around = anchors[self._within(near, anchors, self.config.cluster_m)]
+            anchors = around if len(around) else anchors
+        anchor = int(rng.choice(anchors))
         return [anchor, *source.draw(rng, anchor, self.config.positives).tolist()]
 
     def _draw_negatives(self, rng: np.random.Generator, anchor: int) -> Int[np.ndarray, "{self.config.negatives}"]:
@@ -82,8 +94,12 @@ class TuplePool:
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
         """Whether two frames are certainly other places: of other drives, or beyond the negative distance."""
+        return ~self._within(a, b, self.config.negative_m)
+
+    def _within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], metres: float) -> np.ndarray:
+        """Whether two frames are of one drive and at most so far apart."""
         offset = self.positions[a, :2] - self.positions[b, :2]
-        return (self.drive[a] != self.drive[b]) | (np.hypot(offset[..., 0], offset[..., 1]) > self.config.negative_m)
+        return (self.drive[a] == self.drive[b]) & (np.hypot(offset[..., 0], offset[..., 1]) <= metres)
 
     def _pairs_within(self, drive: int) -> Int[np.ndarray, "pairs 2"]:
         members = np.flatnonzero(self.drive == drive)

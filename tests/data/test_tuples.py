@@ -134,3 +134,22 @@ def test_drives_without_positives_or_negatives_are_refused():
     pool = TuplePool([np.zeros((5, 3))], TupleConfig())
     with pytest.raises(ValueError, match=r"no frame lies farther than 20\.0 m from frame \d of the pool"):
         pool.draw(seed=0, step=0, tuples=1)
+
+
+def test_the_anchors_of_a_cluster_lie_near_each_other_and_the_others_anywhere():
+    street = np.column_stack([np.arange(0, 3000, 1.5), np.zeros((2000, 2))])
+    config = TupleConfig(negatives=0, cluster=4, cluster_m=60.0)
+    pool = TuplePool([street, street], config)
+    anchors = pool.draw(seed=0, step=0, tuples=40)[:, 0].reshape(10, 4)
+    assert (horizontal(pool, anchors[:, :1], anchors) <= 60).all()
+    assert (pool.drive[anchors[:, :1]] == pool.drive[anchors]).all()
+    assert np.ptp(pool.frame[anchors[:, 0]]) > 1000
+    single = TuplePool([street, street], TupleConfig(negatives=0)).draw(seed=0, step=0, tuples=40)[:, 0]
+    assert (np.abs(np.diff(pool.frame[single])) > 40).mean() > 0.8
+
+
+def test_a_cluster_without_another_anchor_nearby_goes_elsewhere():
+    pairs = np.zeros((20, 3))
+    pairs[:, 0] = np.repeat(np.arange(10) * 500.0, 2) + np.tile([0, 1], 10)
+    pool = TuplePool([pairs], TupleConfig(negatives=0, cluster=2, cluster_m=0.5, revisit_gap=1))
+    assert len(pool.draw(seed=0, step=0, tuples=10)) == 10

@@ -1,4 +1,5 @@
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sglpr_jax.bev import rasterize, rasterize_labels
@@ -15,7 +16,7 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are():
     grid = params.config.grid
     counts = np.asarray(rasterize(points, grid=grid))
     seen = (counts > 0) & field_of_view(params.config)[0]
-    logits = np.asarray(segment(params, counts))
+    logits = np.asarray(segment(params, jnp.asarray(counts)))
     np.testing.assert_array_equal(found.counts, counts)
     np.testing.assert_array_equal(found.seen, seen)
     np.testing.assert_array_equal(found.predicted, np.where(seen, logits[..., 1:].argmax(-1) + 1, 0))
