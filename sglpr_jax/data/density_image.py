@@ -1,0 +1,81 @@
+"""The image domain of BEVPlace's KITTI images: a scan as the 8-bit density image that stands in such a dataset.
+
+A scan is thinned to one centroid for each voxel, so that a pixel tells how much of its column is occupied and not how
+near the sensor is. The rows of the image run against x (forward), its columns against y (left); `bev_images.read_image`
+turns it into the orientation of eq. 1.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32, UInt8
+
+from sglpr_jax.data.bev_images import MAX_COUNT, RESOLUTION_M
+
+SIZE = 151
+"""Rows and columns of an image. The crop leaves the outer 13 empty."""
+REACH_M = 25.0
+"""Points count where |x| and |y| are below this."""
+FLOOR_M = -1.2
+"""Points count above this height over the sensor: some 0.5 m over the road."""
+CEILING_M = 200.0
+"""Points count below this height, which no scan reaches, so that the number of a voxel fits 32 bits."""
+MAX_VOXELS = 6000
+EDGE_STEP_M = 0.05
+FIRST_EDGE_M = 0.10
+
+
+def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 151"]:
+    """The density image of a scan (metres, LiDAR frame): voxel centroids per cell, capped at 10, the fullest cell 255.
+
+    The voxels' edge is the smallest of 0.10, 0.15, 0.20, ... m that leaves at most 6000 voxels. Points that are not
+    finite are dropped. Pixel for pixel what the ready-made images of KITTI show.
+    """
+    centroids = _voxel_centroids(points[_in_crop(points)])
+    counts = np.bincount(_cell_of_point(centroids), minlength=SIZE**2).clip(max=MAX_COUNT)
+    return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(SIZE, SIZE)
+
+
+def density_label_map(
+    points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
+) -> Int32[np.ndarray, "151 151"]:
+    """The class of the last point that falls into each cell of the scan's density image, 0 where none does.
+
+    Only points of the image's crop count. A cell is that of the point itself and not of its voxel's centroid, so at
+    the rims of things a label may stand beside a pixel that is 0, and the other way round.
+    """
+    counted = _in_crop(points)
+    labels = np.zeros(SIZE**2, np.int32)
+    labels[_cell_of_point(points[counted])] = classes[counted]  # numpy keeps the last of repeated assignments
+    return labels.reshape(SIZE, SIZE)
+
+
+def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
+    x, y, z = points.T
+    return (np.abs(x) < REACH_M) & (np.abs(y) < REACH_M) & (z > FLOOR_M) & (z < CEILING_M)
+
+
+def _cell_of_point(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """The flat cell of every point. Truncation makes the row and the column through the sensor two cells wide."""
+    row, column = SIZE // 2 - np.trunc(points[:, :2].T / RESOLUTION_M).astype(np.int64)
+    return row * SIZE + column
+
+
+def _voxel_centroids(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 3"]:
+    """The mean of the points in each voxel, with the smallest edge that leaves few enough voxels."""
+    voxels = _voxel_of_point(points, edge_m := FIRST_EDGE_M)
+    while _distinct(voxels) > MAX_VOXELS:
+        voxels = _voxel_of_point(points, edge_m := edge_m + EDGE_STEP_M)
+    _, voxel, count = np.unique(voxels, return_inverse=True, return_counts=True)
+    sums = [np.bincount(voxel, weights=axis, minlength=len(count)) for axis in points.T]
+    return np.stack(sums, axis=1) / count[:, None]
+
+
+def _distinct(numbers: Int32[np.ndarray, " n"]) -> int:
+    """How many different numbers there are: np.unique in half the time."""
+    return int(np.count_nonzero(np.diff(np.sort(numbers)))) + 1
+
+
+def _voxel_of_point(points: Float32[np.ndarray, "n 3"], edge_m: float) -> Int32[np.ndarray, " n"]:
+    """The voxel of every point as one number; the voxels' corners are multiples of `edge_m`."""
+    x, y, z = np.floor(points * np.float32(1 / edge_m)).astype(np.int32).T
+    side = 2 * int(REACH_M / edge_m) + 4  # with room for rounding
+    return (z * side + y) * side + x

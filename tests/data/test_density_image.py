@@ -1,0 +1,101 @@
+"""Density images: against the recipe spelled out point by point, and against the images rendered from real scans."""
+
+import math
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sglpr_jax.data.bev_images import read_image
+from sglpr_jax.data.density_image import density_image, density_label_map
+
+
+def cloud(*points: tuple[float, float, float]) -> np.ndarray:
+    return np.array(points, np.float32).reshape(-1, 3)
+
+
+def reference_image(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """The recipe, one point at a time; the image and the edge of the voxels."""
+    kept = [p for p in points if abs(p[0]) < 25 and abs(p[1]) < 25 and p[2] > -1.2 and np.isfinite(p).all()]
+    for steps in range(2, 100):
+        voxels = defaultdict(list)
+        for p in kept:
+            voxels[tuple(np.floor(p * np.float32(1 / (0.05 * steps))))].append(p.astype(np.float64))
+        if len(voxels) <= 6000:
+            break
+    counts = np.zeros((151, 151))
+    for members in voxels.values():
+        x, y, _ = np.mean(members, axis=0)
+        counts[75 - math.trunc(x / 0.4), 75 - math.trunc(y / 0.4)] += 1
+    counts = np.minimum(counts, 10)
+    return np.round(counts / max(counts.max(), 1) * 255).astype(np.uint8), 0.05 * steps
+
+
+@pytest.mark.parametrize(("n", "spread_m", "edge_m"), [(500, 12.0, 0.10), (9000, 12.0, 0.70), (30000, 2.5, 0.45)])
+def test_images_follow_the_recipe_at_every_edge(n, spread_m, edge_m):
+    points = np.random.default_rng(n).normal(scale=[spread_m, spread_m, 1.0], size=(n, 3)).astype(np.float32)
+    points[::100, 0] = np.nan
+    expected, edge_found = reference_image(points)
+    assert edge_found == pytest.approx(edge_m)
+    np.testing.assert_array_equal(density_image(points), expected)
+
+
+def test_points_of_one_voxel_count_once_where_their_centroid_lies():
+    image = density_image(cloud((2.01, 4.41, 0.0), (2.02, 4.42, 0.05), (2.03, 4.49, 0.15), (-8.5, 0.1, 0.0)))
+    found = {tuple(map(int, cell)): int(image[tuple(cell)]) for cell in np.argwhere(image)}
+    assert found == {(70, 64): 255, (96, 75): 128}
+
+
+def test_a_cell_is_capped_at_ten_voxels():
+    tall = [(5.05, 5.05, 0.1 * i + 0.05) for i in range(20)]
+    five = [(-5.05, 5.05, 0.1 * i + 0.05) for i in range(5)]
+    image = density_image(cloud(*tall, *five))
+    assert sorted(image[image > 0]) == [128, 255]
+
+
+def test_row_is_forward_and_eq_1_is_a_quarter_turn_away(tmp_path):
+    image = density_image(cloud((20.1, -10.1, 0.0)))  # ahead and to the right
+    assert np.argwhere(image).tolist() == [[25, 100]]
+    Image.fromarray(image).save(tmp_path / "a.png")
+    assert np.argwhere(read_image(tmp_path / "a.png")).tolist() == [[100, 125]]  # eq. 1: x to the right, y up
+
+
+@pytest.mark.parametrize(
+    "outside", [(25.0, 0, 0), (0, -25.0, 0), (0, 0, -1.2001), (np.nan, 0, 0), (0, 0, np.nan), (0, 0, np.inf)]
+)
+def test_what_is_outside_the_crop_leaves_no_trace(outside):
+    points = cloud(outside)
+    assert not density_image(points).any()
+    assert not density_label_map(points, np.array([9])).any()
+    assert density_image(np.concatenate([points, cloud((1.0, 1.0, 0.0))])).sum() == 255
+
+
+def test_an_empty_scan_is_a_black_image():
+    assert not density_image(cloud()).any()
+    assert not density_label_map(cloud(), np.zeros(0, np.int32)).any()
+
+
+def test_labels_are_those_of_the_last_point_inside_the_crop():
+    points = cloud((5.1, 5.1, 0.0), (5.2, 5.2, 1.0), (5.2, 5.2, -1.7), (-5.1, 5.1, 0.0))
+    labels = density_label_map(points, np.array([13, 14, 9, 1]))
+    assert labels.dtype == np.int32
+    assert {tuple(map(int, cell)): int(labels[tuple(cell)]) for cell in np.argwhere(labels)} == {
+        (63, 63): 14,
+        (87, 63): 1,
+    }
+
+
+def test_labels_lie_on_the_image():
+    points = np.random.default_rng(0).uniform(-26, 26, (400, 3)).astype(np.float32)
+    labels = density_label_map(points, np.full(len(points), 7))
+    np.testing.assert_array_equal(labels > 0, density_image(points) > 0)  # so few points are their voxels' centroids
+
+
+def test_the_real_images_are_reproduced_pixel_for_pixel(shared):
+    scans = sorted((shared / "data/kitti_odometry/sequences/00/velodyne").glob("*.bin"))
+    assert scans
+    for path in scans:
+        points = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
+        expected = np.asarray(Image.open(shared / f"data/kitti_bev/00/imgs/{path.stem}.png"))
+        np.testing.assert_array_equal(density_image(points), expected, err_msg=path.stem)
