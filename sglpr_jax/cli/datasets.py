@@ -8,20 +8,24 @@ from pathlib import Path
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.kitti import PoseChoice
-from sglpr_jax.sim import write_dataset
-from sglpr_jax.sim.sensor import HDL64E, Sensor
+from sglpr_jax.sim import SENSORS, write_dataset
+from sglpr_jax.sim.dataset import VERSION
+from sglpr_jax.sim.drive import RATE_HZ, name_of_path
+from sglpr_jax.sim.layouts import LAYOUTS
 
 SIMULATED = ("00", "05", "08")
 SIMULATED_SCANS = 300
 SIMULATED_AZIMUTH_STEPS = 900
-MEGABYTES_PER_SCAN = 1.03
+BYTES_PER_RAY = 15
+"""Of a scan and its labels: 20 for every return."""
+BYTES_PER_IMAGE = 2500
 
 
 def dataset_root(data: Path | None) -> Path:
     """The dataset's folder; without one, the simulated drives, made on first use and kept in the user's cache."""
     if data is not None:
         return data
-    root = cache_folder() / f"simulated-{SIMULATED_SCANS}x{SIMULATED_AZIMUTH_STEPS}-seed0"
+    root = cache_folder() / f"simulated-v{VERSION}-{SIMULATED_SCANS}x{SIMULATED_AZIMUTH_STEPS}-seed0"
     print(
         f"no dataset named: using the simulated drives in {root} "
         "(for real KITTI: --data FOLDER, which holds sequences/NN/velodyne)",
@@ -32,22 +36,43 @@ def dataset_root(data: Path | None) -> Path:
 
 
 def simulate(
-    root: Path, *, scans: int, azimuth_steps: int, seed: int, names: Many[str] = SIMULATED, base: Sensor = HDL64E
+    root: Path,
+    *,
+    names: Many[str] = SIMULATED,
+    along: Many[Path] = (),
+    scans: int,
+    sensor: str = "hdl64e",
+    azimuth_steps: int | None = None,
+    seed: int,
+    rate_hz: float = RATE_HZ,
+    images: bool = False,
 ) -> None:
-    """Write what is missing of a simulated dataset, with its size said beforehand and its progress shown."""
-    unfinished = [name for name in names if not (root / "sequences" / name / "poses.txt").exists()]
+    """Write what is missing of a simulated dataset, with its size said beforehand and its progress shown.
+
+    Raises ValueError for an unknown sensor; for the other errors see `write_dataset`.
+    """
+    if sensor not in SENSORS:
+        raise ValueError(f"expected a sensor among {', '.join(SENSORS)}, found {sensor!r}")
+    lidar = SENSORS[sensor]
+    lidar = lidar if azimuth_steps is None else dataclasses.replace(lidar, azimuth_steps=azimuth_steps)
+    layout = "images" if images else "scans"
+    drives = [*names, *map(name_of_path, along)]
+    unfinished = [name for name in drives if not LAYOUTS[layout].is_finished(root, name)]
     if unfinished:
-        size = MEGABYTES_PER_SCAN * azimuth_steps / SIMULATED_AZIMUTH_STEPS * scans * len(unfinished)
-        print(f"simulating {len(unfinished)} drives of {scans} scans, about {size:.0f} MB", file=sys.stderr)
-    sensor = dataclasses.replace(base, azimuth_steps=azimuth_steps)
-    with progress_bar("simulate", scans * len(names)) as show:
+        rays = len(lidar.elevations_deg) * lidar.azimuth_steps
+        size = (BYTES_PER_IMAGE if images else BYTES_PER_RAY * rays) * scans * len(unfinished) / 1e6
+        print(f"simulating {len(unfinished)} drives of {scans} {layout}, about {size:.0f} MB", file=sys.stderr)
+    with progress_bar("simulate", scans * len(drives)) as show:
         write_dataset(
             root,
             names=names,
+            along=along,
             scans=scans,
-            sensor=sensor,
+            sensor=lidar,
             seed=seed,
-            progress=lambda name, done, _: show(list(names).index(name) * scans + done),
+            rate_hz=rate_hz,
+            layout=layout,
+            progress=lambda name, done, count: show(drives.index(name) * scans + done * scans // count),
         )
 
 

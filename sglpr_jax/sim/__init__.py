@@ -1,8 +1,23 @@
-"""A small simulator of drives through a town: what bin/demo and bin/train use where no dataset is named."""
+"""A simulator of drives through a town: LiDAR scans with poses and semantic labels, free of anybody's licence."""
 
 from sglpr_jax.sim.dataset import write_dataset
-from sglpr_jax.sim.drive import Drive, plan_drive
-from sglpr_jax.sim.sensor import Sensor, scan
+from sglpr_jax.sim.drive import Drive, Trajectory, plan_trajectory, poses_on, read_path
+from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
+from sglpr_jax.sim.sequence import SimulatedSequence, simulate_sequence
 from sglpr_jax.sim.world import World, build_world
 
-__all__ = ["Drive", "Sensor", "World", "build_world", "plan_drive", "scan", "write_dataset"]
+__all__ = [
+    "SENSORS",
+    "Drive",
+    "Sensor",
+    "SimulatedSequence",
+    "Trajectory",
+    "World",
+    "build_world",
+    "plan_trajectory",
+    "poses_on",
+    "read_path",
+    "scan",
+    "simulate_sequence",
+    "write_dataset",
+]

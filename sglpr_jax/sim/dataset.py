@@ -1,24 +1,26 @@
-"""Simulated drives on disk, in the layout of KITTI odometry and SemanticKITTI."""
+"""Simulated drives on disk, resumable: the same seed gives the same bytes."""
 
+import contextlib
 import dataclasses
+import functools
+import hashlib
 import json
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import jax
-import numpy as np
-from jaxtyping import Float
-
-from sglpr_jax.sim.drive import ROUTES, plan_drive, streets_needed
-from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
-from sglpr_jax.sim.world import build_world
+from sglpr_jax.sim.drive import RATE_HZ, name_of_path, read_path, thinned
+from sglpr_jax.sim.layouts import LAYOUTS, Layout
+from sglpr_jax.sim.routes import ROLES
+from sglpr_jax.sim.sensor import HDL64E, Sensor
+from sglpr_jax.sim.sequence import SimulatedSequence, simulate_sequence
 
 SETTINGS_FILE = "simulation.json"
-VERSION = 1
+VERSION = 2
 """Of what the simulator makes of a seed; a change in its scans needs a new one."""
-CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""Camera x right, y down, z forward from LiDAR x forward, y left, z up; both at one place."""
+WORKERS = 2
+"""Threads that render; the compiled program leaves other threads room."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -27,87 +29,119 @@ def write_dataset(
     root: Path,
     *,
     names: Sequence[str] = ("00", "05", "08"),
+    along: Sequence[Path] = (),
     scans: int = 300,
     sensor: Sensor = HDL64E,
     seed: int = 0,
+    rate_hz: float = RATE_HZ,
+    layout: str = "scans",
     progress: Progress | None = None,
 ) -> Path:
-    """Write the drives `names` of `scans` scans each under `root`/sequences and return `root`.
+    """Write the routes `names`, and the drives along the pose files `along`, into the folder `root`; return `root`.
 
-    Every drive has a town of its own, drawn from `seed` and its name. Scans that are there already are kept, so a run
-    that was cut off goes on where it stopped, to the same bytes; a sequence without `poses.txt` is unfinished.
-    `progress(name, done, scans)` is called after every scan.
+    Every drive has a town of its own, drawn from `seed` and the drive's name, and `scans` scans (along a pose file: at
+    most so many, see `simulate_sequence`). `layout` is "scans" or "images", see `LAYOUTS`. Files that are there already
+    are kept, so a run that was cut off goes on where it stopped, to the same bytes; every file is whole or not there.
+    `progress(name, done, scans)` is called as scans are done.
 
-    Raises ValueError for an unknown name and where `root` holds another dataset or one of other settings.
+    Raises ValueError for unknown names, malformed pose files, and where `root` holds another dataset or one of other
+    settings; OSError, with the file's name, where something cannot be written.
     """
-    unknown = [name for name in names if name not in ROUTES]
+    files = {**dict.fromkeys(names), **{name_of_path(file): file for file in along}}
+    unknown = [name for name in names if name not in ROLES]
     if unknown or scans < 2:
-        raise ValueError(f"expected drives among {', '.join(ROUTES)} with 2 scans or more, found {unknown}, {scans}")
-    _claim(root, {"version": VERSION, "seed": seed, "scans": scans, "sensor": dataclasses.asdict(sensor)})
-    for name in names:
-        _write_sequence(root / "sequences" / name, name, scans=scans, sensor=sensor, seed=seed, progress=progress)
+        raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")
+    if len(files) < len(names) + len(along) or layout not in LAYOUTS:
+        drives = [*names, *map(name_of_path, along)]
+        raise ValueError(f"expected different names and layout scans or images, found {', '.join(drives)} and {layout}")
+    settings = {"version": VERSION, "layout": layout, "scans": scans, "seed": seed, "rate_hz": rate_hz}
+    ways = {f"drive {name}": _fingerprint(file) for name, file in files.items()}
+    _claim(root, {**settings, "sensor": dataclasses.asdict(sensor)}, ways)
+    for name, file in files.items():
+        options = {"along": file, "scans": scans, "sensor": sensor, "seed": seed, "rate_hz": rate_hz}
+        count = scans if file is None else len(thinned(read_path(file), scans).times)
+        simulate = functools.partial(simulate_sequence, name, **options)
+        show = functools.partial(progress, name) if progress else lambda done, scans: None
+        _write_drive(root, name, simulate, scans=count, layout=LAYOUTS[layout], progress=show)
     return root
 
 
-def _claim(root: Path, settings: dict) -> None:
-    """Note the settings in `root`, or make sure that they are those already there."""
+def _fingerprint(file: Path | None) -> str:
+    """What tells one way from another; reads the file whole, so that a malformed one is noticed first."""
+    if file is None:
+        return "route"
+    return hashlib.sha256(b"".join(values.tobytes() for values in read_path(file))).hexdigest()[:16]
+
+
+def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
+    """Note settings and ways in `root`, or make sure that they are those already there; new drives may be added."""
     path = root / SETTINGS_FILE
-    settings = json.loads(json.dumps(settings))  # as JSON gives them back: tuples are lists
-    if not path.exists():
-        if (root / "sequences").exists():
-            raise ValueError(
-                f"{root} holds sequences that were not simulated (no {SETTINGS_FILE}); choose another folder"
-            )
-        root.mkdir(parents=True, exist_ok=True)
-        _write(path, json.dumps(settings, indent=1).encode())
-        return
-    found = json.loads(path.read_text())
-    different = [key for key in settings if found.get(key) != settings[key]]
+    if path.exists():
+        found = _read_settings(path)
+    elif root.is_dir() and any(not file.name.startswith(".") for file in root.iterdir()):
+        raise ValueError(f"{root} holds files that were not simulated (no {SETTINGS_FILE}); choose another folder")
+    else:
+        found = {}
+    expected = json.loads(json.dumps({**settings, **ways}))  # as JSON gives them back: tuples are lists
+    claimed = {**(found or expected), **{way: ways[way] for way in ways if way not in found}}
+    different = [key for key, value in expected.items() if claimed.get(key) != value]
     if different:
-        described = ", ".join(f"{key} {settings[key]} (found {found.get(key)})" for key in different)
+        described = ", ".join(f"{key} {expected[key]} (found {found.get(key)})" for key in different)
         raise ValueError(f"{path} belongs to another simulated dataset; expected {described}; choose another folder")
+    if claimed != found:
+        _write(path, json.dumps(claimed, indent=1, sort_keys=True).encode())
 
 
-def _write_sequence(
-    folder: Path, name: str, *, scans: int, sensor: Sensor, seed: int, progress: Progress | None
+def _read_settings(path: Path) -> dict:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ValueError(
+            f"{path}: expected the settings of a simulated dataset, found no such JSON ({error})"
+        ) from error
+
+
+def _write_drive(
+    root: Path,
+    name: str,
+    simulate: Callable[[], SimulatedSequence],
+    *,
+    scans: int,
+    layout: Layout,
+    progress: Callable[[int, int], None],
 ) -> None:
-    world = build_world((seed, int(name)), streets=streets_needed(name, scans))
-    rng = np.random.default_rng((seed, int(name), 1))
-    drive = plan_drive(rng, name, world, scans=scans, height_m=sensor.height_m)
-    key = jax.random.fold_in(jax.random.key(seed), int(name))
-    (folder / "velodyne").mkdir(parents=True, exist_ok=True)
-    (folder / "labels").mkdir(exist_ok=True)
-    for i, world_from_lidar in enumerate(drive.world_from_lidar):
-        points_file, label_file = folder / "velodyne" / f"{i:06d}.bin", folder / "labels" / f"{i:06d}.label"
-        if not (points_file.exists() and label_file.exists()):
-            points, labels = scan(jax.random.fold_in(key, i), world, world_from_lidar, sensor=sensor)
-            _write(label_file, labels.astype("<u4").tobytes())
-            _write(points_file, points.astype("<f4").tobytes())
-        if progress is not None:
-            progress(name, i + 1, scans)
-    _write(folder / "calib.txt", _calibration().encode())
-    _write(folder / "times.txt", "".join(f"{time:.6e}\n" for time in drive.times).encode())
-    _write(folder / "poses.txt", _camera_poses(drive.world_from_lidar).encode())
+    """Write what is missing of one drive; its town is built only where something is."""
+    missing = [i for i in range(scans) if not all(file.exists() for file in layout.files_of_scan(root, name, i))]
+    progress(scans - len(missing), scans)
+    if not missing and layout.is_finished(root, name):
+        return
+    sequence = simulate()
 
+    def write_scan(i: int) -> None:
+        contents = layout.scan_contents(*sequence.render(i))
+        for file, content in zip(layout.files_of_scan(root, name, i), contents, strict=True):
+            _write(file, content)
 
-def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
-    return " ".join(f"{value:.9g}" for value in matrix[:3].ravel())
-
-
-def _calibration() -> str:
-    """KITTI's calib.txt; nothing here has a camera, so its projections are identities."""
-    projections = "".join(f"P{i}: {_row(np.eye(4))}\n" for i in range(4))
-    return f"{projections}Tr: {_row(CAMERA_FROM_LIDAR)}\n"
-
-
-def _camera_poses(world_from_lidar: Float[np.ndarray, "n 4 4"]) -> str:
-    """Lines of poses.txt: world_from_camera, in a world whose axes are a camera's as well."""
-    poses = CAMERA_FROM_LIDAR @ world_from_lidar @ CAMERA_FROM_LIDAR.T
-    return "".join(_row(pose) + "\n" for pose in poses)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        try:
+            for done, _ in enumerate(pool.map(write_scan, missing), scans - len(missing) + 1):
+                progress(done, scans)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    for file, content in layout.drive_contents(sequence.drive).items():
+        _write(root / layout.folder.format(name=name) / file, content)
 
 
 def _write(path: Path, content: bytes) -> None:
     """Write a file whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(f"{path}: could not write this file of the simulated dataset ({error})") from error
+    finally:
+        with contextlib.suppress(OSError):  # it is gone where all went well
+            temporary.unlink()

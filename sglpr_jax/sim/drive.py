@@ -1,28 +1,42 @@
-"""Where the vehicle goes: three routes through a street grid, each with the revisits that its namesake in KITTI has."""
+"""Where the vehicle goes and when: along one of the eleven routes, or along a given pose file."""
 
+import hashlib
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
 
-from sglpr_jax.sim.world import World
+from sglpr_jax.data.pose_files import read_poses, read_times
+from sglpr_jax.poses import positions_from_camera
+from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
+from sglpr_jax.sim.routes import ROLES, STEP_M, plan_route, travelled
 
-ROUTES = {
-    # Around an L of three blocks and on for half the way again: same-direction revisits.
-    "00": ((0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 0), (2, 0), (2, 1), (1.5, 1)),
-    # Around a row of three blocks, likewise.
-    "05": ((0, 0), (3, 0), (3, 1), (0, 1), (0, 0), (3, 0), (3, 0.5)),
-    # Out along two streets, around a block, and the two streets back: revisits in the opposite direction.
-    "08": ((1, 0), (2, 0), (2, 3), (3, 3), (3, 2), (2, 2), (2, 0), (1, 0)),
-}
-"""The corners of every route as (street along y, street along x); 1.5 is midway between two. Scale 1: some 600 m."""
-SCANS_PER_SCALE = 300
-SPEED_MPS = 6.0
-LANE_M = 0.9
-"""How far right of the middle of the street the vehicle keeps; small, so that both directions lie within 3 m."""
-SWAY_M = 0.3
-CORNER_RADIUS_M = 4.5
-STEP_M = 0.25
+RATE_HZ = 4.0
+"""Scans per second, so that at a car's speed they lie some 2 m apart; KITTI's car took 10."""
+PATH_HZ = 10.0
+"""Poses per second, roughly, of the path between scans."""
+SHORTEST_S = 60.0
+"""Of a drive; a shorter one could not come back after 30 s. Few scans are spread over that time."""
+LANE_M = (0.9, 1.6)
+"""How far right of the middle of the street the vehicle keeps; both directions mostly lie within 3 m."""
+SWAY_WAVELENGTH_M = (60.0, 150.0)
+STEERING_M = 3.0
+"""Width of the Gaussian that smooths the path once more: a steering wheel does not jump."""
+LATERAL_ACCELERATION = 2.0
+ACCELERATION = 1.5
+"""In metres per square second, as is the lateral one: how fast a corner is taken, and how fast speeds change."""
+FREE_SPEED = 1.35
+"""Speed on a free street, as a multiple of the mean one."""
+
+
+class Trajectory(NamedTuple):
+    """The vehicle's way in the plane."""
+
+    xy: np.ndarray  # (n, 2) metres, of the LiDAR
+    yaw: np.ndarray  # (n,) radians, where the vehicle heads
+    times: np.ndarray  # (n,) seconds, from 0
 
 
 class Drive(NamedTuple):
@@ -32,69 +46,117 @@ class Drive(NamedTuple):
     times: np.ndarray  # (n,) seconds
 
 
-def scale_of(scans: int) -> int:
-    """How much larger than at scale 1 a route of `scans` scans is, so that scans lie some 2 m apart."""
-    return max(1, round(scans / SCANS_PER_SCALE))
+def plan_trajectory(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> Trajectory:
+    """Return where the `scans` scans of route `name` are taken, evenly spread in time.
 
-
-def streets_needed(name: str, scans: int) -> tuple[int, int]:
-    """How many streets along y and along x the route needs, with a block of houses all around."""
-    columns, rows = np.max(ROUTES[name], axis=0) * scale_of(scans)
-    return int(columns) + 3, int(rows) + 3
-
-
-def plan_drive(rng: np.random.Generator, name: str, world: World, *, scans: int, height_m: float) -> Drive:
-    """Return `scans` poses along the route `name`, evenly spaced, driven at a constant speed.
-
-    The path keeps to the right of the middle of the street and sways a little, differently on every visit.
+    The route is as long as a car gets in `scans / rate_hz` seconds, but takes SHORTEST_S at least. The vehicle keeps to
+    the right and sways a little, differently on every visit; it slows down in corners. Raises ValueError for an unknown
+    name.
     """
-    nodes = np.array(ROUTES[name]) * scale_of(scans) + 1
-    streets = world.streets_x, world.streets_y
-    corners = np.stack([np.interp(n, np.arange(len(s)), s) for n, s in zip(nodes.T, streets, strict=True)], axis=1)
-    path = _in_lane(rng, _resample(_rounded(corners), STEP_M))
-    travelled = _travelled(path)
-    at = np.linspace(0, travelled[-1], scans)
-    x, y = (np.interp(at, travelled, axis) for axis in path.T)
+    return thinned(plan_path(rng, name, scans=scans, rate_hz=rate_hz), scans)
+
+
+def plan_path(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> Trajectory:
+    """Return the whole way of `plan_trajectory`, a pose about every 0.1 s: a whole multiple of `scans` poses."""
+    if name not in ROLES:
+        raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
+    role = ROLES[name]
+    seconds = max(scans / rate_hz, SHORTEST_S)
+    path = _in_lane(rng, plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m)))
     heading = np.unwrap(np.arctan2(*np.gradient(path, axis=0).T[::-1]))
-    poses = _level_poses(x, y, np.full(scans, height_m), np.interp(at, travelled, heading))
-    return Drive(poses, at / SPEED_MPS)
+    clock = _clock(rng, path, heading, FREE_SPEED * role.speed_mps)
+    times = np.linspace(0, clock[-1], scans * max(1, round(clock[-1] * PATH_HZ / scans)))
+    x, y, yaw = (np.interp(times, clock, values) for values in (*path.T, heading))
+    return Trajectory(np.stack([x, y], axis=1), yaw, times)
 
 
-def _travelled(path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+def read_path(file: Path) -> Trajectory:
+    """Return the way of a KITTI pose file: 12 numbers a line, the camera's pose; 0.1 s a line.
+
+    Where a `times.txt` lies beside it, the times are its. Distances in x and y are exactly the file's; heights, pitch
+    and roll are dropped. Raises FileNotFoundError, and ValueError naming file, line, what was expected and found.
+    """
+    poses = read_poses(file)
+    if len(poses) < 2:
+        raise ValueError(f"{file}: expected 2 poses or more, 12 numbers a line, found {len(poses)}")
+    times_file = file.parent / "times.txt"
+    times = read_times(times_file) if times_file.is_file() else np.arange(len(poses)) / 10
+    if len(times) != len(poses):
+        raise ValueError(f"{times_file}: expected {len(poses)} times, one per pose of {file.name}, found {len(times)}")
+    if not np.all(np.diff(times) > 0):
+        line = int(np.argmin(np.diff(times))) + 2
+        raise ValueError(f"{times_file}, line {line}: expected a time > {times[line - 2]}, found {times[line - 1]}")
+    yaw = np.arctan2(-poses[:, 0, 2], poses[:, 2, 2])  # where the camera's z axis points
+    return Trajectory(positions_from_camera(poses)[:, :2], yaw, times - times[0])
 
 
-def _rounded(corners: Float[np.ndarray, "c 2"]) -> Float[np.ndarray, "n 2"]:
-    """The way through `corners` with a quarter circle in place of every turn."""
-    points = [corners[:1]]
-    quarter = np.linspace(0, np.pi / 2, 30)[:, None]
-    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
-        arriving = (corner - before) / np.linalg.norm(corner - before)
-        leaving = (after - corner) / np.linalg.norm(after - corner)
-        centre = corner + CORNER_RADIUS_M * (leaving - arriving)
-        points.append(centre + CORNER_RADIUS_M * (np.sin(quarter) * arriving - np.cos(quarter) * leaving))
-    return np.concatenate([*points, corners[-1:]])
+def name_of_path(file: Path) -> str:
+    """The name of the drive along a pose file: the file's stem, or its folder's name for a `poses.txt`."""
+    return file.resolve().parent.name if file.name == "poses.txt" else file.stem
 
 
-def _resample(path: Float[np.ndarray, "n 2"], step_m: float) -> Float[np.ndarray, "m 2"]:
-    travelled = _travelled(path)
-    at = np.linspace(0, travelled[-1], int(travelled[-1] / step_m) + 2)
-    return np.stack([np.interp(at, travelled, axis) for axis in path.T], axis=1)
+def thinned(path: Trajectory, scans: int) -> Trajectory:
+    """Every k-th pose, with the smallest k that leaves at most `scans` of them."""
+    return Trajectory(*(values[every_kth(path, scans)] for values in path))
 
 
-def _in_lane(rng: np.random.Generator, path: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """`path` moved to the right, with a slow sway."""
-    wavelengths, phases = rng.uniform(60, 150, 3), rng.uniform(0, 2 * np.pi, 3)
-    waves = np.sin(2 * np.pi * _travelled(path)[:, None] / wavelengths[None, :] + phases[None, :])
-    offset = LANE_M + SWAY_M * waves.mean(axis=1)
-    tangent = np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    return path + offset[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+def every_kth(path: Trajectory, scans: int) -> slice:
+    """Which poses of `path` are those of `thinned`."""
+    return slice(None, None, -(-len(path.times) // scans))
 
 
-def _level_poses(x: np.ndarray, y: np.ndarray, z: np.ndarray, yaw: np.ndarray) -> Float[np.ndarray, "n 4 4"]:
+def speeds(path: Trajectory) -> Float[np.ndarray, " n"]:
+    """How fast the vehicle is at every pose, in metres per second."""
+    return np.linalg.norm(np.gradient(path.xy, path.times, axis=0), axis=1)
+
+
+def drive_seed(seed: int, name: str) -> tuple[int, int]:
+    """The seed of one drive of a dataset: drives of other names are others."""
+    return seed, int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
+
+
+def poses_on(
+    relief: Relief, xy: Float[np.ndarray, "n 2"], yaw: Float[np.ndarray, " n"], *, height_m: float
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return world_from_lidar for a vehicle on hills: z along the ground's normal, x forward, `height_m` above it."""
+    slope = relief_gradient(relief, xy)
+    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    x_axis = np.concatenate([forward, (forward * slope).sum(axis=1, keepdims=True)], axis=1)
+    z_axis = np.concatenate([-slope, np.ones((len(yaw), 1))], axis=1)
+    steepness = np.linalg.norm(z_axis, axis=1)
+    x_axis /= np.linalg.norm(x_axis, axis=1, keepdims=True)
+    z_axis /= steepness[:, None]
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
-    poses[:, :3, 3] = np.stack([x, y, z], axis=1)
+    poses[:, :3, :3] = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=2)
+    poses[:, :2, 3] = xy
+    poses[:, 2, 3] = relief_height(relief, xy) + height_m * steepness  # `height_m` along the normal
     return poses
+
+
+def _waves(rng: np.random.Generator, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """A slow random curve along a path, between -1 and 1."""
+    wavelengths, phases = rng.uniform(*SWAY_WAVELENGTH_M, 3), rng.uniform(0, 2 * np.pi, 3)
+    return np.sin(2 * np.pi * length[:, None] / wavelengths + phases).mean(axis=1)
+
+
+def _in_lane(rng: np.random.Generator, middle: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """`middle` moved to the right, with a slow sway."""
+    offset = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * _waves(rng, travelled(middle))
+    tangent = np.gradient(middle, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    lane = middle + offset[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    return gaussian_filter1d(lane, STEERING_M / STEP_M, axis=0, mode="nearest")
+
+
+def _clock(
+    rng: np.random.Generator, path: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], free_mps: float
+) -> Float[np.ndarray, " n"]:
+    """When each point of `path` is passed: as fast as streets and corners allow, with a car's accelerations."""
+    length = travelled(path)
+    curvature = np.abs(np.gradient(heading, length)).clip(min=1e-6)
+    limit = np.minimum((free_mps * (1 + 0.2 * _waves(rng, length))) ** 2, LATERAL_ACCELERATION / curvature)
+    gain = 2 * ACCELERATION * length  # v^2 grows by at most 2 a s
+    limit = np.minimum.accumulate(limit - gain) + gain
+    limit = np.minimum.accumulate((limit + gain)[::-1])[::-1] - gain
+    speed = np.sqrt(limit)
+    return np.concatenate([[0.0], np.cumsum(np.diff(length) / ((speed[1:] + speed[:-1]) / 2))])

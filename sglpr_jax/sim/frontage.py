@@ -1,147 +1,48 @@
-"""What stands along one side of a block of houses, as the street shows it.
+"""What stands along one side of a street: on the strips beside the road, and on the plots behind them.
 
-Everything is placed in the side's own frame: s runs along the kerb from one corner to the next, d leads away from the
-road, z up. Five styles of block and a few random numbers per side make one street differ from the next.
+Everything is placed in the side's own frame: s runs along the street, d leads outwards from the kerb.
 """
 
-import dataclasses
-from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-CAR, BICYCLE, TRUCK, VAN, PERSON, BICYCLIST = 10, 11, 18, 20, 30, 31
-ROAD, PARKING, SIDEWALK, BUILDING, FENCE, VEGETATION = 40, 44, 48, 50, 51, 70
-TRUNK, TERRAIN, POLE, TRAFFIC_SIGN = 71, 72, 80, 81
-BAY_M = 2.3
-"""Depth of a parking bay."""
+from sglpr_jax.sim import buildings, plants, vehicles
+from sglpr_jax.sim.raw_ids import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN
+from sglpr_jax.sim.styles import Side, draw_house
+from sglpr_jax.sim.things import Part, Placed, Range, Thing, Zone
 
-Range = tuple[float, float]
-
-
-class Item(NamedTuple):
-    """One shape in the frame of its side; metres and radians."""
-
-    kind: Literal["box", "cylinder", "ellipsoid"]
-    label: int
-    s: float
-    d: float
-    bottom: float
-    length: float  # along s before the yaw
-    width: float
-    height: float
-    yaw: float = 0.0
-    roughness: float = 0.0
+Clock = tuple[float, float]
+"""When the drive begins and ends, seconds."""
+STAY_S = 200.0
+"""How long a parked car stays, on average."""
+CHANGING_BUSHES = 0.1
+"""Share of the bushes that are there only for a while: they grow and are cut between two visits."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Style:
-    """How one kind of block is built; every pair is the range of a uniform distribution, in metres."""
+def frontage(
+    rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock, bystanders: Iterator[Callable]
+) -> Iterator[Placed]:
+    """Yield all that stands along one side from s = `start` to `stop`, where no other street joins.
 
-    width: Range
-    depth: Range
-    height: Range
-    gap: Range
-    set_back: Range
-    garden: int  # label of the ground around the houses
-    border: tuple[str, ...]  # what may close off the front; one is drawn per side
-    parking: float  # probability that a block has parking bays
-    greenery: float  # trees and bushes per metre of side
-    houses: float  # probability that a plot is built on
-
-
-STYLES = {
-    "centre": Style(
-        width=(9.0, 22.0),
-        depth=(8.0, 13.0),
-        height=(9.0, 18.0),
-        gap=(-2.0, 0.5),
-        set_back=(0.0, 1.5),
-        garden=SIDEWALK,
-        border=("none",),
-        parking=0.6,
-        greenery=0.05,
-        houses=0.9,
-    ),
-    "suburb": Style(
-        width=(8.0, 14.0),
-        depth=(7.0, 11.0),
-        height=(4.0, 8.0),
-        gap=(3.0, 11.0),
-        set_back=(3.0, 8.0),
-        garden=TERRAIN,
-        border=("hedge", "hedge", "fence", "wall", "none", "none"),
-        parking=0.3,
-        greenery=0.35,
-        houses=1.0,
-    ),
-    "estate": Style(
-        width=(18.0, 38.0),
-        depth=(10.0, 13.0),
-        height=(8.0, 13.0),
-        gap=(8.0, 20.0),
-        set_back=(4.0, 10.0),
-        garden=TERRAIN,
-        border=("none", "none", "hedge"),
-        parking=0.5,
-        greenery=0.25,
-        houses=1.0,
-    ),
-    "works": Style(
-        width=(16.0, 40.0),
-        depth=(12.0, 20.0),
-        height=(5.0, 9.0),
-        gap=(6.0, 18.0),
-        set_back=(3.0, 10.0),
-        garden=PARKING,
-        border=("fence", "wall", "hedge"),
-        parking=0.2,
-        greenery=0.08,
-        houses=1.0,
-    ),
-    "park": Style(
-        width=(6.0, 9.0),
-        depth=(4.0, 6.0),
-        height=(3.0, 4.0),
-        gap=(20.0, 40.0),
-        set_back=(8.0, 15.0),
-        garden=TERRAIN,
-        border=("none", "none", "hedge", "fence"),
-        parking=0.2,
-        greenery=0.6,
-        houses=0.3,
-    ),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class Verge:
-    """The strip between the kerb and the plots of a block."""
-
-    bay: float  # depth of the parking bays; 0 where there are none
-    walk: float  # width of the sidewalk
-
-    @property
-    def depth(self) -> float:
-        return self.bay + self.walk
-
-
-def draw_verge(rng: np.random.Generator, style: Style) -> Verge:
-    """Draw the parking bays and the sidewalk around a block."""
-    return Verge(BAY_M if rng.random() < style.parking else 0.0, rng.uniform(1.5, 3.5))
-
-
-def frontage(rng: np.random.Generator, style: Style, verge: Verge, length: float) -> Iterator[Item]:
-    """Yield all that stands along one side of `length` metres between its two corners."""
-    if verge.bay:
-        yield from _parked_cars(rng, verge.bay / 2, length)
-    yield from _street_furniture(rng, verge, length)
-    yield from _passers_by(rng, verge, length)
-    yield from _border(rng, style, verge, length)
-    yield from _plots(rng, style, verge, length)
-    for _ in range(rng.poisson(style.greenery * length)):
-        s, d = rng.uniform(verge.depth + 2, length - verge.depth - 2), verge.depth + 0.8 + 12 * rng.random() ** 2
-        yield from _tree(rng, s, d, (2.5, 6.0)) if rng.random() < 0.5 else _bush(rng, s, d)
+    `bystanders` yields the makers of people, bicycles and the like, in the order in which they shall occur.
+    """
+    if side.bays:
+        yield from _parked_cars(rng, side, start, stop, clock)
+    yield from _street_furniture(rng, side, start, stop)
+    yield from _tree_row(rng, side, start, stop)
+    for s in _poisson(rng, side.style.bystanders, start, stop):
+        d = side.verge - rng.uniform(0.3, max(side.strips[-1].width, 0.6) if side.strips else 0.6)
+        make = next(bystanders)
+        yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.5)
+    if side.wood:
+        yield from _wood(rng, side, start, stop)
+    elif side.bank:
+        yield from _banks(rng, side, start, stop)
+    else:
+        yield from _border(rng, side, start, stop)
+        yield from _plots(rng, side, start, stop, clock)
+    yield from _greenery(rng, side, start, stop, clock)
 
 
 def _steps(rng: np.random.Generator, start: float, stop: float, spacing: Range) -> Iterator[float]:
@@ -152,116 +53,203 @@ def _steps(rng: np.random.Generator, start: float, stop: float, spacing: Range) 
         place += rng.uniform(*spacing)
 
 
-def _car(rng: np.random.Generator, s: float, d: float, yaw: float) -> Iterator[Item]:
-    yaw += rng.normal(0, 0.03)
-    kind = rng.choice(["car", "van", "truck"], p=[0.9, 0.07, 0.03])
-    if kind == "car":
-        length, height = rng.uniform(3.6, 4.8), rng.uniform(1.35, 1.65)
-        yield Item("box", CAR, s, d, 0.2, length, 1.75, 0.6 * height, yaw)
-        yield Item("box", CAR, s, d, 0.2, 0.55 * length, 1.5, height - 0.2, yaw)
-    elif kind == "van":
-        yield Item("box", VAN, s, d, 0.25, rng.uniform(4.8, 5.6), 1.95, rng.uniform(1.8, 2.4), yaw)
-    else:
-        yield Item("box", TRUCK, s, d, 0.4, rng.uniform(6, 8), 2.1, rng.uniform(2.6, 3.3), yaw)
+def _poisson(rng: np.random.Generator, per_metre: float, start: float, stop: float) -> list[float]:
+    return rng.uniform(start, stop, rng.poisson(per_metre * (stop - start))).tolist()
 
 
-def _parked_cars(rng: np.random.Generator, d: float, length: float) -> Iterator[Item]:
-    occupied = rng.uniform(0.15, 0.95)
-    for s in _steps(rng, 7.0, length - 7, (5.6, 6.4)):
-        if rng.random() < occupied:
-            yield from _car(rng, s, d, 0.0)
+def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float = STAY_S) -> Iterator[Clock]:
+    """Yield when a place that is taken for a share `occupied` of the time is taken: stays of `stay_s` on average."""
+    time = clock[0]
+    taken = rng.random() < occupied
+    while time < clock[1]:
+        lasts = rng.exponential(stay_s if taken else stay_s * (1 - occupied) / occupied)
+        if taken:
+            yield (-np.inf if time == clock[0] else time, time + lasts)
+        time, taken = time + lasts, not taken
 
 
-def _tree(rng: np.random.Generator, s: float, d: float, spread: Range) -> Iterator[Item]:
-    """A trunk under a crown whose diameter is in the range `spread`."""
-    trunk, crown = rng.uniform(0.25, 0.7), rng.uniform(*spread)
-    below = rng.uniform(1.2, 2.6)
-    yield Item("cylinder", TRUNK, s, d, 0, trunk, trunk, below + 0.3 * crown)
-    yield Item("ellipsoid", VEGETATION, s, d, below, crown, crown, crown * rng.uniform(0.8, 1.4), roughness=0.5)
+def _changing(
+    rng: np.random.Generator,
+    make: Callable[[np.random.Generator], Thing],
+    s: float,
+    d: float,
+    yaw: float,
+    zone: Zone,
+    clock: Clock,
+    occupied: float,
+) -> Iterator[Placed]:
+    """Yield what stands at one place, one after the other."""
+    for since, until in stays(rng, clock, occupied):
+        shift, turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
+        yield Placed(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, zone, since, until)
 
 
-def _bush(rng: np.random.Generator, s: float, d: float) -> Iterator[Item]:
-    length, width, height = rng.uniform(0.8, 3.5), rng.uniform(0.8, 2), rng.uniform(0.6, 2.6)
-    yield Item("ellipsoid", VEGETATION, s, d, -0.3 * height, length, width, 1.3 * height, rng.uniform(0, np.pi), 0.15)
+def _parked_cars(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
+    d = side.strips[0].width / 2 + 0.1
+    for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
+        yaw = rng.choice((0.0, np.pi))
+        yield from _changing(rng, vehicles.parked, s, d, yaw, "bay", clock, side.occupied)
 
 
-def _street_furniture(rng: np.random.Generator, verge: Verge, length: float) -> Iterator[Item]:
-    """Lamp posts, signs and, along some sides, a row of trees."""
-    d = verge.bay + 0.4
-    lamps = rng.uniform(18, 40)
-    for s in _steps(rng, 2.0, length - 2, (lamps, lamps + 3)):
-        yield Item("cylinder", POLE, s, d, 0, 0.2, 0.2, rng.uniform(5, 8))
-    for s in _steps(rng, 2.0, length - 2, (12.0, 50.0)):
-        side = rng.uniform(0.5, 0.8)
-        yield Item("cylinder", POLE, s, d, 0, 0.09, 0.09, 2.3)
-        yield Item("box", TRAFFIC_SIGN, s, d, 2.0, 0.06, side, side, rng.normal(0, 0.2))
-    if verge.walk > 2 and rng.random() < 0.4:
-        spacing = rng.uniform(7, 16)
-        for s in _steps(rng, 4.0, length - 4, (spacing, spacing + 1)):
-            yield from _tree(rng, s, d + 0.3, (1.8, 3.4))  # small: the vehicle passes beside it
+def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+    """Lamp posts, signs and bins at the inner edge of the sidewalk."""
+    d = side.verge - side.strips[-1].width + 0.35 if side.strips else 0.7
+    zone: Zone = "verge" if side.strips else "plot"
+    if side.style.lamps:
+        spacing = rng.uniform(20, 40)
+        for s in _steps(rng, start, stop, (spacing, spacing + 3)):
+            yield Placed((Part("cylinder", POLE, (0.18, 0.18, rng.uniform(5, 8))),), s, d, zone=zone)
+        for s in _steps(rng, start, stop, (40.0, 120.0)):
+            yield Placed(bin_or_bench(rng), s, d + 0.3, zone=zone)
+    for s in _poisson(rng, side.style.signs, start, stop):
+        size, low = rng.uniform(0.5, 0.9), rng.uniform(1.3, 2.1)
+        post = Part("cylinder", POLE, (0.08, 0.08, low + size))
+        plate = Part("box", TRAFFIC_SIGN, (0.06, size, size), x=0.06, bottom=low)
+        yield Placed((post, plate), s, d, rng.normal(0, 0.2), zone)
 
 
-def _passers_by(rng: np.random.Generator, verge: Verge, length: float) -> Iterator[Item]:
-    """People, riders and parked bicycles on the sidewalk."""
-    for s in rng.uniform(2, length - 2, rng.poisson(length / 60)):
-        d, height = verge.bay + rng.uniform(0.6, verge.walk), rng.uniform(1.5, 1.9)
-        what = rng.choice(["person", "bicyclist", "bicycle"], p=[0.5, 0.2, 0.3])
-        if what == "person":
-            yield Item("cylinder", PERSON, s, d, 0, 0.5, 0.35, height)
-            continue
-        yield Item("box", BICYCLIST if what == "bicyclist" else BICYCLE, s, d, 0, 1.7, 0.12, 1.0)
-        if what == "bicyclist":
-            yield Item("cylinder", BICYCLIST, s, d, 0.6, 0.4, 0.45, height - 0.4)
-
-
-def _border(rng: np.random.Generator, style: Style, verge: Verge, length: float) -> Iterator[Item]:
-    """What closes the plots off from the sidewalk, in pieces with entrances between them."""
-    label, thickness, low, high, roughness = {
-        "none": (FENCE, 0, 0, 0, 0),
-        "hedge": (VEGETATION, 0.8, 0.9, 2.2, 0.12),
-        "fence": (FENCE, 0.06, 0.9, 1.8, 0.03),
-        "wall": (FENCE, 0.25, 0.6, 2.0, 0.0),
-    }[rng.choice(style.border)]
-    if not thickness:
+def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+    """Street trees, on the median where there is one; a highway's median has a guard rail instead."""
+    if side.median and side.border == "rail":
+        yield from _in_pieces(rng, "rail", start, stop, side.median / 2, "verge")
         return
-    s, end = verge.depth, length - verge.depth
-    while s < end:
-        piece = min(rng.uniform(5, 22), end - s)
-        if rng.random() < 0.85:
-            d = verge.depth + 0.2 + thickness / 2
-            yield Item("box", label, s + piece / 2, d, 0, piece, thickness, rng.uniform(low, high), 0, roughness)
-        s += piece + rng.uniform(2, 5)
+    if not side.tree_spacing:
+        return
+    rows = [side.verge - side.strips[-1].width + 0.5] if side.strips else [1.2]
+    if side.median:
+        rows = [side.median / 2] if side.median < 5 else [1.3, side.median - 1.3]
+    for d in rows:
+        for s in _steps(rng, start + 2, stop - 2, (side.tree_spacing, side.tree_spacing + 1)):
+            spread = (2.0, 4.0) if side.median or side.strips else (3.0, 7.0)
+            yield Placed(plants.tree(rng, spread), s, d, zone="verge" if side.strips else "plot")
 
 
-def _plots(rng: np.random.Generator, style: Style, verge: Verge, length: float) -> Iterator[Item]:
-    """The row of houses; some have a lower wing, some gaps hold a car, a shed or a hedge between neighbours."""
-    s, end = verge.depth + rng.uniform(*style.set_back), length - verge.depth - 2
-    row = rng.uniform(*style.set_back)  # the row's common building line
-    while s < end:
-        width, depth, gap = rng.uniform(*style.width), rng.uniform(*style.depth), rng.uniform(*style.gap)
-        width = min(width, end - s)
-        if rng.random() < style.houses and width > 3:
-            set_back = row if rng.random() < 0.7 else rng.uniform(*style.set_back)
-            yield from _house(rng, s, verge.depth + set_back, width, depth, rng.uniform(*style.height))
-        if gap > 2.5 and s + width + gap < end:
-            yield from _between_houses(rng, s + width, verge.depth, gap)
+_BORDERS: dict[str, tuple[float, Range, float]] = {
+    # thickness, range of heights, share of the line that is closed
+    "hedge": (0.8, (0.9, 2.2), 0.85),
+    "fence": (0.06, (0.9, 1.8), 0.85),
+    "wall": (0.25, (0.7, 2.2), 0.9),
+    "rail": (0.15, (0.75, 0.8), 1.0),
+}
+
+
+def _piece(border: str, length: float, thickness: float, height: float) -> Thing:
+    if border == "hedge":
+        return plants.hedge(length, thickness, height)
+    if border == "rail":
+        return (
+            Part("box", FENCE, (length, thickness, 0.35), bottom=height - 0.35),
+            Part("cylinder", FENCE, (0.12, 0.12, height)),
+        )
+    porosity = 0.45 if border == "fence" else 0.0
+    return (Part("box", FENCE, (length, thickness, height + 0.3), bottom=-0.3, porosity=porosity),)
+
+
+def _in_pieces(
+    rng: np.random.Generator, border: str, start: float, stop: float, d: float, zone: Zone
+) -> Iterator[Placed]:
+    """A line along the street, in short pieces so that it follows curves and slopes."""
+    thickness, heights, _ = _BORDERS[border]
+    height = rng.uniform(*heights)
+    count = int((stop - start) / 5) + 1
+    edges = np.linspace(start, stop, count + 1).tolist()
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        yield Placed(_piece(border, high - low + 0.1, thickness, height), (low + high) / 2, d, zone=zone)
+
+
+def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+    """What closes the plots off from the sidewalk, with entrances between."""
+    if side.border == "none":
+        return
+    thickness, _, closed = _BORDERS[side.border]
+    d = side.verge + 0.45 + thickness / 2
+    s = start
+    while s < stop - 1:
+        end = stop if side.border == "rail" else min(s + rng.uniform(6, 30), stop)
+        if rng.random() < closed:
+            yield from _in_pieces(rng, side.border, s, end, d, "plot")
+        s = end + rng.uniform(2, 4.5)
+
+
+def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
+    """The row of houses; gaps hold cars, a garage, a wall or a hedge between neighbours."""
+    style = side.style
+    s = start + max(rng.uniform(*style.gap), 0) / 2
+    while s < stop - 3.5:
+        plan = side.row or draw_house(rng, style)
+        width, gap = min(plan.width, stop - s), rng.uniform(*style.gap)
+        if rng.random() < style.houses:
+            near = rng.random() < (1.0 if side.row else 0.75)
+            set_back = side.set_back if near else rng.uniform(*style.set_back)
+            plan = buildings.House(width, plan.depth, plan.height, plan.glass)
+            thing = buildings.house(rng, plan, porch=set_back > 2)
+            yield Placed(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
+        if gap > 2.5 and s + width + gap < stop:
+            yield from _between_houses(rng, s + width, side, gap, clock)
         s += width + gap
 
 
-def _house(rng: np.random.Generator, s: float, d: float, width: float, depth: float, height: float) -> Iterator[Item]:
-    """A house whose front begins at (s, d)."""
-    yield Item("box", BUILDING, s + width / 2, d + depth / 2, 0, width, depth, height, rng.normal(0, 0.01))
-    if rng.random() < 0.5:  # a wing or a porch in front of the house, or set back beside it
-        wing, forward = rng.uniform(0.2, 0.5) * width, rng.uniform(-1.5, 1.5)
-        at = s + wing / 2 + rng.uniform(0, width - wing)
-        yield Item("box", BUILDING, at, d + depth / 2 - forward, 0, wing, depth, rng.uniform(0.5, 0.85) * height)
-
-
-def _between_houses(rng: np.random.Generator, s: float, d: float, gap: float) -> Iterator[Item]:
-    what = rng.choice(["car", "shed", "hedge", "nothing"], p=[0.35, 0.2, 0.2, 0.25])
-    if what == "car":
-        yield from _car(rng, s + gap / 2, d + rng.uniform(3, 6), np.pi / 2)
-    elif what == "shed":
-        yield Item("box", BUILDING, s + gap / 2, d + rng.uniform(8, 11), 0, min(gap, 4), 5, rng.uniform(2.2, 3))
+def _between_houses(
+    rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock
+) -> Iterator[Placed]:
+    what = rng.choice(["cars", "garage", "hedge", "wall", "nothing"], p=[0.4, 0.2, 0.15, 0.1, 0.15])
+    middle, d = s + gap / 2, side.verge
+    if what == "cars":
+        for at in np.arange(s + 1.4, s + min(gap, 14) - 1.2, 2.6).tolist():
+            yield from _changing(rng, vehicles.parked, at, d + 4.5, np.pi / 2, "plot", clock, 0.6)
+    elif what == "garage":
+        yield Placed(buildings.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
     elif what == "hedge":
-        yield Item("box", VEGETATION, s + gap / 2, d + 6, 0, 0.8, 11, rng.uniform(1, 2.2), roughness=0.12)
+        yield Placed(plants.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
+    elif what == "wall":
+        yield Placed(_piece("wall", 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
+
+
+def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
+    """Trees and bushes on the plots, more of them near the street."""
+    for s in _poisson(rng, side.style.trees, start, stop):
+        d, kind = side.verge + 1.5 + 14 * rng.random() ** 2, rng.random()
+        if kind < 0.35:
+            yield Placed(plants.tree(rng, (3.0, 7.0)), s, d)
+        elif kind < 0.43:
+            yield Placed(plants.conifer(rng), s, d)
+        elif rng.random() < CHANGING_BUSHES:
+            yield from _changing(rng, plants.bush, s, d, 0.0, "plot", clock, 0.5)
+        else:
+            yield Placed(plants.bush(rng), s, d)
+
+
+def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+    """The edge of a wood, some rows deep."""
+    edge = side.verge + rng.uniform(2.5, 6)
+    for row in range(3):
+        for s in _steps(rng, start, stop, (3.0 + row, 5.5 + 2 * row)):
+            yield Placed(plants.thicket(rng), s, edge + 4.5 * row + rng.uniform(0, 2), rng.uniform(0, 2 * np.pi))
+
+
+def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+    """Ground that rises beside the road, with bushes on it."""
+    for s in _steps(rng, start, stop, (9.0, 14.0)):
+        length, width, height = rng.uniform((16, 9, 1.5), (30, 16, 4.0)).tolist()
+        bank = Part("ellipsoid", TERRAIN, (length, width, 2 * height), bottom=-height, roughness=0.02)
+        bushes = [
+            part._replace(x=part.x + rng.uniform(-0.3, 0.3) * length, bottom=part.bottom + 0.85 * height)
+            for part in plants.bush(rng, 1.3)
+        ]
+        yield Placed((bank, *bushes), s, side.verge + 1 + width / 2)
+
+
+def bin_or_bench(rng: np.random.Generator) -> Thing:
+    """What has no class of its own."""
+    length, width, height = rng.uniform((0.5, 0.5, 0.8), (1.8, 0.8, 1.3)).tolist()
+    return (Part("box", OTHER_OBJECT, (length, width, height)),)
+
+
+def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], Thing]]:
+    """Yield makers without end; every kind comes once in any ten."""
+    person, bicycle = vehicles.person, vehicles.bicycle
+    kinds = [person, person, person, bicycle, bicycle, bicycle]
+    kinds += [vehicles.bicyclist, vehicles.motorcycle, vehicles.motorcyclist, bin_or_bench]
+    while True:
+        for i in rng.permutation(len(kinds)).tolist():
+            yield kinds[i]

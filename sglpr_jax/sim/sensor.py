@@ -2,22 +2,27 @@
 
 import dataclasses
 import functools
+import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sglpr_jax.sim.shapes import AnyArray, Scene, Shapes, Vectors, nearest_hit
-from sglpr_jax.sim.world import CELL_M, GROUND, Ground, World
+from sglpr_jax.sim.ground_cast import GroundView, ground_view, meet_ground
+from sglpr_jax.sim.raycast import COLUMNS, Candidates, Chance, find_candidates, nearest_hit, sector_count
+from sglpr_jax.sim.returns import Surface, echo_returns, mix_edges, nearer, reflectivity, surface_of_shapes
+from sglpr_jax.sim.shapes import AnyArray, Vectors
+from sglpr_jax.sim.world import World
 
 HDL64E_DEG = (*np.linspace(2.0, -8.33, 32).tolist(), *np.linspace(-8.83, -24.8, 32).tolist())
 """The elevations of the HDL-64E: two blocks of 32 lasers, the upper one finer."""
-SHAPES_IN_VIEW = 256, 128, 160
-"""How many boxes, cylinders and ellipsoids a scan may meet: fixed, so that one compiled program does for every scan.
-
-Meeting all of them instead changes the label of 1 % of the points, most of them far away.
-"""
+HDL32E_DEG = tuple(np.linspace(10.67, -30.67, 32).tolist())
+VLP16_DEG = tuple(np.linspace(15.0, -15.0, 16).tolist())
+TURN_S = 0.1
+LASERS_AT_A_TIME = 16
+"""At most; must divide their number, else the largest common divisor is taken."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,11 +33,18 @@ class Sensor:
     azimuth_steps: int = 1800
     height_m: float = 1.73
     """Above the road."""
+    min_range_m: float = 2.5
     max_range_m: float = 80.0
     range_noise_m: float = 0.02
     """Standard deviation along the ray."""
-    dropout: float = 0.05
-    """Share of the returns that are lost."""
+    dropout: float = 0.02
+    """Share of the returns that are lost whatever they come from."""
+    faintest_echo: float = 6e-6
+    """Strength of an echo that is seen in 63 % of the cases; see `returns.echo_returns`."""
+    edge_share: float = 0.3
+    """Share of the returns at an edge that come from between its two sides."""
+    motion_distortion: bool = False
+    """Whether points are given relative to where the sensor was when it measured them, not to the scan's pose."""
 
     def __post_init__(self):
         if not self.elevations_deg or self.azimuth_steps < 1:
@@ -40,101 +52,139 @@ class Sensor:
                 "a sensor needs at least one elevation and one azimuth step, found "
                 f"{len(self.elevations_deg)} and {self.azimuth_steps}"
             )
+        if not 0 <= self.min_range_m < self.max_range_m:
+            raise ValueError(f"expected 0 <= min_range_m < max_range_m, found {self.min_range_m}, {self.max_range_m}")
 
 
 HDL64E = Sensor()
+SENSORS = {
+    "hdl64e": HDL64E,
+    # NCLT's, on a Segway.
+    "hdl32e": Sensor(HDL32E_DEG, azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
+    "vlp16": Sensor(VLP16_DEG, min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
+}
+"""Real sensors, by the names that the command line knows."""
+
+
+class View(NamedTuple):
+    """What a sensor may see from one pose: arrays of the same size for every pose, so that views can be stacked."""
+
+    candidates: tuple[Candidates, ...]
+    ground: GroundView
+    rotation: AnyArray  # (3, 3) world_from_lidar's
+    velocity: AnyArray  # (3,) of the sensor, in its own frame, m/s
+
+
+class Turn(NamedTuple):
+    """What came back of one turn; arrays begin (lasers, azimuths)."""
+
+    points: AnyArray  # (..., 4) x, y, z in metres in the LiDAR frame, intensity 0 to 1
+    labels: AnyArray  # int32 raw SemanticKITTI ids
+    returned: AnyArray  # bool; where false, point and label mean nothing
 
 
 def scan(
-    key: Array, world: World, world_from_lidar: Float[np.ndarray, "4 4"], *, sensor: Sensor = HDL64E
+    key: Array,
+    world: World,
+    world_from_lidar: Float[np.ndarray, "4 4"],
+    *,
+    sensor: Sensor = HDL64E,
+    time: float = 0.0,
+    velocity: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
-    """Return one scan of `world`: points (x, y, z in metres in the LiDAR frame, intensity 0 to 1) and raw labels.
+    """Return one scan of `world` at `time`: points (x, y, z in metres in the LiDAR frame, intensity) and raw labels.
 
-    Points come as in KITTI's files: laser by laser from the top, each laser counter-clockwise from straight ahead. The
-    pose must be level; rays start at its origin, and the road is the plane z = 0 of the world. Intensity depends on the
-    range alone.
+    Points come as in KITTI's files: laser by laser from the top, each laser counter-clockwise from straight ahead.
+    `velocity` (m/s, LiDAR frame) is used by sensors with `motion_distortion`.
 
-    Raises ValueError where the pose is tilted.
+    Raises ValueError where the pose is not rigid, or a velocity is needed and missing.
     """
-    if not np.allclose(world_from_lidar[2, :3], (0, 0, 1)) or not np.allclose(world_from_lidar[:3, 2], (0, 0, 1)):
-        raise ValueError(f"expected a level pose, found the rotation {world_from_lidar[:3, :3].tolist()}")
-    scene = _in_view(world.scene, world_from_lidar, max_range_m=sensor.max_range_m)
-    ground = world.ground.around(world_from_lidar[:2, 3], sensor.max_range_m)
-    points, labels, returned = _turn(key, scene, ground, world_from_lidar.astype(np.float32), sensor=sensor)
-    returned = np.asarray(returned)
-    return np.asarray(points)[returned], np.asarray(labels)[returned]
+    turn = cast_turn(key, view_of(world, world_from_lidar, sensor=sensor, time=time, velocity=velocity), sensor=sensor)
+    points, labels, returned = (np.asarray(part) for part in turn)
+    rows = np.flatnonzero(returned)
+    return points.reshape(-1, 4).take(rows, axis=0), labels.take(rows)
 
 
-def _in_view(scene: Scene, world_from_lidar: Float[np.ndarray, "4 4"], *, max_range_m: float) -> Scene:
-    """The shapes that look largest from the sensor, in the LiDAR frame, a fixed number of each kind."""
-    return Scene(
-        *(
-            _largest(shapes, world_from_lidar, count, max_range_m)
-            for shapes, count in zip(scene, SHAPES_IN_VIEW, strict=True)
-        )
+def view_of(
+    world: World,
+    world_from_lidar: Float[np.ndarray, "4 4"],
+    *,
+    sensor: Sensor = HDL64E,
+    time: float = 0.0,
+    velocity: Float[np.ndarray, "3"] | None = None,
+) -> View:
+    """Choose what the sensor may meet from a pose; raises as `scan` does."""
+    rotation = world_from_lidar[:3, :3]
+    if not (np.isfinite(world_from_lidar).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)):
+        raise ValueError(f"expected a pose of rotation and translation, found {world_from_lidar.tolist()}")
+    if sensor.motion_distortion and velocity is None:
+        raise ValueError("a sensor with motion_distortion needs the velocity of the sensor, found None")
+    candidates = find_candidates(
+        world.scene, world_from_lidar, time=time, azimuth_steps=sensor.azimuth_steps, reach_m=sensor.max_range_m
     )
-
-
-def _largest(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"], count: int, max_range_m: float) -> Shapes:
-    rotation, position = world_from_lidar[:3, :3], world_from_lidar[:3, 3]
-    centre = (shapes.centre - position) @ rotation
-    radius = np.linalg.norm(shapes.half, axis=1)
-    clearance = np.maximum(np.linalg.norm(centre, axis=1) - radius, 0.1)
-    by_size = np.argsort(-radius / clearance, kind="stable")
-    chosen = by_size[clearance[by_size] <= max_range_m][:count]
-
-    def pad(values: AnyArray, filler: float | int, dtype: type) -> np.ndarray:
-        width = [(0, count - len(chosen))] + [(0, 0)] * (values.ndim - 1)
-        return np.pad(values[chosen], width, constant_values=filler).astype(dtype)
-
-    yaw = shapes.yaw - np.arctan2(rotation[1, 0], rotation[0, 0])
-    return Shapes(
-        centre=pad(centre, 1e6, np.float32),  # a thousand kilometres away: never hit within the range limit
-        half=pad(shapes.half, 1, np.float32),
-        yaw=pad(yaw, 0, np.float32),
-        label=pad(shapes.label, 0, np.int32),
-        roughness=pad(shapes.roughness, 0, np.float32),
-    )
-
-
-def _rays(sensor: Sensor) -> Vectors:
-    """One ray per laser and azimuth, of horizontal length 1: x and y are (1, azimuths), z is (lasers, 1)."""
-    azimuth = np.arange(sensor.azimuth_steps) * (2 * np.pi / sensor.azimuth_steps)
-    slope = np.tan(np.radians(sensor.elevations_deg))
-    x, y, z = np.cos(azimuth)[None, :], np.sin(azimuth)[None, :], slope[:, None]
-    return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in (x, y, z)))
-
-
-def _ground_label(ground: Ground, x: Array, y: Array) -> Array:
-    rows, columns = ground.label.shape
-    row = jnp.clip(jnp.floor((y - ground.origin[1]) / CELL_M).astype(jnp.int32), 0, rows - 1)
-    column = jnp.clip(jnp.floor((x - ground.origin[0]) / CELL_M).astype(jnp.int32), 0, columns - 1)
-    return ground.label[row, column].astype(jnp.int32)
+    ground = ground_view(world.ground, world_from_lidar[:3, 3], reach_m=sensor.max_range_m)
+    velocity = np.zeros(3) if velocity is None else velocity
+    return View(candidates, ground, rotation.astype(np.float32), velocity.astype(np.float32))
 
 
 @functools.partial(jax.jit, static_argnames="sensor")
-def _turn(
-    key: Array, scene: Scene, ground: Ground, world_from_lidar: Float[Array, "4 4"], *, sensor: Sensor
-) -> tuple[Float[Array, "rays 4"], Int[Array, " rays"], Array]:
-    """Points, labels and whether anything came back, for every ray; `scene` is in the LiDAR frame."""
+def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
+    """Cast the rays of one turn. A pure function of arrays: `jax.vmap` over keys and views gives many turns."""
+    key_chance, key_returns = jax.random.split(key)
     rays = _rays(sensor)
-    distance, index = nearest_hit(rays, scene)
-    to_road = jnp.where(rays.z < 0, -world_from_lidar[2, 3] / rays.z, jnp.inf)
-    label = jnp.where(to_road < distance, GROUND, jnp.concatenate([shapes.label for shapes in scene])[index])
-    roughness = jnp.concatenate([shapes.roughness for shapes in scene])[index] * (to_road >= distance)
-    distance = jnp.minimum(distance, to_road)
+    surface = _meet(key_chance, rays, view, max_range_m=sensor.max_range_m)
+    steps = sensor.azimuth_steps
+    rays, surface = jax.tree.map(lambda values: values[:, :steps], (rays, surface))
+    reach, returned = _echoes(key_returns, surface, sensor)
+    points = [axis * reach for axis in rays]
+    if sensor.motion_distortion:
+        since_middle = TURN_S * (jnp.arange(steps, dtype=jnp.float32) / steps - 0.5)
+        points = [axis - view.velocity[i] * since_middle[None, :] for i, axis in enumerate(points)]
+    intensity = reflectivity(surface.label) * (0.5 + 0.5 * surface.facing)
+    return Turn(jnp.stack([*points, intensity], axis=-1), surface.label, returned)
 
-    key_noise, key_depth, key_dropout = jax.random.split(key, 3)
-    length = jnp.sqrt(1 + rays.z**2)  # of a ray whose horizontal length is 1
-    noise = sensor.range_noise_m * jax.random.normal(key_noise, distance.shape)
-    depth = roughness * jnp.abs(jax.random.normal(key_depth, distance.shape))
-    reach = distance * length + noise + depth
-    returned = (reach < sensor.max_range_m) & (jax.random.uniform(key_dropout, distance.shape) >= sensor.dropout)
-    reach = jnp.where(returned, reach, 0)
 
-    x, y, z = (axis * (reach / length) for axis in rays)
-    (cos, _, _, east), (sin, _, _, north) = world_from_lidar[0], world_from_lidar[1]
-    ground_label = _ground_label(ground, cos * x - sin * y + east, sin * x + cos * y + north)
-    label = jnp.where(label == GROUND, ground_label, label)
-    points = jnp.stack([x, y, z, 0.4 * jnp.exp(-reach / 40)], axis=-1)
-    return points.reshape(-1, 4), label.reshape(-1), returned.reshape(-1)
+def _rays(sensor: Sensor) -> Vectors:
+    """One ray of length 1 per laser and azimuth of whole sectors, in the LiDAR frame: arrays (lasers, azimuths)."""
+    columns = sector_count(sensor.azimuth_steps) * COLUMNS
+    azimuth = (np.arange(columns) * (2 * np.pi / sensor.azimuth_steps))[None, :]
+    elevation = np.radians(sensor.elevations_deg)[:, None]
+    level = np.cos(elevation)
+    axes = level * np.cos(azimuth), level * np.sin(azimuth), np.broadcast_to(np.sin(elevation), (len(elevation), columns))
+    return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in axes))
+
+
+def _meet(key: Array, rays: Vectors, view: View, *, max_range_m: float) -> Surface:
+    """The first surface on every ray, ground or shape.
+
+    A few lasers are cast at a time: low ones see the ground in front of most shapes, so that they are soon through.
+    """
+    lasers, azimuths = rays.x.shape
+    key_depth, key_pores = jax.random.split(key)
+    chance = Chance(jax.random.exponential(key_depth, rays.x.shape), jax.random.bits(key_pores, rays.x.shape))
+
+    def of_block(block: tuple[Vectors, Chance]) -> Surface:
+        rays, chance = block
+        upright = Vectors(*(row[0] * rays.x + row[1] * rays.y + row[2] * rays.z for row in view.rotation))
+        distance, label, facing = meet_ground(upright, view.ground)
+        distance = jnp.minimum(distance, max_range_m)
+        ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
+        hit, slot = nearest_hit(upright, view.candidates, distance, chance)
+        return nearer(ground, surface_of_shapes(upright, hit, slot, view.candidates))
+
+    in_blocks = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
+    surface = jax.lax.map(of_block, jax.tree.map(lambda values: values.reshape(in_blocks), (rays, chance)))
+    return jax.tree.map(lambda values: values.reshape(lasers, azimuths), surface)
+
+
+def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:
+    """The measured range of every ray, and whether there is one."""
+    key_noise, key_seen, key_edge = jax.random.split(key, 3)
+    shape = surface.distance.shape
+    returned = (surface.distance < sensor.max_range_m) & echo_returns(
+        jax.random.uniform(key_seen, shape), surface, faintest_echo=sensor.faintest_echo, dropout=sensor.dropout
+    )
+    reach = mix_edges(jax.random.uniform(key_edge, shape), surface.distance, returned, share=sensor.edge_share)
+    reach = reach + sensor.range_noise_m * jax.random.normal(key_noise, shape)
+    returned &= (reach >= sensor.min_range_m) & (reach < sensor.max_range_m)
+    return jnp.where(returned, reach, 0), returned

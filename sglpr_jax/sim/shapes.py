@@ -1,4 +1,4 @@
-"""What a ray meets: upright boxes, cylinders and ellipsoids, each turned about z only.
+"""What stands and moves in a world: upright boxes, cylinders and ellipsoids, each turned about z only.
 
 A shape is a unit solid (cube, cylinder, ball) that is scaled by its half sizes, turned by its yaw and moved to its
 centre. All three solids are convex, so a ray is inside one of them during one interval of its length, and the hit is
@@ -9,10 +9,9 @@ cylinder that of a disc and a slab.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 AnyArray = Array | np.ndarray
 Interval = tuple[AnyArray, AnyArray]
@@ -20,17 +19,22 @@ Interval = tuple[AnyArray, AnyArray]
 
 
 class Shapes(NamedTuple):
-    """Shapes of one kind; every array has the leading axis n."""
+    """Shapes of one kind in the world frame; every array has the leading axis n."""
 
-    centre: AnyArray  # (n, 3) metres
+    centre: AnyArray  # (n, 3) metres, at time 0: a mover's centre at time t is centre[:, :2] + velocity * t
     half: AnyArray  # (n, 3) half sizes along the shape's own axes, metres
     yaw: AnyArray  # (n,) rotation about z, radians
-    label: AnyArray  # (n,) raw SemanticKITTI ids
-    roughness: AnyArray  # (n,) how far returns scatter along the ray, metres: leaves are no wall
+    label: AnyArray  # (n,) int32 raw SemanticKITTI ids
+    roughness: AnyArray  # (n,) metres: mean depth that a ray goes into it before it returns; leaves are no wall
+    porosity: AnyArray  # (n,) share 0..1 of the rays that pass as if it were not there: crowns, fences of mesh
+    glass: AnyArray  # (n,) share 0..1 of a facade that is window; a window returns nothing most of the time
+    velocity: AnyArray  # (n, 2) m/s, zero for all that stands
+    since: AnyArray  # (n,) seconds: the shape is there for since <= time < until; -inf and inf: always
+    until: AnyArray  # (n,)
 
 
 class Scene(NamedTuple):
-    """Everything that stands on the ground."""
+    """Everything on the ground. The ground itself is no shape."""
 
     boxes: Shapes
     cylinders: Shapes
@@ -40,13 +44,26 @@ class Scene(NamedTuple):
 class Vectors(NamedTuple):
     """Vectors as three arrays, one per axis, that broadcast against each other.
 
-    This is several times faster than one (n, 3) array. A spinning sensor gives x and y by azimuth and z by elevation,
-    so that most of the work is done once per azimuth or once per elevation instead of once per ray.
+    This is several times faster than one (n, 3) array: no axis of length 3 takes part in the arithmetic.
     """
 
     x: AnyArray
     y: AnyArray
     z: AnyArray
+
+
+Solid = Callable[[Vectors, Vectors], Interval]
+"""Of origins and directions in a solid's unit frame: the interval of every ray inside the solid."""
+
+
+def at_time(shapes: Shapes, time: float, near: Float[np.ndarray, "3"], *, reach_m: float) -> Shapes:
+    """Return the shapes that are there at `time` and less than `reach_m` from `near`, where they are then."""
+    velocity = np.asarray(shapes.velocity)
+    centre = np.concatenate([shapes.centre[:, :2] + velocity * time, shapes.centre[:, 2:]], axis=1)
+    present = (shapes.since <= time) & (time < shapes.until)
+    close = np.linalg.norm(centre - near, axis=1) < reach_m + np.linalg.norm(shapes.half, axis=1)
+    chosen = np.flatnonzero(present & close)
+    return Shapes(*(np.asarray(values)[chosen] for values in shapes._replace(centre=centre)))
 
 
 def _slab(origin: AnyArray, direction: AnyArray) -> Interval:
@@ -67,60 +84,24 @@ def _both(a: Interval, b: Interval) -> Interval:
     return jnp.maximum(a[0], b[0]), jnp.minimum(a[1], b[1])
 
 
-def _cube(o: Vectors, d: Vectors) -> Interval:
+def cube(o: Vectors, d: Vectors) -> Interval:
+    """Where rays are in |x|, |y|, |z| <= 1."""
     return _both(_both(_slab(o.x, d.x), _slab(o.y, d.y)), _slab(o.z, d.z))
 
 
-def _cylinder(o: Vectors, d: Vectors) -> Interval:
-    square = d.x**2 + d.y**2
+def cylinder(o: Vectors, d: Vectors) -> Interval:
+    """Where rays are in x^2 + y^2 <= 1, |z| <= 1."""
+    square = jnp.maximum(d.x**2 + d.y**2, 1e-12)
     # The same discriminant, but float32 keeps this form for a thin pole far away too.
     discriminant = square - (o.x * d.y - o.y * d.x) ** 2
     return _both(_round(square, o.x * d.x + o.y * d.y, discriminant), _slab(o.z, d.z))
 
 
-def _ball(o: Vectors, d: Vectors) -> Interval:
+def ball(o: Vectors, d: Vectors) -> Interval:
+    """Where rays are in x^2 + y^2 + z^2 <= 1."""
     square, towards = d.x**2 + d.y**2 + d.z**2, o.x * d.x + o.y * d.y + o.z * d.z
     return _round(square, towards, towards**2 - square * (o.x**2 + o.y**2 + o.z**2 - 1))
 
 
-def _in_unit_frame(vectors: Vectors, shape: Shapes) -> Vectors:
-    """The same vectors along the axes and in the half sizes of `shape`, a single one."""
-    cos, sin = jnp.cos(shape.yaw), jnp.sin(shape.yaw)
-    along, across = cos * vectors.x + sin * vectors.y, cos * vectors.y - sin * vectors.x
-    return Vectors(along / shape.half[0], across / shape.half[1], vectors.z / shape.half[2])
-
-
-Nearest = tuple[Array, Array]
-"""Of every ray: the distance to the nearest hit so far, and the index of the shape that was hit."""
-
-
-def _nearest_of_kind(
-    rays: Vectors, shapes: Shapes, first: int, solid: Callable[[Vectors, Vectors], Interval], best: Nearest
-) -> Nearest:
-    """`best` after every ray has been tried against `shapes`, whose indices begin at `first`."""
-
-    def try_shape(best: Nearest, indexed: tuple[Shapes, Array]) -> tuple[Nearest, None]:
-        shape, index = indexed
-        origin = _in_unit_frame(Vectors(*-shape.centre), shape)
-        enter, leave = solid(origin, _in_unit_frame(rays, shape))
-        distance, nearest = best
-        closer = (enter <= leave) & (enter > 0) & (enter < distance)
-        return (jnp.where(closer, enter, distance), jnp.where(closer, index, nearest)), None
-
-    indices = first + jnp.arange(len(shapes.label), dtype=jnp.int32)
-    return jax.lax.scan(try_shape, best, (shapes, indices), unroll=4)[0]
-
-
-def nearest_hit(rays: Vectors, scene: Scene) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"]]:
-    """Distance to the first shape that each ray from the origin meets, and which one it is.
-
-    Distances count in lengths of the ray's direction, which need not be 1. The index counts boxes, then cylinders, then
-    ellipsoids; a ray that meets nothing has distance inf and index -1. A shape around the rays' origin is not seen.
-    """
-    shape = jnp.broadcast_shapes(*(axis.shape for axis in rays))
-    best = jnp.full(shape, jnp.inf, jnp.float32), jnp.full(shape, -1, jnp.int32)
-    first = 0
-    for shapes, solid in zip(scene, (_cube, _cylinder, _ball), strict=True):
-        best = _nearest_of_kind(rays, shapes, first, solid, best)
-        first += len(shapes.label)
-    return best
+SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)
+"""The solids of boxes, cylinders and ellipsoids, in this order."""

@@ -1,12 +1,16 @@
+import numpy as np
+
 from sglpr_jax.data import open_sequence
+from sglpr_jax.sim import SENSORS
 
 from .conftest import assert_one_line_error
+
+THIN = ("--scans", 3, "--azimuth-steps", 40, "--seed", 5)
 
 
 def test_drives_are_written_completed_and_kept(command, tmp_path):
     out = tmp_path / "town"
-    options = ("--out", out, "--scans", 3, "--azimuth-steps", 40, "--seed", 5)
-    first = command("simulate", *options, "--seq", "08")
+    first = command("simulate", "--out", out, *THIN, "--seq", "08")
     assert first.status == 0 and "08" in first.out
     assert "simulating 1 drives of 3 scans, about 0 MB" in first.error
     drive = open_sequence(out, "08")
@@ -15,18 +19,44 @@ def test_drives_are_written_completed_and_kept(command, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.bin")}
     (out / "sequences" / "08" / "poses.txt").unlink()
     (out / "sequences" / "08" / "velodyne" / "000001.bin").unlink()
-    again = command("simulate", *options, "--seq", "08")
+    again = command("simulate", "--out", out, *THIN, "--seq", "08")
     assert again.status == 0 and "simulating" in again.error
     after = {path: path.stat().st_mtime_ns for path in out.rglob("*.bin")}
     assert after.keys() == before.keys()
     assert [path.stem for path in after if after[path] != before[path]] == ["000001"]
-    assert "simulating" not in command("simulate", *options, "--seq", "08").error
+    assert "simulating" not in command("simulate", "--out", out, *THIN, "--seq", "08").error
 
     other = command("simulate", "--out", out, "--scans", 4, "--azimuth-steps", 40, "--seed", 5, "--seq", "08")
     assert_one_line_error(other, "simulation.json", "scans 4", "found 3")
 
 
-def test_a_drive_that_does_not_exist_is_refused(command, tmp_path):
-    ended = command("simulate", "--out", tmp_path / "town", "--seq", "03", "--scans", 3)
-    assert_one_line_error(ended, "00, 05, 08", "03")
+def test_a_pose_file_and_another_sensor(command, tmp_path):
+    rows = np.tile(np.eye(3, 4), (40, 1, 1))
+    rows[:, 2, 3] = 0.5 * np.arange(40)
+    np.savetxt(tmp_path / "campus.txt", rows.reshape(40, 12))
+    options = ("--along", tmp_path / "campus.txt", *THIN, "--sensor", "vlp16")
+    ended = command("simulate", "--out", tmp_path / "town", *options)
+    assert ended.status == 0 and ended.out == f"{tmp_path / 'town'}: drives campus\n"
+    drive = open_sequence(tmp_path / "town", "campus")
+    np.testing.assert_allclose(drive.positions[:, 0], [0, 7, 14], atol=1e-6)  # every 14th of 40 lines
+    assert len(drive.points(0)) <= len(SENSORS["vlp16"].elevations_deg) * 40
+
+    images = command("simulate", "--out", tmp_path / "images", *options, "--images")
+    assert images.status == 0 and "3 images, about 0 MB" in images.error
+    assert open_sequence(tmp_path / "images", "campus").image(0).shape == (151, 151)
+
+
+def test_wrong_input_is_refused_before_anything_is_written(command, tmp_path):
+    out = ("--out", tmp_path / "town")
+    assert_one_line_error(command("simulate", *out, "--seq", "11"), "00, 01,", "'11'")
+    assert_one_line_error(command("simulate", *out, "--sensor", "hdl16"), "hdl64e, hdl32e, vlp16", "'hdl16'")
+    (tmp_path / "bad.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4 + "1 0 0 nan 0 1 0 0 0 0 1 0\n")
+    ended = command("simulate", *out, "--along", tmp_path / "bad.txt")
+    assert_one_line_error(ended, "bad.txt, line 5", "expected finite numbers", "nan")
     assert not (tmp_path / "town").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(command, tmp_path):
+    (tmp_path / "file").write_text("")
+    ended = command("simulate", "--out", tmp_path / "file" / "town", *THIN, "--seq", "08")
+    assert_one_line_error(ended, "simulation.json", "could not write")

@@ -1,14 +1,19 @@
-"""The KITTI layout on disk: readable with plain numpy, the same bytes for the same seed, resumable."""
+"""Simulated drives on disk and on the fly: layouts, the same bytes for the same seed, resumable, whole or not there."""
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sglpr_jax.data import ImageSequence, ScanSequence, open_sequence
+from sglpr_jax.data.batch import read_batch
+from sglpr_jax.data.density_image import density_image
+from sglpr_jax.data.tuples import TupleConfig, TuplePool
+from sglpr_jax.labels import to_classes
 from sglpr_jax.poses import positions_from_camera
-from sglpr_jax.sim import Sensor, build_world, plan_drive, write_dataset
-from sglpr_jax.sim.drive import streets_needed
+from sglpr_jax.sim import SENSORS, Sensor, scan, sequence, simulate_sequence, write_dataset
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 SCANS = 4
@@ -27,6 +32,20 @@ def dataset(tmp_path_factory) -> Path:
     return write(tmp_path_factory.mktemp("town") / "data")
 
 
+@pytest.fixture(scope="module")
+def drive():
+    return simulate_sequence("08", scans=SCANS, sensor=TINY, seed=1)
+
+
+@pytest.fixture
+def pose_file(tmp_path) -> Path:
+    """A camera that goes 12 m straight on, along its z axis, in 30 steps."""
+    rows = np.tile(np.eye(3, 4), (30, 1, 1))
+    rows[:, 2, 3] = 0.4 * np.arange(30)
+    np.savetxt(tmp_path / "campus.txt", rows.reshape(30, 12))
+    return tmp_path / "campus.txt"
+
+
 def test_layout(dataset):
     for name in ("00", "08"):
         folder = dataset / "sequences" / name
@@ -35,41 +54,61 @@ def test_layout(dataset):
         for stem in stems:
             points = np.fromfile(folder / "velodyne" / f"{stem}.bin", "<f4").reshape(-1, 4)
             labels = np.fromfile(folder / "labels" / f"{stem}.label", "<u4")
-            assert 300 < len(points) == len(labels) <= 480
+            assert 200 < len(points) == len(labels) <= 480
             assert np.all(np.isfinite(points)) and labels.max() <= 259 and (labels > 0).all()
     assert json.loads((dataset / "simulation.json").read_text())["seed"] == 1
 
 
-def test_poses_times_and_calibration_are_kittis(dataset):
+def test_poses_times_and_calibration_are_kittis(dataset, drive):
     folder = dataset / "sequences" / "08"
     poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
-    world = build_world((1, 8), streets=streets_needed("08", SCANS))
-    drive = plan_drive(np.random.default_rng((1, 8, 1)), "08", world, scans=SCANS, height_m=TINY.height_m)
-    np.testing.assert_allclose(positions_from_camera(poses), drive.world_from_lidar[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(positions_from_camera(poses), drive.positions, atol=1e-5)
     np.testing.assert_allclose(np.loadtxt(folder / "times.txt"), drive.times, rtol=1e-5)
     rows = dict(line.split(":") for line in (folder / "calib.txt").read_text().splitlines())
     camera_from_lidar = np.array(rows["Tr"].split(), float).reshape(3, 4)
     np.testing.assert_array_equal(camera_from_lidar, [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
     # KITTI's camera looks along z: where x of the LiDAR points.
-    rotation = camera_from_lidar[:, :3]
-    expected = rotation @ drive.world_from_lidar[:, :3, 0, None]
+    expected = camera_from_lidar[:, :3] @ drive.drive.world_from_lidar[:, :3, 0, None]
     np.testing.assert_allclose(poses[:, :, 2:3], expected, atol=1e-6)
+
+
+def test_a_drive_on_the_fly_is_the_one_on_disk(dataset, drive):
+    on_disk = open_sequence(dataset, "08")
+    assert isinstance(drive, ScanSequence) and drive.has_labels
+    assert drive.ids == on_disk.ids and len(drive) == SCANS and drive.name == "08"
+    for i in range(SCANS):
+        np.testing.assert_array_equal(drive.points(i), on_disk.points(i))
+        np.testing.assert_array_equal(drive.labels(i), on_disk.labels(i))
+
+
+def test_points_and_labels_of_a_scan_cost_one_rendering(monkeypatch):
+    rendered = []
+    monkeypatch.setattr(sequence, "scan", lambda *a, **k: rendered.append(k["time"]) or scan(*a, **k))
+    fresh = simulate_sequence("08", scans=SCANS, sensor=TINY, seed=2)
+    assert len(fresh.points(1)) == len(fresh.labels(1)) and len(fresh.points(2)) == len(fresh.labels(2))
+    assert rendered == [fresh.times[1], fresh.times[2]]
+
+
+def test_training_batches_are_read_from_a_drive_on_the_fly(drive):
+    pool = TuplePool([drive.positions], TupleConfig(positives=1, negatives=1, positive_m=1e6, negative_m=1.0))
+    batch = read_batch([drive], pool, np.array([[0, 1, 2]]), max_points=480, share_negatives=False)
+    assert batch.labelled.all() and batch.points.shape == (3, 480, 3)
+    np.testing.assert_array_equal(batch.classes[1, : batch.count[1]], to_classes(drive.labels(1)))
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(dataset, tmp_path):
     again = content(write(tmp_path / "again"))
     assert again == content(dataset)
     other = content(write(tmp_path / "other", seed=2))
-    assert (
-        other.keys() == again.keys()
-        and other["sequences/00/velodyne/000000.bin"] != again["sequences/00/velodyne/000000.bin"]
-    )
+    first = "sequences/00/velodyne/000000.bin"
+    assert other.keys() == again.keys() and other[first] != again[first]
 
 
-def test_drives_do_not_depend_on_each_other(dataset, tmp_path):
-    alone = content(write(tmp_path / "alone", names=("08",)))
-    everything = content(dataset)
-    assert {name: data for name, data in everything.items() if "/00/" not in name} == alone
+def test_drives_can_be_added_and_do_not_depend_on_each_other(dataset, tmp_path):
+    root = write(tmp_path / "grown", names=("08",))
+    kept = (root / "sequences" / "08" / "velodyne" / "000000.bin").stat().st_mtime_ns
+    assert content(write(root, names=("00",))) == content(dataset)
+    assert (root / "sequences" / "08" / "velodyne" / "000000.bin").stat().st_mtime_ns == kept
 
 
 def test_an_interrupted_run_is_recognised_and_resumed(dataset, tmp_path):
@@ -82,7 +121,7 @@ def test_an_interrupted_run_is_recognised_and_resumed(dataset, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "cut", progress=interrupt)
-    assert calls == [("00", 1, SCANS), ("00", 2, SCANS)]
+    assert calls == [("00", 0, SCANS), ("00", 1, SCANS), ("00", 2, SCANS)]
     assert not (tmp_path / "cut" / "sequences" / "00" / "poses.txt").exists()
     assert content(write(tmp_path / "cut")) == content(dataset)
 
@@ -97,9 +136,59 @@ def test_deleted_scans_come_back_and_finished_ones_are_left_alone(dataset, tmp_p
     assert (scans / "000000.bin").stat().st_mtime_ns == kept
 
 
+def test_a_finished_dataset_builds_no_town(dataset, monkeypatch):
+    monkeypatch.setattr(sequence, "build_world", None)
+    before = content(dataset)
+    assert content(write(dataset)) == before
+
+
+def test_along_a_pose_file_distances_are_the_files(tmp_path, pose_file):
+    root = write(tmp_path / "along", names=(), along=(pose_file,), scans=8)
+    drive = open_sequence(root, "campus")
+    assert len(drive) == 8  # every fourth of 30
+    np.testing.assert_allclose(drive.positions[:, 0], 1.6 * np.arange(8), atol=1e-6)
+    np.testing.assert_allclose(drive.positions[:, 1], 0, atol=1e-6)
+    np.testing.assert_allclose(drive.times, 0.4 * np.arange(8), atol=1e-6)
+    on_the_fly = simulate_sequence(along=pose_file, scans=8, sensor=TINY, seed=1)
+    np.testing.assert_array_equal(on_the_fly.points(3), drive.points(3))
+
+
+def test_another_pose_file_of_that_name_is_refused(tmp_path, pose_file):
+    root = write(tmp_path / "along", names=(), along=(pose_file,), scans=8)
+    before = content(root)
+    np.savetxt(pose_file, np.loadtxt(pose_file) * 1.1)
+    with pytest.raises(ValueError, match=r"simulation.json belongs to another.*drive campus"):
+        write(root, names=(), along=(pose_file,), scans=8)
+    assert content(root) == before
+
+
+def test_a_malformed_pose_file_leaves_nothing_behind(tmp_path, pose_file):
+    pose_file.write_text(pose_file.read_text().replace("4.000000000000000222e-01", "nan"))
+    with pytest.raises(ValueError, match=r"campus.txt, line 2: expected finite numbers, found .*nan"):
+        write(tmp_path / "along", names=(), along=(pose_file,))
+    assert not (tmp_path / "along").exists()
+
+
+def test_images_are_those_of_the_scans(tmp_path, drive):
+    root = write(tmp_path / "images", names=("08",), layout="images")
+    assert sorted(content(root)) == [f"08/imgs/{i:06d}.png" for i in range(SCANS)] + ["08/pose.txt", "simulation.json"]
+    images = open_sequence(root, "08")
+    assert isinstance(images, ImageSequence)
+    np.testing.assert_allclose(images.positions, drive.positions, atol=1e-5)
+    expected = np.rot90(density_image(drive.points(2)), -1) * np.float32(10 / 255)
+    np.testing.assert_array_equal(images.image(2), expected)
+    assert expected.max() > 0
+
+
 @pytest.mark.parametrize(
     ("changes", "found"),
-    [({"seed": 2}, r"seed 2 \(found 1\)"), ({"scans": 5}, "scans 5"), ({"sensor": Sensor()}, "sensor")],
+    [
+        ({"seed": 2}, r"seed 2 \(found 1\)"),
+        ({"scans": 5}, "scans 5"),
+        ({"sensor": SENSORS["vlp16"]}, "sensor"),
+        ({"layout": "images"}, r"layout images \(found scans\)"),
+        ({"rate_hz": 10.0}, "rate_hz 10"),
+    ],
 )
 def test_other_settings_are_refused(dataset, changes, found):
     before = content(dataset)
@@ -108,15 +197,48 @@ def test_other_settings_are_refused(dataset, changes, found):
     assert content(dataset) == before
 
 
-def test_real_sequences_are_never_written_into(tmp_path):
+def test_files_that_were_not_simulated_are_never_written_among(tmp_path):
     (tmp_path / "sequences" / "00").mkdir(parents=True)
     with pytest.raises(ValueError, match="not simulated"):
         write(tmp_path)
     assert content(tmp_path) == {}
 
 
-@pytest.mark.parametrize("changes", [{"names": ("00", "03")}, {"scans": 1}])
+def test_damaged_settings_are_named(tmp_path):
+    (tmp_path / "simulation.json").write_text('{"seed": 1')
+    with pytest.raises(ValueError, match=r"simulation.json: expected the settings of a simulated dataset"):
+        write(tmp_path)
+
+
+@pytest.mark.parametrize("changes", [{"names": ("00", "11")}, {"scans": 1}])
 def test_unknown_drives_and_too_few_scans_are_refused(tmp_path, changes):
-    with pytest.raises(ValueError, match="expected drives among 00, 05, 08"):
+    with pytest.raises(ValueError, match=r"expected drives among 00, 01, .* 10 with 2 scans"):
         write(tmp_path / "none", **changes)
     assert not (tmp_path / "none").exists()
+
+
+def test_two_drives_of_one_name_are_refused(tmp_path, pose_file):
+    with pytest.raises(ValueError, match="expected different names"):
+        write(tmp_path / "none", names=(), along=(pose_file, pose_file))
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp_path):
+    """The limit on the size of a file stands in for the disk: writing fails half-way."""
+    root = tmp_path / "full"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
+    try:
+        with pytest.raises(OSError, match=r"velodyne/00000\d.bin: could not write this file of the simulated dataset"):
+            write(root)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    whole = content(dataset)
+    assert all(whole[name] == data for name, data in content(root).items())
+    assert content(write(root)) == whole
+
+
+def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"simulation.json: could not write this file"):
+        write(tmp_path / "file" / "town")
