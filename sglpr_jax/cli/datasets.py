@@ -16,9 +16,9 @@ from sglpr_jax.sim.layouts import LAYOUTS
 SIMULATED = ("00", "05", "08")
 SIMULATED_SCANS = 300
 SIMULATED_AZIMUTH_STEPS = 900
-BYTES_PER_RAY = 15
-"""Of a scan and its labels: 20 for every return."""
-BYTES_PER_IMAGE = 2500
+BYTES_PER_RAY = 16
+"""Of a scan and its labels: 20 for every return, and most rays return."""
+BYTES_PER_IMAGE = 2000
 
 
 def dataset_root(data: Path | None) -> Path:

@@ -3,6 +3,7 @@
 Everything is placed in the side's own frame: s runs along the street, d leads outwards from the kerb.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -34,7 +35,7 @@ def frontage(
     for s in _poisson(rng, side.style.bystanders, start, stop):
         d = side.verge - rng.uniform(0.3, max(side.strips[-1].width, 0.6) if side.strips else 0.6)
         make = next(bystanders)
-        yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.5)
+        yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.65)
     if side.wood:
         yield from _wood(rng, side, start, stop)
     elif side.bank:
@@ -126,7 +127,7 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
 
 _BORDERS: dict[str, tuple[float, Range, float]] = {
     # thickness, range of heights, share of the line that is closed
-    "hedge": (0.8, (0.9, 2.2), 0.85),
+    "hedge": (1.0, (0.9, 2.6), 0.9),
     "fence": (0.06, (0.9, 1.8), 0.85),
     "wall": (0.25, (0.7, 2.2), 0.9),
     "rail": (0.15, (0.75, 0.8), 1.0),
@@ -153,7 +154,7 @@ def _in_pieces(
     height = rng.uniform(*heights)
     count = int((stop - start) / 5) + 1
     edges = np.linspace(start, stop, count + 1).tolist()
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         yield Placed(_piece(border, high - low + 0.1, thickness, height), (low + high) / 2, d, zone=zone)
 
 
@@ -189,9 +190,7 @@ def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, cloc
         s += width + gap
 
 
-def _between_houses(
-    rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock
-) -> Iterator[Placed]:
+def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock) -> Iterator[Placed]:
     what = rng.choice(["cars", "garage", "hedge", "wall", "nothing"], p=[0.4, 0.2, 0.15, 0.1, 0.15])
     middle, d = s + gap / 2, side.verge
     if what == "cars":
@@ -208,10 +207,10 @@ def _between_houses(
 def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
     """Trees and bushes on the plots, more of them near the street."""
     for s in _poisson(rng, side.style.trees, start, stop):
-        d, kind = side.verge + 1.5 + 14 * rng.random() ** 2, rng.random()
-        if kind < 0.35:
+        d, kind = side.verge + 1.0 + 14 * rng.random() ** 2, rng.random()
+        if kind < 0.28:
             yield Placed(plants.tree(rng, (3.0, 7.0)), s, d)
-        elif kind < 0.43:
+        elif kind < 0.35:
             yield Placed(plants.conifer(rng), s, d)
         elif rng.random() < CHANGING_BUSHES:
             yield from _changing(rng, plants.bush, s, d, 0.0, "plot", clock, 0.5)

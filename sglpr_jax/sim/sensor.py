@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.sim.ground_cast import GroundView, ground_view, meet_ground
 from sglpr_jax.sim.raycast import COLUMNS, Candidates, Chance, find_candidates, nearest_hit, sector_count
@@ -27,7 +27,7 @@ LASERS_AT_A_TIME = 16
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR; the default is KITTI's Velodyne HDL-64E."""
+    """A spinning LiDAR; the default is KITTI's Velodyne HDL-64E, less the vehicle below it."""
 
     elevations_deg: tuple[float, ...] = HDL64E_DEG
     azimuth_steps: int = 1800
@@ -35,7 +35,7 @@ class Sensor:
     """Above the road."""
     min_range_m: float = 2.5
     max_range_m: float = 80.0
-    range_noise_m: float = 0.02
+    range_noise_m: float = 0.015
     """Standard deviation along the ray."""
     dropout: float = 0.02
     """Share of the returns that are lost whatever they come from."""
@@ -43,6 +43,8 @@ class Sensor:
     """Strength of an echo that is seen in 63 % of the cases; see `returns.echo_returns`."""
     edge_share: float = 0.3
     """Share of the returns at an edge that come from between its two sides."""
+    shadows_deg: tuple[tuple[float, float, float], ...] = ()
+    """What the vehicle hides: between two azimuths, counter-clockwise, nothing returns from below an elevation."""
     motion_distortion: bool = False
     """Whether points are given relative to where the sensor was when it measured them, not to the scan's pose."""
 
@@ -56,7 +58,15 @@ class Sensor:
             raise ValueError(f"expected 0 <= min_range_m < max_range_m, found {self.min_range_m}, {self.max_range_m}")
 
 
-HDL64E = Sensor()
+KITTI_SHADOWS_DEG = (
+    (-12.0, 18.0, -21.3),
+    (128.0, 139.0, -20.5),
+    (158.0, 208.0, -17.5),
+    (231.0, 239.0, -20.5),
+    (284.0, 302.0, -15.8),
+)
+"""As measured in KITTI's scans: bonnet, roof and what else is on it."""
+HDL64E = Sensor(shadows_deg=KITTI_SHADOWS_DEG)
 SENSORS = {
     "hdl64e": HDL64E,
     # NCLT's, on a Segway.
@@ -166,7 +176,7 @@ def _meet(key: Array, rays: Vectors, view: View, *, max_range_m: float) -> Surfa
     def of_block(block: tuple[Vectors, Chance]) -> Surface:
         rays, chance = block
         upright = Vectors(*(row[0] * rays.x + row[1] * rays.y + row[2] * rays.z for row in view.rotation))
-        distance, label, facing = meet_ground(upright, view.ground)
+        distance, label, facing = meet_ground(upright, view.ground, reach_m=max_range_m)
         distance = jnp.minimum(distance, max_range_m)
         ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
         hit, slot = nearest_hit(upright, view.candidates, distance, chance)
@@ -186,5 +196,15 @@ def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]
     )
     reach = mix_edges(jax.random.uniform(key_edge, shape), surface.distance, returned, share=sensor.edge_share)
     reach = reach + sensor.range_noise_m * jax.random.normal(key_noise, shape)
-    returned &= (reach >= sensor.min_range_m) & (reach < sensor.max_range_m)
+    returned &= (reach >= sensor.min_range_m) & (reach < sensor.max_range_m) & ~_shadowed(sensor)
     return jnp.where(returned, reach, 0), returned
+
+
+def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
+    """Which rays the vehicle hides."""
+    azimuth = np.arange(sensor.azimuth_steps) * (360 / sensor.azimuth_steps)
+    elevation = np.array(sensor.elevations_deg)[:, None]
+    hidden = np.zeros((len(elevation), len(azimuth)), bool)
+    for first, last, below in sensor.shadows_deg:
+        hidden |= ((azimuth - first) % 360 <= last - first) & (elevation < below)
+    return hidden

@@ -31,14 +31,14 @@ def test_drives_are_written_completed_and_kept(command, tmp_path):
 
 
 def test_a_pose_file_and_another_sensor(command, tmp_path):
-    rows = np.tile(np.eye(3, 4), (40, 1, 1))
-    rows[:, 2, 3] = 0.5 * np.arange(40)
-    np.savetxt(tmp_path / "campus.txt", rows.reshape(40, 12))
+    rows = np.tile(np.eye(3, 4), (150, 1, 1))
+    rows[:, 2, 3] = 0.5 * np.arange(150)
+    np.savetxt(tmp_path / "campus.txt", rows.reshape(150, 12))
     options = ("--along", tmp_path / "campus.txt", *THIN, "--sensor", "vlp16")
     ended = command("simulate", "--out", tmp_path / "town", *options)
     assert ended.status == 0 and ended.out == f"{tmp_path / 'town'}: drives campus\n"
     drive = open_sequence(tmp_path / "town", "campus")
-    np.testing.assert_allclose(drive.positions[:, 0], [0, 7, 14], atol=1e-6)  # every 14th of 40 lines
+    np.testing.assert_allclose(drive.positions[:, 0], [0, 25, 50], atol=1e-6)  # every 50th of 150 lines
     assert len(drive.points(0)) <= len(SENSORS["vlp16"].elevations_deg) * 40
 
     images = command("simulate", "--out", tmp_path / "images", *options, "--images")

@@ -39,10 +39,10 @@ def drive():
 
 @pytest.fixture
 def pose_file(tmp_path) -> Path:
-    """A camera that goes 12 m straight on, along its z axis, in 30 steps."""
-    rows = np.tile(np.eye(3, 4), (30, 1, 1))
-    rows[:, 2, 3] = 0.4 * np.arange(30)
-    np.savetxt(tmp_path / "campus.txt", rows.reshape(30, 12))
+    """A camera that goes straight on, along its z axis, 0.5 m a line."""
+    rows = np.tile(np.eye(3, 4), (150, 1, 1))
+    rows[:, 2, 3] = 0.5 * np.arange(150)
+    np.savetxt(tmp_path / "campus.txt", rows.reshape(150, 12))
     return tmp_path / "campus.txt"
 
 
@@ -145,10 +145,10 @@ def test_a_finished_dataset_builds_no_town(dataset, monkeypatch):
 def test_along_a_pose_file_distances_are_the_files(tmp_path, pose_file):
     root = write(tmp_path / "along", names=(), along=(pose_file,), scans=8)
     drive = open_sequence(root, "campus")
-    assert len(drive) == 8  # every fourth of 30
-    np.testing.assert_allclose(drive.positions[:, 0], 1.6 * np.arange(8), atol=1e-6)
+    assert len(drive) == 8  # every 19th of 150
+    np.testing.assert_allclose(drive.positions[:, 0], 9.5 * np.arange(8), atol=1e-6)
     np.testing.assert_allclose(drive.positions[:, 1], 0, atol=1e-6)
-    np.testing.assert_allclose(drive.times, 0.4 * np.arange(8), atol=1e-6)
+    np.testing.assert_allclose(drive.times, 1.9 * np.arange(8), atol=1e-6)
     on_the_fly = simulate_sequence(along=pose_file, scans=8, sensor=TINY, seed=1)
     np.testing.assert_array_equal(on_the_fly.points(3), drive.points(3))
 
@@ -163,7 +163,7 @@ def test_another_pose_file_of_that_name_is_refused(tmp_path, pose_file):
 
 
 def test_a_malformed_pose_file_leaves_nothing_behind(tmp_path, pose_file):
-    pose_file.write_text(pose_file.read_text().replace("4.000000000000000222e-01", "nan"))
+    pose_file.write_text(pose_file.read_text().replace("5.000000000000000000e-01", "nan"))
     with pytest.raises(ValueError, match=r"campus.txt, line 2: expected finite numbers, found .*nan"):
         write(tmp_path / "along", names=(), along=(pose_file,))
     assert not (tmp_path / "along").exists()

@@ -1,57 +1,66 @@
 """A turn of the sensor over small worlds in which every return is known."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import FLAT, HILLS, NOTHING, in_world, pose, shapes, striped_ground
 
-from sglpr_jax.sim import Sensor, World, build_world, scan
-from sglpr_jax.sim.frontage import BUILDING, POLE, ROAD, TERRAIN
-from sglpr_jax.sim.shapes import Scene, Shapes
-from sglpr_jax.sim.world import Ground
+from sglpr_jax.sim.ground import Relief, relief_height
+from sglpr_jax.sim.raw_ids import BUILDING, POLE, ROAD, TERRAIN, VEGETATION
+from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor, cast_turn, scan, view_of
+from sglpr_jax.sim.shapes import Scene
+from sglpr_jax.sim.world import World
 
 ELEVATIONS = (2.0, -1.0, -4.0, -8.0, -12.0, -16.0, -20.0, -24.0)
-EXACT = Sensor(elevations_deg=ELEVATIONS, azimuth_steps=60, range_noise_m=0.0, dropout=0.0)
+EXACT = Sensor(
+    elevations_deg=ELEVATIONS,
+    azimuth_steps=60,
+    min_range_m=0.0,
+    range_noise_m=0.0,
+    dropout=0.0,
+    edge_share=0.0,
+    faintest_echo=1e-9,
+)
 KEY = jax.random.key(0)
+POLE_AHEAD = (5, 0, 1, 0.5, 0.5, 3, 0, POLE)
+TILTED = [pose(-6, 3, 1.8, yaw=1.0, pitch=0.06, roll=-0.08), pose(2, -5, 2.2, yaw=-2.5, pitch=-0.1, roll=0.05)]
 
 
-def shapes(*rows: tuple[float, ...]) -> Shapes:
-    """Rows of x, y, z, three half sizes, yaw, label."""
-    table = np.array(rows, dtype=float).reshape(-1, 8)
-    return Shapes(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7].astype(int), np.zeros(len(table)))
+def walled_world(*poles: tuple[float, ...], relief: Relief = FLAT, glass: float = 0.0) -> World:
+    """A wall whose face is the plane x = 10, on ground that is road for y > 0 and, KERB_M higher, terrain elsewhere."""
+    wall = shapes((11, 0, 3, 1, 40, 6, 0, BUILDING), glass=glass)
+    return World(Scene(wall, shapes(*poles), NOTHING), striped_ground(relief, ROAD, TERRAIN))
 
 
-def walled_world(*poles: tuple[float, ...]) -> World:
-    """A wall whose face is the plane x = 10, on a ground that is road for y > 0 and terrain elsewhere."""
-    label = np.full((400, 400), TERRAIN, np.uint8)
-    label[200:] = ROAD
-    wall = shapes((11, 0, 3, 1, 40, 3, 0, BUILDING))
-    return World(Scene(wall, shapes(*poles), shapes()), Ground(label, np.array([-50.0, -50])), np.zeros(2), np.zeros(2))
-
-
-def pose(x: float = 0, y: float = 0, yaw: float = 0, z: float = 1.73) -> np.ndarray:
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1]])
-
-
-def in_world(points: np.ndarray, world_from_lidar: np.ndarray) -> np.ndarray:
-    return points[:, :3] @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3]
-
-
-@pytest.mark.parametrize("where", [pose(), pose(-6, 3, 1.0), pose(2, -5, -2.5)])
+@pytest.mark.parametrize("where", [pose(z=1.73), *TILTED])
 def test_wall_and_ground_coincide_in_the_world_from_every_pose(where):
     points, labels = scan(KEY, walled_world(), where, sensor=EXACT)
     world = in_world(points, where)
     wall, ground = labels == BUILDING, labels != BUILDING
     assert wall.sum() > 30 and ground.sum() > 100
     np.testing.assert_allclose(world[wall, 0], 10, atol=1e-3)
-    np.testing.assert_allclose(world[ground, 2], 0, atol=1e-3)
-    inland = np.abs(world[:, 1]) < 45
-    clear_of_edge = ground & inland & (np.abs(world[:, 1]) > 1e-3)
-    np.testing.assert_array_equal(labels[clear_of_edge], np.where(world[clear_of_edge, 1] > 0, ROAD, TERRAIN))
+    clear_of_kerb = ground & (np.abs(world[:, 1]) > 0.5) & (np.linalg.norm(points[:, :3], axis=1) < 20)
+    on_road = world[clear_of_kerb, 1] > 0
+    np.testing.assert_allclose(world[clear_of_kerb, 2], np.where(on_road, 0, 0.12), atol=2e-3)
+    np.testing.assert_array_equal(labels[clear_of_kerb], np.where(on_road, ROAD, TERRAIN))
+
+
+def test_hills_coincide_in_the_world_from_two_poses():
+    for where in TILTED:
+        where = where.copy()
+        where[2, 3] += relief_height(HILLS, where[:2, 3])
+        points, labels = scan(KEY, walled_world(relief=HILLS), where, sensor=EXACT)
+        world = in_world(points, where)
+        road = (labels == ROAD) & (world[:, 1] > 0.5)
+        assert road.sum() > 100
+        np.testing.assert_allclose(world[road, 2], relief_height(HILLS, world[road, :2].astype(float)), atol=0.05)
 
 
 def test_points_come_laser_by_laser_counter_clockwise():
-    points, labels = scan(KEY, walled_world(), pose(), sensor=EXACT)
+    points, labels = scan(KEY, walled_world(), pose(z=1.73), sensor=EXACT)
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
     laser = np.abs(elevation[:, None] - np.array(ELEVATIONS)[None, :]).argmin(1)
@@ -63,7 +72,7 @@ def test_points_come_laser_by_laser_counter_clockwise():
 
 
 def test_a_nearer_shape_hides_the_wall():
-    points, labels = scan(KEY, walled_world((5, 0, 1, 0.5, 0.5, 3, 0, POLE)), pose(), sensor=EXACT)
+    points, labels = scan(KEY, walled_world(POLE_AHEAD), pose(z=1.73), sensor=EXACT)
     ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.05
     high = points[:, 2] > -1.5
     assert np.all(labels[ahead & high] == POLE)
@@ -72,62 +81,124 @@ def test_a_nearer_shape_hides_the_wall():
 
 def test_turning_world_and_sensor_together_changes_nothing():
     world = walled_world((5, 2, 1, 0.5, 0.5, 3, 0, POLE))
-    turn = pose(30, -12, 0.7, z=0)
-    turned_shapes = (part._replace(centre=in_world(part.centre, turn), yaw=part.yaw + 0.7) for part in world.scene)
-    turned = world._replace(scene=Scene(*turned_shapes))
-    points, labels = scan(KEY, world, pose(-3, 1, 0.3), sensor=EXACT)
-    turned_points, turned_labels = scan(KEY, turned, turn @ pose(-3, 1, 0.3), sensor=EXACT)
-    np.testing.assert_allclose(points, turned_points, atol=2e-3)
-    standing = np.isin(labels, (BUILDING, POLE))  # the ground's raster cannot be turned
-    np.testing.assert_array_equal(labels[standing], turned_labels[standing])
+    turn, where = pose(30, -12, yaw=0.7), pose(-3, 1, 1.73, yaw=0.3, pitch=0.05, roll=0.1)
+    turned = Scene(*(kind._replace(centre=in_world(kind.centre, turn), yaw=kind.yaw + 0.7) for kind in world.scene))
+    ground = world.ground._replace(label=np.full_like(world.ground.label, ROAD))  # the raster cannot be turned
+    points, labels = scan(KEY, world._replace(ground=ground), where, sensor=EXACT)
+    turned_points, turned_labels = scan(KEY, World(turned, ground), turn @ where, sensor=EXACT)
+    np.testing.assert_allclose(points, turned_points, atol=4e-3)
+    np.testing.assert_array_equal(labels, turned_labels)
 
 
-def test_noise_dropout_and_range_limit():
-    real = Sensor(elevations_deg=ELEVATIONS, azimuth_steps=1000, max_range_m=30.0, range_noise_m=0.05, dropout=0.2)
-    points, labels = scan(KEY, walled_world(), pose(), sensor=real)
+def test_noise_dropout_and_range_limits():
+    real = dataclasses.replace(EXACT, azimuth_steps=1000, max_range_m=30.0, range_noise_m=0.05, dropout=0.2)
+    points, labels = scan(KEY, walled_world(), pose(z=1.73), sensor=real)
     assert np.linalg.norm(points[:, :3], axis=1).max() < 30
     # Along the ray, so a wall point's x is off by the noise times the cosine of the angle between them.
     wall = points[labels == BUILDING]
     error = (wall[:, 0] - 10) * np.linalg.norm(wall[:, :3], axis=1) / wall[:, 0]
     assert abs(error.std() - 0.05) < 0.01 and abs(error.mean()) < 0.01
-    everything = Sensor(elevations_deg=ELEVATIONS, azimuth_steps=1000, max_range_m=30.0, dropout=0.0)
-    share = len(points) / len(scan(KEY, walled_world(), pose(), sensor=everything)[0])
-    assert abs(share - 0.8) < 0.02
+    everything = scan(KEY, walled_world(), pose(z=1.73), sensor=dataclasses.replace(real, dropout=0.0))[0]
+    assert abs(len(points) / len(everything) - 0.8) < 0.02
+    blind, _ = scan(KEY, walled_world(), pose(z=1.73), sensor=dataclasses.replace(real, min_range_m=6.0))
+    assert 5.9 < np.linalg.norm(blind[:, :3], axis=1).min() < 6.2
+
+
+def test_windows_return_little():
+    low = dataclasses.replace(EXACT, azimuth_steps=600)
+    solid, glazed = (
+        np.sum(scan(KEY, walled_world(glass=glass), pose(z=1.73), sensor=low)[1] == BUILDING) for glass in (0.0, 0.5)
+    )
+    assert abs(glazed / solid - 0.55) < 0.1
+
+
+def test_a_mover_is_seen_where_it_is_at_the_time():
+    car = shapes((5, -8, 1, 1, 1, 1, 0, 252), velocity=(0.0, 4.0), since=0.0, until=3.0)
+    world = World(Scene(car, NOTHING, NOTHING), striped_ground(FLAT, ROAD, TERRAIN))
+    points, labels = scan(KEY, world, pose(z=1.73), sensor=EXACT, time=2.0)
+    assert np.abs(points[labels == 252, 1]).max() <= 1.001
+    assert not np.any(scan(KEY, world, pose(z=1.73), sensor=EXACT, time=3.0)[1] == 252)
+
+
+def test_the_vehicle_hides_what_is_below_it():
+    sensor = dataclasses.replace(EXACT, azimuth_steps=360, shadows_deg=((-20.0, 30.0, -10.0),))
+    points, labels = scan(KEY, walled_world(), pose(z=1.73), sensor=sensor)
+    plain, _ = scan(KEY, walled_world(), pose(z=1.73), sensor=dataclasses.replace(sensor, shadows_deg=()))
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    low = points[:, 2] / np.linalg.norm(points[:, :3], axis=1) < -0.18
+    assert len(points) == len(labels) and not np.any(low & (azimuth > -20) & (azimuth < 30))
+    assert len(plain) - len(points) == 4 * 51
+
+
+def test_motion_distortion_moves_points_by_when_they_were_measured():
+    moving = dataclasses.replace(EXACT, motion_distortion=True)
+    plain, _ = scan(KEY, walled_world(), pose(z=1.73), sensor=EXACT)
+    shifted, _ = scan(KEY, walled_world(), pose(z=1.73), sensor=moving, velocity=np.array([10.0, 0, 0]))
+    azimuth = np.round(np.arctan2(plain[:, 1], plain[:, 0]) / (2 * np.pi) * 60) % 60
+    expected = plain[:, :3] - np.array([10.0, 0, 0]) * (0.1 * (azimuth / 60 - 0.5))[:, None]
+    np.testing.assert_allclose(shifted[:, :3], expected, atol=1e-4)
+    with pytest.raises(ValueError, match="velocity"):
+        scan(KEY, walled_world(), pose(z=1.73), sensor=moving)
 
 
 def test_the_key_alone_decides_the_noise():
     noisy = Sensor(elevations_deg=ELEVATIONS, azimuth_steps=60)
+    leafy = walled_world()
+    crown = shapes((6, 0, 2, 1, 4, 3, 0, VEGETATION), roughness=0.3, porosity=0.4)
+    leafy = leafy._replace(scene=leafy.scene._replace(ellipsoids=crown))
     first, again, other = (
-        scan(jax.random.key(seed), walled_world(), pose(), sensor=noisy)[0].tobytes() for seed in (1, 1, 2)
+        scan(jax.random.key(seed), leafy, pose(z=1.73), sensor=noisy)[0].tobytes() for seed in (1, 1, 2)
     )
     assert first == again != other
 
 
-def test_of_too_many_shapes_those_that_look_largest_are_kept():
-    far = [(x, y, 1, 0.2, 0.2, 1, 0, POLE) for x in range(-60, -20, 2) for y in range(-40, 40, 2)]
-    near = (5, 0, 1, 0.5, 0.5, 3, 0, POLE)
-    _, labels = scan(KEY, walled_world(*far), pose(), sensor=EXACT)
-    _, with_near = scan(KEY, walled_world(*far, near), pose(), sensor=EXACT)
-    assert (with_near == POLE).sum() > (labels == POLE).sum()
+def test_many_turns_at_once_are_the_same_turns():
+    keys = jax.random.split(KEY, 2)
+    world = walled_world(POLE_AHEAD, relief=HILLS)
+    views = [view_of(world, where, sensor=EXACT) for where in TILTED]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+    together = jax.vmap(lambda key, view: cast_turn(key, view, sensor=EXACT))(keys, stacked)
+    for i in range(2):
+        alone = cast_turn(keys[i], views[i], sensor=EXACT)
+        np.testing.assert_array_equal(together.returned[i], alone.returned)
+        np.testing.assert_array_equal(together.labels[i], alone.labels)
+        np.testing.assert_allclose(together.points[i], alone.points, atol=1e-3)
 
 
-def test_a_town_gives_a_scan_of_many_classes():
-    world = build_world(0, streets=(3, 3))
-    where = pose(world.streets_x[1] + 0.9, world.streets_y[1] + 15, np.pi / 2)
-    points, labels = scan(KEY, world, where, sensor=Sensor(azimuth_steps=200))
-    assert len(points) == len(labels) and np.all(np.isfinite(points))
-    assert len(points) > 0.8 * 64 * 200 and len(set(labels.tolist())) >= 5
+@pytest.mark.parametrize("name", list(SENSORS))
+def test_presets_scan_a_whole_turn(name):
+    sensor = dataclasses.replace(SENSORS[name], azimuth_steps=200)
+    points, labels = scan(KEY, walled_world(POLE_AHEAD), pose(z=sensor.height_m), sensor=sensor)
+    assert len(points) == len(labels) > 0.3 * len(sensor.elevations_deg) * 200
+    assert np.all(np.isfinite(points)) and {BUILDING, POLE, ROAD, TERRAIN} == set(labels.tolist())
     assert points[:, 3].min() >= 0 and points[:, 3].max() <= 1
 
 
-def test_a_tilted_pose_is_refused():
-    tilted = pose()
-    tilted[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]
-    with pytest.raises(ValueError, match="level pose"):
-        scan(KEY, walled_world(), tilted, sensor=EXACT)
+def test_the_tables_of_elevations():
+    assert {name: len(sensor.elevations_deg) for name, sensor in SENSORS.items()} == {
+        "hdl64e": 64,
+        "hdl32e": 32,
+        "vlp16": 16,
+    }
+    np.testing.assert_allclose(np.diff(SENSORS["vlp16"].elevations_deg), -2)
+    np.testing.assert_allclose(np.diff(SENSORS["hdl32e"].elevations_deg), -1.3335, atol=1e-3)
+    assert HDL64E.elevations_deg[0] == 2.0 and HDL64E.elevations_deg[-1] == -24.8
+
+
+@pytest.mark.parametrize("entry", [np.nan, 2.0])
+def test_a_pose_that_is_not_rigid_is_refused(entry):
+    bent = pose(z=1.73)
+    bent[0, 1] = entry
+    with pytest.raises(ValueError, match="rotation and translation"):
+        scan(KEY, walled_world(), bent, sensor=EXACT)
 
 
 @pytest.mark.parametrize("bad", [{"elevations_deg": ()}, {"azimuth_steps": 0}])
 def test_a_sensor_without_rays_is_refused(bad):
     with pytest.raises(ValueError, match="at least one"):
         Sensor(**bad)
+
+
+def test_a_sensor_whose_ranges_leave_nothing_is_refused():
+    with pytest.raises(ValueError, match="min_range_m < max_range_m"):
+        Sensor(min_range_m=80.0, max_range_m=80.0)

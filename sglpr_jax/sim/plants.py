@@ -1,0 +1,66 @@
+"""Trees, bushes, hedges and the edge of a wood: porous, rough ellipsoids and boxes."""
+
+import numpy as np
+
+from sglpr_jax.sim.raw_ids import TRUNK, VEGETATION
+from sglpr_jax.sim.things import Part, Range, Thing
+
+
+def _leaves(
+    size: tuple[float, float, float], x: float, y: float, bottom: float, *, roughness: float, porosity: float
+) -> Part:
+    return Part("ellipsoid", VEGETATION, size, x, y, bottom, roughness=roughness, porosity=porosity)
+
+
+def tree(rng: np.random.Generator, spread: Range) -> Thing:
+    """A trunk under a crown whose diameter is in the range `spread`; a large crown is several ellipsoids."""
+    crown, below = rng.uniform(*spread), rng.uniform(0.9, 2.6)
+    thick = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
+    parts = [Part("cylinder", TRUNK, (thick, thick, below + 0.35 * crown))]
+    lobes = 1 if crown < 3.5 else int(rng.integers(2, 5))
+    for _ in range(lobes):
+        size = crown * (1.0 if lobes == 1 else rng.uniform(0.6, 0.85))
+        x, y = (rng.uniform(-0.5, 0.5, 2) * (crown - size)).tolist()
+        low = below + rng.uniform(0, 0.25) * crown * (lobes > 1)
+        high = size * rng.uniform(0.8, 1.3)
+        parts.append(_leaves((size, size, high), x, y, low, roughness=0.7, porosity=rng.uniform(0.45, 0.75)))
+    return tuple(parts)
+
+
+def conifer(rng: np.random.Generator) -> Thing:
+    """A crown that reaches down to the ground."""
+    spread = rng.uniform(1.5, 4)
+    leaves = _leaves((spread, spread, 3 * spread), 0.0, 0.0, -0.8 * spread, roughness=0.5, porosity=0.45)
+    return Part("cylinder", TRUNK, (0.3, 0.3, 1.5)), leaves
+
+
+def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
+    """One or two lumps of leaves; `large` scales them."""
+    parts = []
+    large *= rng.uniform(0.6, 1.7)
+    for i in range(int(rng.integers(1, 3))):
+        length, width, height = large * rng.uniform((0.8, 0.8, 0.7), (3.0, 2.0, 2.4))
+        x, y = i * rng.uniform(-0.5, 0.5, 2) * (length, width)
+        leaves = _leaves(
+            (length, width, 1.4 * height), float(x), float(y), -0.4 * height, roughness=0.45, porosity=0.45
+        )
+        parts.append(leaves._replace(yaw=rng.uniform(0, np.pi)))
+    return tuple(parts)
+
+
+def hedge(length: float, thickness: float, height: float) -> Thing:
+    """A trimmed hedge along x."""
+    return (Part("box", VEGETATION, (length, thickness, height + 0.3), bottom=-0.3, roughness=0.3, porosity=0.25),)
+
+
+def thicket(rng: np.random.Generator) -> Thing:
+    """A piece of a wood's edge: undergrowth, and trunks that show through it."""
+    parts = [*bush(rng, rng.uniform(1.2, 2.4))]
+    for _ in range(int(rng.integers(1, 4))):
+        x, y = rng.uniform(-2.5, 2.5, 2).tolist()
+        thick = rng.uniform(0.15, 0.45)
+        parts.append(Part("cylinder", TRUNK, (thick, thick, rng.uniform(4, 8)), x, y))
+        size = rng.uniform(2.5, 5)
+        low = rng.uniform(1.0, 3.5)
+        parts.append(_leaves((size, size, 1.5 * size), x, y, low, roughness=0.9, porosity=rng.uniform(0.5, 0.75)))
+    return tuple(parts)

@@ -1,0 +1,196 @@
+"""Which shape every ray meets first.
+
+The columns of a turn are split into sectors. On the host, every sector gets a list of the shapes that reach into it,
+nearest first. On the device, all sectors go through their lists at once, one shape of each at a time, until what is
+left is farther than everything that was hit.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
+
+COLUMNS = 32
+"""Azimuth steps in a sector."""
+SLOTS = 64, 48, 128
+"""The most boxes, cylinders and ellipsoids that a sector may meet; of more, the nearest are kept."""
+UNROLL = 4
+"""Shapes tried between two looks at what is left; divides every number of slots."""
+_MARGIN = 1e-3
+_PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)
+
+
+class Candidates(NamedTuple):
+    """The shapes of one kind that each sector may meet, nearest first; every array is (slots, sectors).
+
+    Shapes are given by the way into their unit frame, from the frame at the sensor along the world's axes.
+    """
+
+    xx: AnyArray  # unit x = xx x + xy y + origin x, and so on, 1 / metres
+    xy: AnyArray
+    yx: AnyArray
+    yy: AnyArray
+    zz: AnyArray
+    origin: Vectors  # the sensor in the unit frame
+    nearest: AnyArray  # metres: no part of the shape is nearer to the sensor; inf marks an empty slot
+    roughness: AnyArray
+    porosity: AnyArray  # uint32: as a share of 2^32
+    glass: AnyArray
+    label: AnyArray  # int32
+
+
+class Chance(NamedTuple):
+    """One random number of each sort for every ray."""
+
+    depth: AnyArray  # exponentially distributed, mean 1: how far the ray goes into what is rough
+    pores: AnyArray  # uint32, uniform: which of the porous shapes let it through
+
+
+def sector_count(azimuth_steps: int) -> int:
+    """How many sectors make a turn; the last one may reach into the first."""
+    return -(-azimuth_steps // COLUMNS)
+
+
+def find_candidates(
+    scene: Scene,
+    world_from_lidar: Float[np.ndarray, "4 4"],
+    *,
+    time: float,
+    azimuth_steps: int,
+    reach_m: float,
+    slots: tuple[int, ...] = SLOTS,
+) -> tuple[Candidates, ...]:
+    """The boxes, cylinders and ellipsoids that each sector of a turn may meet at `time` within `reach_m`."""
+    step = 2 * np.pi / azimuth_steps
+    middle = (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
+    half_width = (COLUMNS - 1) / 2 * step + _MARGIN
+    found = []
+    for shapes, count in zip(scene, slots, strict=True):
+        near = at_time(shapes, time, world_from_lidar[:3, 3], reach_m=reach_m)
+        bearing, half_extent = _bearings(near, world_from_lidar)
+        apart = np.abs(_wrapped(bearing[:, None] - middle))
+        found.append(_listed(near, world_from_lidar[:3, 3], apart <= half_extent[:, None] + half_width, count))
+    return tuple(found)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """The same angles in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _bearings(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and half width of the azimuths, in the LiDAR frame, between which each shape lies."""
+    signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+    corners = signs * shapes.half[:, None]
+    cos, sin = np.cos(shapes.yaw)[:, None], np.sin(shapes.yaw)[:, None]
+    offset = shapes.centre - world_from_lidar[:3, 3]
+    turned = np.stack([cos * corners[..., 0] - sin * corners[..., 1], sin * corners[..., 0] + cos * corners[..., 1]])
+    corners = np.concatenate([np.moveaxis(turned, 0, -1), corners[..., 2:]], axis=-1) + offset[:, None]
+
+    azimuth = np.arctan2(*np.moveaxis(corners @ world_from_lidar[:3, 1::-1], -1, 0))
+    centre = np.arctan2(*(offset @ world_from_lidar[:3, 1::-1]).T)
+    side = _wrapped(azimuth - centre[:, None])
+    low, high = side.min(axis=1), side.max(axis=1)
+    # A shape that spans half a turn or more is around, above or below the sensor: any ray may meet it.
+    return centre + (low + high) / 2, np.where(high - low < np.pi, (high - low) / 2, np.pi)
+
+
+def _listed(shapes: Shapes, sensor: Float[np.ndarray, "3"], overlap: np.ndarray, slots: int) -> Candidates:
+    """Per sector the nearest `slots` shapes of those whose `overlap` (n, sectors) is true."""
+    cos, sin, offset = np.cos(shapes.yaw), np.sin(shapes.yaw), shapes.centre - sensor
+    along, across = cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]
+    inside = np.stack([along, across, offset[:, 2]], axis=1)
+    nearest = np.linalg.norm(np.maximum(np.abs(inside) - shapes.half, 0), axis=1)
+
+    order = np.argsort(nearest, kind="stable")
+    slot = np.cumsum(overlap[order], axis=0) - 1
+    which, sector = np.nonzero(overlap[order] & (slot < slots))
+    table = np.full((slots, overlap.shape[1]), -1)
+    table[slot[which, sector], sector] = order[which]
+
+    def fill(values: np.ndarray, empty: float, dtype: type = np.float32) -> np.ndarray:
+        return np.append(values, empty)[table].astype(dtype)
+
+    (hx, hy, hz), origin = shapes.half.T, -inside / shapes.half
+    return Candidates(
+        xx=fill(cos / hx, 1.0),
+        xy=fill(sin / hx, 0.0),
+        yx=fill(-sin / hy, 0.0),
+        yy=fill(cos / hy, 1.0),
+        zz=fill(1 / hz, 1.0),
+        origin=Vectors(*(fill(axis, 1e6) for axis in origin.T)),  # a thousand kilometres off: never hit
+        nearest=fill(nearest, np.inf),
+        roughness=fill(shapes.roughness, 0.0),
+        porosity=fill(np.minimum(shapes.porosity * 2.0**32, 2.0**32 - 1), 0.0, np.uint32),
+        glass=fill(shapes.glass, 0.0),
+        label=fill(shapes.label, 0.0, np.int32),
+    )
+
+
+def into_unit_frame(vectors: Vectors, shape: Candidates) -> Vectors:
+    """The same directions in the shape's unit frame."""
+    return Vectors(
+        shape.xx * vectors.x + shape.xy * vectors.y,
+        shape.yx * vectors.x + shape.yy * vectors.y,
+        shape.zz * vectors.z,
+    )
+
+
+Nearest = tuple[Array, Array]
+"""Of every ray: the distance to the nearest hit so far, and the slot of what was hit, -1 for nothing."""
+
+
+def nearest_hit(
+    rays: Vectors, candidates: Sequence[Candidates], limit: Float[Array, "lasers azimuths"], chance: Chance
+) -> tuple[Float[Array, "lasers azimuths"], Int[Array, "lasers azimuths"]]:
+    """Distance to the first shape that each ray from the sensor meets, and its slot.
+
+    `rays` have length 1 and as many azimuths as all sectors together. A ray that meets nothing nearer than `limit` has
+    that distance and slot -1. Slots count boxes, then cylinders, then ellipsoids. A shape around the sensor is not
+    seen. A rough shape returns a ray from some depth; one that is thinner there lets it through.
+    """
+    sectors = (limit.shape[0], -1, COLUMNS)
+    rays, limit, chance = jax.tree.map(
+        lambda values: jnp.broadcast_to(values, limit.shape).reshape(sectors), (rays, limit, chance)
+    )
+    best, first = (limit, jnp.full(limit.shape, -1, jnp.int32)), 0
+    for kind, solid in zip(jax.tree.map(jnp.asarray, candidates), SOLIDS, strict=True):
+        best = _nearest_of_kind(rays, kind, first, solid, best, chance)
+        first += len(kind.nearest)
+    distance, slot = best
+    return distance.reshape(limit.shape[0], -1), slot.reshape(limit.shape[0], -1)
+
+
+def _nearest_of_kind(
+    rays: Vectors, candidates: Candidates, first: int, solid: Solid, best: Nearest, chance: Chance
+) -> Nearest:
+    """`best` after the rays (lasers, sectors, columns) have been tried against one kind, whose slots begin at `first`."""
+    slots = len(candidates.nearest)
+    pore_factors = jnp.asarray(_PORE_FACTORS[first : first + slots])
+
+    def unfinished(state: tuple[Array, Nearest]) -> Array:
+        slot, (distance, _) = state
+        nearest = candidates.nearest[jnp.minimum(slot, slots - 1)]
+        return (slot < slots) & jnp.any(nearest < distance.max(axis=(0, 2)))
+
+    def try_slot(slot: Array, best: Nearest) -> Nearest:
+        shape = jax.tree.map(lambda values: values[slot][None, :, None], candidates)
+        distance, hit = best
+        enter, leave = solid(shape.origin, into_unit_frame(rays, shape))
+        through = chance.pores * pore_factors[slot] < shape.porosity
+        met = enter + shape.roughness * chance.depth
+        closer = (enter > 0) & (met <= leave) & (met < distance) & ~through
+        return jnp.where(closer, met, distance), jnp.where(closer, first + slot, hit)
+
+    def try_some(state: tuple[Array, Nearest]) -> tuple[Array, Nearest]:
+        slot, best = state
+        for i in range(UNROLL):
+            best = try_slot(slot + i, best)
+        return slot + UNROLL, best
+
+    return jax.lax.while_loop(unfinished, try_some, (jnp.int32(0), best))[1]

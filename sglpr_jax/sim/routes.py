@@ -1,0 +1,228 @@
+"""Which streets are driven: eleven routes through a lattice of streets, with the revisits of their namesakes in KITTI.
+
+A route is first a walk over the crossings of the lattice, then a line: crossings are moved at random, streets are bent,
+some crossings are roundabouts, and corners are rounded. A street that is driven twice is the same line both times.
+"""
+
+import dataclasses
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+STEP_M = 0.5
+"""Distance between two points of a route's line."""
+BLOCKS_PER_LOOP = 12
+ROUNDABOUT_RADIUS_M = 10.0
+SHORTEST_LOOP = {False: 6, True: 4}
+"""Streets between two visits in the same (False) or the opposite direction: they take 30 s or more."""
+TRIES, TRIES_PER_LOOP = 100, 30
+
+Node = tuple[int, int]
+"""A crossing of the lattice: the number of its column and of its row."""
+STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Role:
+    """What kind of drive a route is."""
+
+    speed_mps: float
+    """On the way as a whole, roughly; faster on a free street, slower in corners."""
+    again: float = 0.0
+    """Share of the streets that are driven a second time."""
+    opposite: bool = False
+    """Whether the second time goes in the opposite direction."""
+    loops: int = 1
+    """At most so many; a route with one ends with its second visit."""
+    straight: float = 0.5
+    """Probability of going straight on at a crossing."""
+    block_m: float = 60.0
+    winding: float = 0.2
+    """How far crossings are moved, and twice how far streets are bent, as a share of `block_m`."""
+    corner_m: float = 9.0
+    """Corners are rounded by a Gaussian of this width, and have about this radius."""
+    roundabouts: float = 0.08
+    """Share of the crossings."""
+
+
+ROLES = {
+    "00": Role(8.2, again=0.25, loops=20),
+    "01": Role(19.0, straight=1.0, winding=0.3, block_m=150.0, corner_m=40.0, roundabouts=0.0),
+    "02": Role(9.5, again=0.15, loops=4, straight=0.6),
+    "03": Role(7.5, straight=0.7),
+    "04": Role(12.0, straight=1.0, winding=0.04, corner_m=20.0, roundabouts=0.0),
+    "05": Role(8.0, again=0.25, loops=20),
+    "06": Role(9.5, again=0.25, straight=0.85, winding=0.1, roundabouts=0.0),
+    "07": Role(7.0, again=0.12),
+    "08": Role(8.0, again=0.25, opposite=True, loops=20, roundabouts=0.04),
+    "09": Role(9.5, again=0.07, straight=0.6),
+    "10": Role(8.0, straight=0.6),
+}
+"""As in KITTI, 00, 02, 05, 06 and 07 come back to places in the same direction, 08 in the opposite one, 09 at its very
+end, and 01 (a highway), 03, 04 (a straight road) and 10 never. Shares are larger than KITTI's where those are small."""
+
+
+def plan_route(rng: np.random.Generator, role: Role, *, blocks: int) -> Float[np.ndarray, "n 2"]:
+    """Return the middle of the streets that a drive of about `blocks` blocks takes, a point every STEP_M metres."""
+    walk = np.array(plan_walk(rng, role, blocks=blocks))
+    corners = resampled(_Streets(rng, role, walk).line(), STEP_M)
+    return resampled(gaussian_filter1d(corners, role.corner_m / STEP_M, axis=0, mode="nearest"), STEP_M)
+
+
+def travelled(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """The length of a line up to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def resampled(line: Float[np.ndarray, "n 2"], step_m: float) -> Float[np.ndarray, "m 2"]:
+    """The same line with points every `step_m` metres."""
+    length = travelled(line)
+    at = np.linspace(0, length[-1], max(2, round(length[-1] / step_m) + 1))
+    return np.stack([np.interp(at, length, axis) for axis in line.T], axis=1)
+
+
+def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node]:
+    """Return the crossings that a route passes: `blocks` streets, give or take one for every loop.
+
+    Raises ValueError where `blocks` is too few for a loop.
+    """
+    if role.again == 0:
+        return _walk_onward(rng, role, blocks)
+    loops = min(role.loops, max(1, blocks // BLOCKS_PER_LOOP))
+    shares = np.diff(np.linspace(0, blocks, loops + 1).round().astype(int)).tolist()
+    for _ in range(TRIES):
+        if walk := _walk_in_loops(rng, role, shares):
+            return walk
+    raise ValueError(f"no walk of {blocks} blocks with {loops} loops was found; a loop needs 8 blocks or more")
+
+
+def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> list[Node]:
+    """A walk with one loop of about `share` streets after the other, or an empty list where it came to a dead end."""
+    walk = [(0, 0)]
+    for share in shares:
+        again = max(1, round(role.again * share))
+        attempts = (_with_loop(rng, role, walk, new=share - again, again=again) for _ in range(TRIES_PER_LOOP))
+        walk = next(filter(None, attempts), [])
+        if not walk:
+            break
+    return walk
+
+
+def _walk_onward(rng: np.random.Generator, role: Role, blocks: int) -> list[Node]:
+    """A walk that never goes west, and so never meets itself."""
+    nodes, heading = [(0, 0)], (1, 0)
+    for _ in range(blocks):
+        if rng.random() >= role.straight:
+            heading = (1, 0) if heading[0] == 0 else (0, int(rng.choice([-1, 1])))
+        nodes.append(_moved(nodes[-1], heading))
+    return nodes
+
+
+def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: int, again: int) -> list[Node]:
+    """`nodes`, then `new` streets that lead back to an earlier one, then `again` streets for the second time.
+
+    Returns an empty list where the walk ran into a dead end.
+    """
+    wandering = int(rng.integers(new // 2, max(new - 1, 1) + 1))
+    walk = _wandered(rng, role, nodes, wandering)
+    left = new - wandering
+    ways = _ways_back(walk, left + 1) if walk else {}
+    shortest = max(SHORTEST_LOOP[role.opposite], new // 2)
+    driven = Counter(_streets(walk))
+    closings = []
+    for k, node in enumerate(walk):
+        way = ways.get(node, [])
+        if len(way) < max(left - 1, 1) or len(walk) - 1 + len(way) - k < shortest:
+            continue
+        second = walk[max(k - again, 0) : k + 1][::-1] if role.opposite else walk[k : k + again + 1]
+        if len(second) == again + 1 and all(driven[street] == 1 for street in _streets(second)):
+            closings.append(walk + way + second[1:])
+    return closings[rng.integers(len(closings))] if closings else []
+
+
+def _wandered(rng: np.random.Generator, role: Role, nodes: list[Node], steps: int) -> list[Node]:
+    """`nodes` and `steps` more that were never visited, or an empty list in a dead end."""
+    walk, visited = list(nodes), set(nodes)
+    for _ in range(steps):
+        ahead = _moved(walk[-1], walk[-1], walk[-2]) if len(walk) > 1 else (1, 0)
+        free = [node for step in STEPS if (node := _moved(walk[-1], step)) not in visited]
+        if not free:
+            return []
+        weights = np.array([role.straight if node == ahead else (1.01 - role.straight) / 2 for node in free])
+        walk.append(free[rng.choice(len(free), p=weights / weights.sum())])
+        visited.add(walk[-1])
+    return walk
+
+
+def _ways_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
+    """The shortest ways of up to `longest` streets from the end of `walk`, over unvisited crossings to visited ones."""
+    visited, reached = set(walk), set(walk)
+    frontier: dict[Node, list[Node]] = {walk[-1]: []}
+    found: dict[Node, list[Node]] = {}
+    for _ in range(longest):
+        further = {}
+        for end, way in frontier.items():
+            for node in (_moved(end, step) for step in STEPS):
+                if node in visited:
+                    found.setdefault(node, [*way, node])
+                elif node not in reached:
+                    further[node] = [*way, node]
+                    reached.add(node)
+        frontier = further
+    return found
+
+
+def _streets(walk: list[Node]) -> list[tuple[Node, Node]]:
+    """The streets of a walk, the same for both directions."""
+    return [(min(a, b), max(a, b)) for a, b in pairwise(walk)]
+
+
+def _moved(node: Node, step: Node, origin: Node = (0, 0)) -> Node:
+    """`node` + `step` - `origin`."""
+    return node[0] + step[0] - origin[0], node[1] + step[1] - origin[1]
+
+
+class _Streets:
+    """The streets around a walk: where their crossings lie and how they are bent."""
+
+    def __init__(self, rng: np.random.Generator, role: Role, walk: np.ndarray):
+        low, high = walk.min(axis=0), walk.max(axis=0)
+        columns, rows = high - low + 1
+        lattice = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1)
+        jitter = rng.uniform(-role.winding, role.winding, (columns, rows, 2))
+        self.crossing = (lattice + jitter) * role.block_m
+        self.bend = rng.uniform(-role.winding, role.winding, (2, columns, rows)) / 2  # of streets along x and along y
+        self.is_round = rng.random((columns, rows)) < role.roundabouts
+        self.walk: list[Node] = [(int(column), int(row)) for column, row in walk - low]
+
+    def line(self) -> Float[np.ndarray, "n 2"]:
+        """The way along the walk, with sharp corners; roundabouts are taken counter-clockwise."""
+        streets = [self._street(a, b) for a, b in pairwise(self.walk)]
+        parts = [streets[0]]
+        for node, street in zip(self.walk[1:-1], streets[1:], strict=True):
+            if self.is_round[node]:
+                parts.append(self._arc(node, parts[-1][-1], street[0]))
+            parts.append(street)
+        return np.concatenate(parts)
+
+    def _street(self, a: Node, b: Node) -> Float[np.ndarray, "n 2"]:
+        """From crossing `a` to its neighbour `b`: a parabola, without what lies in a roundabout."""
+        if a > b:
+            return self._street(b, a)[::-1]
+        start, end = self.crossing[a], self.crossing[b]
+        left = np.array([start[1] - end[1], end[0] - start[0]])
+        middle = (start + end) / 2 + self.bend[0 if b[0] > a[0] else 1][a] * left
+        t = np.linspace(0, 1, 60)[:, None]
+        line = (1 - t) ** 2 * start + 2 * t * (1 - t) * middle + t**2 * end
+        for node in (a, b):
+            if self.is_round[node]:
+                line = line[np.linalg.norm(line - self.crossing[node], axis=1) > ROUNDABOUT_RADIUS_M]
+        return line
+
+    def _arc(self, node: Node, entry: Float[np.ndarray, "2"], exit: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
+        first, last = (np.arctan2(*(point - self.crossing[node])[::-1]) for point in (entry, exit))
+        angle = first + np.linspace(0, (last - first) % (2 * np.pi), 30)
+        return self.crossing[node] + ROUNDABOUT_RADIUS_M * np.stack([np.cos(angle), np.sin(angle)], axis=1)

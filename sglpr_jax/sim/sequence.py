@@ -1,0 +1,95 @@
+"""A simulated drive as a sequence of scans that are rendered when they are asked for: nothing lies on disk."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Int32
+
+from sglpr_jax.data.sequence import ScanSequence
+from sglpr_jax.sim.drive import (
+    RATE_HZ,
+    Drive,
+    drive_seed,
+    every_kth,
+    name_of_path,
+    plan_path,
+    poses_on,
+    read_path,
+    speeds,
+    thinned,
+)
+from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
+from sglpr_jax.sim.world import build_world
+
+KEPT_SCANS = 8
+"""The last ones rendered, so that asking for a scan's points and then for its labels costs one rendering."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSequence(ScanSequence):
+    """A drive whose scans, all with labels, are rendered on demand; `scan_paths` and `label_paths` name no files.
+
+    `drive` has the poses. `render(i)` returns points (n, 4) with intensities and labels (n,) of scan `i`, the same on
+    every call; do not change them in place.
+    """
+
+    drive: Drive
+    render: Callable[[int], tuple[np.ndarray, np.ndarray]]
+
+    def labels(self, i: int) -> Int32[np.ndarray, " n"]:
+        """Return the raw SemanticKITTI ids of scan `i`, one per point."""
+        return self.render(i)[1]
+
+
+def simulate_sequence(
+    name: str = "00",
+    *,
+    along: Path | None = None,
+    scans: int = 300,
+    sensor: Sensor = HDL64E,
+    seed: int = 0,
+    rate_hz: float = RATE_HZ,
+) -> SimulatedSequence:
+    """Build the town around a drive and return the drive: route `name`, or the way of the pose file `along`.
+
+    Takes some seconds; every scan then takes some hundredths of one. Of a pose file with more than `scans` lines every
+    k-th is taken, and `rate_hz` is not used. The scans are those that `write_dataset` writes for the same arguments.
+
+    Raises ValueError for an unknown route; for the errors of a pose file see `read_path`.
+    """
+    if along is not None:
+        name = name_of_path(along)
+        path = read_path(along)
+    else:
+        rng = np.random.default_rng((*drive_seed(seed, name), 1))
+        path = plan_path(rng, name, scans=scans, rate_hz=rate_hz)
+    seeds = drive_seed(seed, name)
+    world = build_world(seeds, path.xy, path.times)
+    xy, yaw, times = thinned(path, scans)
+    drive = Drive(poses_on(world.ground.relief, xy, yaw, height_m=sensor.height_m), times)
+    speed = speeds(path)[every_kth(path, scans)]
+    key = jax.random.fold_in(jax.random.key(seed), seeds[1])
+
+    @functools.lru_cache(maxsize=KEPT_SCANS)
+    def render(i: int) -> tuple[np.ndarray, np.ndarray]:
+        pose, velocity = drive.world_from_lidar[i], np.array([speed[i], 0, 0])
+        return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(times[i]), velocity=velocity)
+
+    ids = tuple(f"{i:06d}" for i in range(len(times)))
+    names = tuple(Path(i) for i in ids)
+    return SimulatedSequence(
+        name=name,
+        ids=ids,
+        positions=drive.world_from_lidar[:, :3, 3],
+        times=times,
+        pose_source="simulation",
+        scan_paths=names,
+        label_paths=names,
+        read_scan=lambda path: render(int(path.name))[0][:, :3],
+        drive=drive,
+        render=render,
+    )

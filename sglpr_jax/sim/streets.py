@@ -1,0 +1,244 @@
+"""The network of streets around a drive: those it drives along, each once, and side streets that branch off."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
+
+from sglpr_jax.sim.styles import SHARES, STYLES, Side, draw_side
+
+MIDDLE_M = 1.2
+"""How far left of the first pass the middle of the street is: one drives on the right."""
+SAME_STREET_M = 7.0
+"""Within this distance, and nearly parallel, another pass is along the same street."""
+HIGHWAY_MPS = 17.0
+ROUNDABOUT_M = (5.5, 16.0)
+"""Radii that the way around a roundabout may have."""
+
+_LOOK_BACK_M = 30  # along the path: what is nearer is the same pass
+_SIDE_STREET_M = (30.0, 60.0)
+_CROSSING_EVERY_M = (60.0, 150.0)
+_STRETCH_M = (40.0, 150.0)
+_LOOK_ALIKE_M = (300.0, 600.0)
+
+
+class Stretch(NamedTuple):
+    """Part of a street with one style on either side; metres from the street's beginning."""
+
+    start: int
+    stop: int
+    half_width: float  # of the carriageway
+    left: Side
+    right: Side
+
+
+class Street(NamedTuple):
+    """A line with one point a metre and what runs along it."""
+
+    middle: np.ndarray  # (n, 2) metres
+    heading: np.ndarray  # (n,) radians, unwrapped
+    stretches: tuple[Stretch, ...]
+
+
+class Path(NamedTuple):
+    """The driven way with one point a metre."""
+
+    xy: np.ndarray  # (n, 2) metres
+    heading: np.ndarray  # (n,) radians, unwrapped
+    times: np.ndarray  # (n,) seconds
+    speed: np.ndarray  # (n,) metres per second, over some 20 m
+
+    @property
+    def left(self) -> Float[np.ndarray, "n 2"]:
+        return np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=1)
+
+
+class Island(NamedTuple):
+    """The middle of a roundabout."""
+
+    centre: np.ndarray  # (2,) metres
+    radius: float
+
+
+def resample(trajectory: Float[np.ndarray, "n 2"], times: Float[np.ndarray, " n"]) -> Path:
+    """One point a metre along `trajectory`; where the vehicle stood is one point.
+
+    Raises ValueError where the trajectory is shorter than 2 m or not finite, or `times` do not increase.
+    """
+    if len(trajectory) < 2 or not (np.isfinite(trajectory).all() and np.all(np.diff(times) > 0)):
+        raise ValueError("a trajectory needs two or more finite points at increasing times")
+    travelled = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(trajectory, axis=0), axis=1))])
+    moved = np.concatenate([[True], np.diff(travelled) > 1e-6])
+    if travelled[-1] < 2:
+        raise ValueError(f"a trajectory needs a length of 2 m or more, found {travelled[-1]:.2f} m")
+    at = np.linspace(0, travelled[-1], int(travelled[-1]) + 1)
+    xy = np.stack([np.interp(at, travelled[moved], axis) for axis in trajectory[moved].T], axis=1)
+    seconds = np.interp(at, travelled[moved], times[moved])
+    ahead = np.gradient(gaussian_filter1d(xy, 2.0, axis=0, mode="nearest"), axis=0)
+    pace = gaussian_filter1d(np.gradient(seconds), 10.0, mode="nearest")
+    heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    return Path(xy, heading, seconds, np.gradient(at) / np.maximum(pace, 1e-3))
+
+
+def revisits(path: Path) -> Bool[np.ndarray, " n"]:
+    """Which points of the path lie on a street that was driven before, in either direction."""
+    pairs = KDTree(path.xy).query_pairs(SAME_STREET_M, output_type="ndarray")
+    parallel = np.abs(np.cos(path.heading[pairs[:, 0]] - path.heading[pairs[:, 1]])) > 0.75
+    pairs = pairs[parallel & (pairs[:, 1] - pairs[:, 0] > _LOOK_BACK_M)]
+    again = np.zeros(len(path.xy), bool)
+    # In order of the later point, so that a pass is compared only with first passes.
+    for older, later in pairs[np.lexsort(pairs.T)].tolist():
+        again[later] |= not again[older]
+    return again
+
+
+def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
+    """Yield first and one past the last index of every run of True; gaps shorter than `gap` are closed."""
+    indices = np.flatnonzero(keep)
+    breaks = np.flatnonzero(np.diff(indices) > gap)
+    firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(indices) - 1]])
+    for first, last in zip(indices[firsts].tolist(), indices[lasts].tolist(), strict=True):
+        yield first, last + 1
+
+
+def draw_streets(rng: np.random.Generator, path: Path) -> tuple[Street, ...]:
+    """The streets along `path` and the side streets that branch off; same path and state of `rng`, same streets."""
+    middle = gaussian_filter1d(path.xy + MIDDLE_M * path.left, 1.5, axis=0, mode="nearest")
+    style = _new_style(rng)
+    streets, lines = [], [middle]
+    for first, last in runs(~revisits(path), gap=12):
+        # A run begins and ends on a street that is already there: it reaches 4 m into it.
+        line = slice(max(first - 4, 0), min(last + 4, len(middle)))
+        fast = path.speed[line] > HIGHWAY_MPS
+        street = Street(middle[line], path.heading[line], tuple(_draw_stretches(rng, fast, style)))
+        streets.append(street)
+        for start, heading in _branch_starts(rng, street):
+            length, bend = rng.uniform(*_SIDE_STREET_M), rng.normal(0, 0.004)
+            branch = _free_line(start, heading, length, bend, KDTree(np.concatenate(lines)))
+            if len(branch) > 20:
+                lines.append(branch)
+                streets.append(_side_street(rng, branch))
+    return tuple(streets)
+
+
+def _side_street(rng: np.random.Generator, line: Float[np.ndarray, "n 2"]) -> Street:
+    ahead = np.gradient(line, axis=0)
+    stretches = _draw_stretches(rng, np.zeros(len(line), bool), _new_style(rng))
+    return Street(line, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), tuple(stretches))
+
+
+def _new_style(rng: np.random.Generator) -> str:
+    return str(rng.choice(list(SHARES), p=np.array(list(SHARES.values())) / sum(SHARES.values())))
+
+
+def _draw_stretches(rng: np.random.Generator, fast: Bool[np.ndarray, " n"], name: str) -> Iterator[Stretch]:
+    """Cut a street into stretches; a style lasts for some of them, and one in eight is long and all alike."""
+    start, changes = 0, np.flatnonzero(np.diff(fast.astype(int))) + 1
+    town_width = rng.uniform(-0.2, 0.2)
+    while start < len(fast):
+        look_alike = rng.random() < 0.12
+        stop = min(start + int(rng.uniform(*(_LOOK_ALIKE_M if look_alike else _STRETCH_M))), len(fast))
+        stop = min([stop, *changes[changes > start].tolist()])
+        name = name if rng.random() < 0.7 else _new_style(rng)
+        here = STYLES["highway" if fast[start] else name]
+        half_width = sum(here.road) / 2 + town_width
+        median = rng.random() < here.median
+        # Every fourth street looks different across the road.
+        other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng)]
+        left = draw_side(rng, here, median=median, look_alike=look_alike)
+        right = draw_side(rng, other, median=False, look_alike=look_alike)
+        yield Stretch(start, stop, half_width, left, right)
+        start = stop
+
+
+def _branch_starts(rng: np.random.Generator, street: Street) -> list[tuple[Float[np.ndarray, "2"], float]]:
+    """Where side streets may begin and lead: straight on where the street turns off, and by chance elsewhere."""
+    starts = []
+    for turn in _sharp_turns(street.heading):
+        before, after = max(turn - 10, 0), min(turn + 10, len(street.heading) - 1)
+        starts += [(before, street.heading[before])] * (rng.random() < 0.8)
+        starts += [(after, street.heading[after] + np.pi)] * (rng.random() < 0.6)
+    highway = np.concatenate([np.full(part.stop - part.start, part.half_width > 5) for part in street.stretches])
+    at = rng.uniform(15, 60)
+    while at < len(street.middle) - 15:
+        if not highway[int(at)]:
+            turn = rng.choice((-1, 1)) * np.pi / 2 + rng.normal(0, 0.15)
+            starts.append((int(at), street.heading[int(at)] + turn))
+            if rng.random() < 0.5:
+                starts.append((int(at), starts[-1][1] + np.pi))
+        at += rng.uniform(*_CROSSING_EVERY_M)
+    return [(street.middle[index], float(heading)) for index, heading in starts]
+
+
+def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
+    """Yield the middles of turns by 50 to 120 degrees within 20 m."""
+    if len(heading) <= 60:
+        return
+    turned = np.abs(heading[20:] - heading[:-20])
+    for first, last in runs(turned > np.radians(50), gap=5) if np.any(turned > np.radians(50)) else ():
+        peak = first + int(turned[first:last].argmax())
+        if turned[peak] < np.radians(120):
+            yield peak + 10
+
+
+def _free_line(
+    start: Float[np.ndarray, "2"], heading: float, length: float, bend: float, others: KDTree
+) -> Float[np.ndarray, "m 2"]:
+    """A gentle curve from `start` that ends where it meets another street; empty where it would run along one."""
+    along = np.arange(int(length))
+    bearing = heading + bend * along
+    line = start + np.cumsum(np.stack([np.cos(bearing), np.sin(bearing)], axis=1), axis=0)
+    distance = others.query(line)[0]
+    met = np.flatnonzero((distance < 2) & (along > 15))
+    line, distance = line[: met[0] + 1] if len(met) else line, distance[: met[0] + 1] if len(met) else distance
+    beside = (distance < 14) & (along[: len(line)] > 16)
+    if len(met):
+        return line if beside.sum() < 22 else line[:0]
+    return line[: np.flatnonzero(beside)[0]] if beside.any() else line
+
+
+def roundabouts(path: Path) -> tuple[Island, ...]:
+    """The islands that the path goes around: a left-hand bend of 150 degrees or more within a small radius."""
+    turning = gaussian_filter1d(np.gradient(path.heading), 2.0)
+    round_it = (turning > 1 / ROUNDABOUT_M[1]) & (turning < 1 / ROUNDABOUT_M[0])
+    islands = []
+    for first, last in runs(round_it, gap=3) if round_it.any() else ():
+        if path.heading[last - 1] - path.heading[first] > np.radians(150):
+            radius = (last - first) / (path.heading[last - 1] - path.heading[first])
+            centre = (path.xy[first:last] + radius * path.left[first:last]).mean(axis=0)
+            free = KDTree(path.xy).query(centre)[0] - 3.5
+            if free > 1:
+                islands.append(Island(centre, float(free)))
+    return tuple(islands)
+
+
+class Network:
+    """The points of all streets as one table, and which of them is nearest to a place."""
+
+    def __init__(self, streets: tuple[Street, ...]):
+        self.streets = streets
+        self.middle = np.concatenate([street.middle for street in streets])
+        self.heading = np.concatenate([street.heading for street in streets])
+        self.street = np.repeat(np.arange(len(streets)), [len(street.middle) for street in streets])
+        self.stretches = tuple(stretch for street in streets for stretch in street.stretches)
+        self.stretch = np.repeat(np.arange(len(self.stretches)), [part.stop - part.start for part in self.stretches])
+        self.half_width = np.array([part.half_width for part in self.stretches])[self.stretch]
+        verges = np.array([(part.left.verge, part.right.verge) for part in self.stretches])
+        self.verge = verges[self.stretch]  # (n, 2): left and right
+        self._tree = KDTree(self.middle)
+
+    def nearest(self, xy: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, " m"]:
+        """Index of the nearest point of any street."""
+        return np.asarray(self._tree.query(xy)[1])
+
+    def offset(self, xy: Float[np.ndarray, "m 2"], index: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """How far left of the street at its point `index` each place lies; negative on the right.
+
+        Beyond the end of a street its distance counts, so that a dead end is round.
+        """
+        away, cos, sin = xy - self.middle[index], np.cos(self.heading[index]), np.sin(self.heading[index])
+        left, ahead = cos * away[:, 1] - sin * away[:, 0], np.abs(cos * away[:, 0] + sin * away[:, 1])
+        return np.copysign(np.hypot(left, np.maximum(ahead - 1, 0)), left)

@@ -1,0 +1,173 @@
+"""What moves: oncoming and other traffic, riders and walkers, as short pieces of straight motion."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d
+
+from sglpr_jax.sim import vehicles
+from sglpr_jax.sim.ground import Ground
+from sglpr_jax.sim.placing import CLEARANCE_M, Anchors, footprint_distance, place
+from sglpr_jax.sim.shapes import Shapes
+from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
+from sglpr_jax.sim.things import Part, Range, Thing
+
+KEPT_M = 8.0
+"""What drives ahead of the vehicle or behind it keeps this far away."""
+
+_VIEW_M = 85.0
+_PIECE_M, _PIECE_S = 7.0, (0.4, 1.0)
+"""A piece of straight motion is about this long, and takes so long."""
+
+LaneName = Literal["oncoming", "own", "left walk", "right walk"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Flow:
+    """One kind of traffic; the vehicle meets one each `every_m` metres."""
+
+    make: Callable[[np.random.Generator], Thing]
+    every_m: float
+    lanes: tuple[LaneName, ...]
+    speed: Range  # m/s, against the ground; of the vehicle's own lane: not used
+
+
+_DRIVING, _RIDING, _WALKING = (5.0, 12.0), (3.0, 5.5), (0.9, 1.6)
+FLOWS = (
+    Flow(vehicles.car, 80.0, ("oncoming",), _DRIVING),
+    Flow(vehicles.van, 500.0, ("oncoming",), _DRIVING),
+    Flow(vehicles.truck, 300.0, ("oncoming",), _DRIVING),
+    Flow(vehicles.bus, 1200.0, ("oncoming",), _DRIVING),
+    Flow(vehicles.motorcyclist, 300.0, ("oncoming",), _DRIVING),
+    Flow(vehicles.car, 350.0, ("own",), _DRIVING),
+    Flow(vehicles.van, 1500.0, ("own",), _DRIVING),
+    Flow(vehicles.bicyclist, 200.0, ("left walk", "right walk"), _RIDING),
+    Flow(vehicles.person, 45.0, ("left walk", "right walk"), _WALKING),
+)
+
+
+class Lane(NamedTuple):
+    """A line beside the vehicle's way, one point per point of the path."""
+
+    xy: np.ndarray  # (n, 2) metres
+    usable: np.ndarray  # (n,) whether anybody goes there
+
+
+def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
+    """Where traffic goes, seen from the vehicle: the oncoming lane, its own, and the sidewalks."""
+    nearest = network.nearest(path.xy)
+    same_way = np.cos(path.heading - network.heading[nearest])
+    to_middle = -network.offset(path.xy, nearest) * np.sign(same_way)
+    to_middle = np.where(np.abs(same_way) > 0.9, to_middle.clip(-3, 4), MIDDLE_M)
+    pairs = [(part.left, part.right) for part in network.stretches]
+    half_width, stretch = network.half_width[nearest], network.stretch[nearest]
+    away = {}
+    for name, turned in (("left walk", same_way < 0), ("right walk", same_way > 0)):
+        sides = [(sum(s.strips[-1].width for s in [side] if s.strips), side.verge) for pair in pairs for side in pair]
+        last, verge = np.array(sides)[2 * stretch + turned].T
+        sign = 1 if name == "left walk" else -1
+        away[name] = to_middle + sign * (half_width + verge - np.where(last > 0, last / 2, -0.8)), last > 0.9
+    medians = np.array([[side.median for side in pair] for pair in pairs])[stretch, (same_way < 0).astype(int)]
+    beyond = np.where(medians > 0, half_width + medians + 3.5, half_width - 1.55)
+    away["oncoming"] = to_middle + beyond, np.ones(len(stretch), bool)
+    away["own"] = np.zeros(len(stretch)), np.ones(len(stretch), bool)
+    return {
+        name: Lane(path.xy + gaussian_filter1d(left, 5.0, mode="nearest")[:, None] * path.left, usable)
+        for name, (left, usable) in away.items()
+    }
+
+
+class Pieces(NamedTuple):
+    """Straight motions of one thing: from the place `begin` at `since` to `end` at `until`."""
+
+    thing: Thing
+    begin: np.ndarray  # (k, 2) metres
+    end: np.ndarray  # (k, 2)
+    heading: np.ndarray  # (k,) radians
+    since: np.ndarray  # (k,) seconds
+    until: np.ndarray  # (k,)
+
+
+def traffic(rng: np.random.Generator, network: Network, path: Path, ground: Ground) -> tuple[Shapes, list[Part]]:
+    """All that moves around the vehicle while it drives, clear of it, and the part of every row."""
+    lines = lanes(network, path)
+    pieces = [piece for flow in FLOWS for piece in _movers(rng, flow, lines, path)]
+    rows = [_rows(piece, path, ground) for piece in pieces]
+    tables = [shapes for shapes, _ in rows]
+    shapes = Shapes(*(np.concatenate(leaves) for leaves in zip(*tables, strict=True)))
+    return shapes, [part for _, parts in rows for part in parts]
+
+
+def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Pieces]:
+    """Yield the movers of one flow, each met at a place of its own on the path."""
+    for block in np.arange(rng.uniform(-0.5, 0) * flow.every_m, len(path.xy), flow.every_m):
+        met, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
+        thing, speed = vehicles.moving(flow.make(rng)), rng.uniform(*flow.speed)
+        direction, follows = int(rng.choice((-1, 1))), rng.choice((-1, 1)) * rng.uniform(14, 35)
+        if not 0 <= met < len(path.xy) or not lines[name].usable[int(met)]:
+            continue
+        ego = path.speed[int(met)]
+        if name == "own":
+            lasts = rng.uniform(10, 30)
+            times = path.times[int(met)] + np.arange(0, lasts, 1.0)
+            along = np.interp(times, path.times, np.arange(len(path.xy))) + follows
+            direction = 1
+        else:
+            if name == "oncoming":
+                direction, speed = -1, max(speed, 0.9 * ego)
+            lasts = _VIEW_M / max(speed + ego, 5.0)
+            step = float(np.clip(_PIECE_M / speed, *_PIECE_S))
+            offsets = np.arange(-lasts, lasts, step)
+            times, along = path.times[int(met)] + offsets, met + direction * speed * offsets
+        yield _pieces(thing, lines[name], path, times, along, direction)
+
+
+def _pieces(
+    thing: Thing,
+    lane: Lane,
+    path: Path,
+    times: Float[np.ndarray, " k"],
+    along: Float[np.ndarray, " k"],
+    direction: int,
+) -> Pieces:
+    """The motion of a thing that is at place `along` of the lane at each of `times`, where the lane goes on."""
+    inside = (along[:-1] >= 0) & (along[1:] >= 0) & (np.maximum(along[:-1], along[1:]) <= len(path.xy) - 1)
+    index = np.arange(len(path.xy))
+    xy = np.stack([np.interp(along, index, axis) for axis in lane.xy.T], axis=1)
+    middle = (along[:-1] + along[1:]) / 2
+    heading = np.interp(middle, index, path.heading) + (np.pi if direction < 0 else 0.0)
+    return Pieces(thing, *(leaf[inside] for leaf in (xy[:-1], xy[1:], heading, times[:-1], times[1:])))
+
+
+def _rows(pieces: Pieces, path: Path, ground: Ground) -> tuple[Shapes, list[Part]]:
+    """The pieces that keep clear of the vehicle, as shapes."""
+    keep = _clear(pieces, path)
+    begin, end, heading, since, until = (leaf[keep] for leaf in pieces[1:])
+    count, size = len(heading), len(pieces.thing)
+    row = np.repeat(np.arange(count), size)
+    velocity, middle = (end - begin) / (until - since)[:, None], (since + until) / 2
+    anchors = Anchors((begin + end)[row] / 2, heading[row], np.ones(len(row)), since[row], until[row])
+    parts = [*pieces.thing] * count
+    shapes = place(parts, anchors, ground)
+    centre = shapes.centre.copy()
+    centre[:, :2] -= velocity[row] * middle[row, None]  # back to time 0
+    return shapes._replace(centre=centre, velocity=velocity[row]), parts
+
+
+def _clear(pieces: Pieces, path: Path) -> Bool[np.ndarray, " k"]:
+    """Which pieces keep clear of the vehicle all the time: CLEARANCE_M beside it, KEPT_M ahead and behind."""
+    half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in pieces.thing], axis=0)
+    half = np.tile(half, (len(pieces.heading), 1))
+    clear = np.ones(len(pieces.heading), bool)
+    for share in np.linspace(0, 1, 21):
+        time = pieces.since + share * (pieces.until - pieces.since)
+        vehicle = np.stack([np.interp(time, path.times, axis) for axis in path.xy.T], axis=1)
+        facing = np.interp(time, path.times, path.heading)
+        away = vehicle - (pieces.begin + share * (pieces.end - pieces.begin))
+        beside = np.abs(np.cos(facing) * away[:, 1] - np.sin(facing) * away[:, 0]) > half[:, 1] + 1.0
+        distance = footprint_distance(away, pieces.heading, half)
+        clear &= distance > np.where(beside, CLEARANCE_M, KEPT_M)
+    return clear

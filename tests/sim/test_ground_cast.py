@@ -1,0 +1,79 @@
+"""Rays against hills and kerbs, compared with the height of the ground where they say that they meet it."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import FLAT, HILLS, striped_ground
+
+from sglpr_jax.sim.ground import KERB_M, Relief, relief_gradient, relief_height, surface_height
+from sglpr_jax.sim.ground_cast import ground_view, meet_ground
+from sglpr_jax.sim.raw_ids import ROAD, SIDEWALK, TERRAIN
+from sglpr_jax.sim.shapes import Vectors
+
+REACH_M = 70.0
+meet = jax.jit(lambda rays, view: meet_ground(rays, view, reach_m=REACH_M))
+
+
+def rays(lowest: float = -0.5, highest: float = 0.02) -> np.ndarray:
+    """Unit vectors (lasers, azimuths, 3)."""
+    azimuth, slope = np.linspace(0, 2 * np.pi, 90)[None, :], np.linspace(lowest, highest, 16)[:, None]
+    directions = np.stack(np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), slope), axis=-1)
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def cast(ground, sensor: np.ndarray, directions: np.ndarray):
+    """Distance, label and facing per ray, and the points in the world."""
+    view = ground_view(ground, sensor, reach_m=REACH_M)
+    found = [np.asarray(part) for part in meet(Vectors(*np.moveaxis(directions, -1, 0).astype(np.float32)), view)]
+    return *found, sensor + directions * np.where(np.isfinite(found[0]), found[0], 0)[..., None]
+
+
+def sensor_over(relief: Relief, x: float, y: float) -> np.ndarray:
+    return np.array([x, y, relief_height(relief, np.array([x, y], float)) + 1.73])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-25, 25), st.floats(-25, 25), st.sampled_from([FLAT, HILLS]))
+def test_points_lie_on_the_ground_and_bear_its_label(x, y, relief):
+    ground = striped_ground(relief, ROAD, TERRAIN)
+    distance, label, _, points = cast(ground, sensor_over(relief, x, y), rays())
+    # Far away, a flat ray into a kerb's face may be given metres behind it: KERB_M below the surface.
+    for reach, tolerance in ((20, 0.01), (60, KERB_M + 0.01)):
+        near = (distance < reach) & (np.abs(points[..., 1]) > 0.3)
+        assert near.sum() > 200
+        np.testing.assert_allclose(points[near][:, 2], surface_height(ground, points[near][:, :2]), atol=tolerance)
+        np.testing.assert_array_equal(label[near], np.where(points[near][:, 1] > 0, ROAD, TERRAIN))
+
+
+def test_rays_above_the_horizon_of_flat_ground_meet_nothing():
+    directions = rays(highest=0.3)
+    distance, _, _, _ = cast(striped_ground(FLAT, ROAD, TERRAIN), np.array([0, 0, 1.73]), directions)
+    np.testing.assert_array_equal(np.isinf(distance), directions[..., 2] >= 0)
+
+
+def test_a_kerb_hides_nothing_and_its_face_is_the_sidewalk():
+    ground = striped_ground(FLAT, ROAD, SIDEWALK)  # the kerb runs along y = 0
+    down = np.linspace(-0.43, -0.2, 300)
+    towards = np.stack([np.zeros(300), -np.ones(300), down], axis=-1)
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    _, label, _, points = cast(ground, np.array([0, 5.0, 1.73]), towards[None])
+    x_road, x_top, face = points[0, :, 1] > 1e-3, points[0, :, 2] > KERB_M - 1e-3, label[0] == SIDEWALK
+    np.testing.assert_array_equal(face, ~x_road)
+    np.testing.assert_allclose(points[0, x_top, 2], KERB_M, atol=1e-4)
+    np.testing.assert_allclose(points[0, x_road, 2], 0, atol=1e-4)
+    on_face = ~x_road & ~x_top
+    # A ray into the face is given where it would meet the road behind it: some centimetres too far.
+    assert on_face.sum() > 2 and np.all(points[0, on_face, 1] > -0.5)
+
+
+@pytest.mark.parametrize("relief", [FLAT, HILLS])
+def test_facing_is_the_cosine_to_the_normal(relief):
+    ground, directions = striped_ground(relief, ROAD, ROAD), rays()
+    distance, _, facing, points = cast(ground, sensor_over(relief, 3, 4), directions)
+    gradient = relief_gradient(relief, points[..., :2])
+    normal = np.concatenate([-gradient, np.ones((*gradient.shape[:-1], 1))], axis=-1)
+    expected = -np.sum(directions * normal, axis=-1) / np.linalg.norm(normal, axis=-1)
+    near = distance < 30
+    np.testing.assert_allclose(facing[near], expected[near], atol=5e-3)

@@ -1,0 +1,142 @@
+"""The town: nothing is in the way, everything stands on the ground, all classes occur, and parked cars change."""
+
+import jax
+import numpy as np
+import pytest
+from town import LOOP, THERE_AND_BACK, drive
+
+from sglpr_jax.labels import CATEGORIES, to_classes
+from sglpr_jax.sim import World, build_world
+from sglpr_jax.sim.ground import is_raised, label_at, surface_height
+from sglpr_jax.sim.raw_ids import BUILDING, CAR, LANE_MARKING, MOVING, POLE, ROAD, TRUNK
+from sglpr_jax.sim.shapes import Shapes
+
+SEEDS = range(4)
+_worlds: dict[tuple, World] = {}
+
+
+def world_of(corners, seed: int) -> World:
+    if (corners, seed) not in _worlds:
+        _worlds[corners, seed] = build_world(seed, *drive(corners))
+    return _worlds[corners, seed]
+
+
+def clearance(shapes: Shapes, vehicle: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Smallest distance (n,) of each shape's footprint from the vehicle while the shape is there."""
+    nearest = np.full(len(shapes.label), np.inf)
+    for (x, y), time in zip(vehicle, times, strict=True):
+        away = np.array([x, y]) - shapes.centre[:, :2] - shapes.velocity * time
+        cos, sin = np.cos(shapes.yaw), np.sin(shapes.yaw)
+        along = np.abs(cos * away[:, 0] + sin * away[:, 1]) - shapes.half[:, 0]
+        across = np.abs(cos * away[:, 1] - sin * away[:, 0]) - shapes.half[:, 1]
+        distance = np.hypot(np.maximum(along, 0), np.maximum(across, 0))
+        there = (shapes.since <= time) & (time < shapes.until)
+        nearest = np.where(there, np.minimum(nearest, distance), nearest)
+    return nearest
+
+
+def select(shapes: Shapes, keep: np.ndarray) -> Shapes:
+    return Shapes(*(leaf[keep] for leaf in shapes))
+
+
+@pytest.mark.parametrize("corners", [LOOP, THERE_AND_BACK])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_nothing_is_in_the_vehicles_way_at_any_time(corners, seed):
+    trajectory, times = drive(corners)
+    for shapes in world_of(corners, seed).scene:
+        standing = np.all(shapes.velocity == 0, axis=1) & ~np.isin(shapes.label, list(MOVING.values()))
+        always = select(shapes, standing)
+        always = always._replace(since=always.since - np.inf, until=always.until + np.inf)
+        assert clearance(always, trajectory, times).min() >= 1.6
+        assert clearance(select(shapes, ~standing), trajectory, times).min(initial=np.inf) >= 1.6
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_drives_ahead_keeps_eight_metres_away(seed):
+    trajectory, times = drive(LOOP)
+    heading = np.unwrap(np.arctan2(*np.gradient(trajectory, axis=0).T[::-1]))
+    boxes = world_of(LOOP, seed).scene.boxes
+    cars = select(boxes, np.isin(boxes.label, [MOVING[CAR]]))
+    seen_ahead = 0
+    for (x, y), yaw, time in zip(trajectory, heading, times, strict=True):
+        away = cars.centre[:, :2] + cars.velocity * time - [x, y]
+        there = (cars.since <= time) & (time < cars.until)
+        ahead = np.cos(yaw) * away[:, 0] + np.sin(yaw) * away[:, 1]
+        beside = np.abs(np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0])
+        in_lane = there & (beside < 0.8)
+        seen_ahead += in_lane.any()
+        assert np.all(np.abs(ahead[in_lane]) - cars.half[in_lane, 0] >= 7.9)
+    assert seen_ahead > 20
+
+
+def test_movers_go_where_they_look_and_leave_no_gap():
+    scene = world_of(LOOP, 0).scene
+    boxes = select(scene.boxes, np.linalg.norm(scene.boxes.velocity, axis=1) > 2)
+    along = np.cos(boxes.yaw) * boxes.velocity[:, 0] + np.sin(boxes.yaw) * boxes.velocity[:, 1]
+    assert np.mean(along > 0.97 * np.linalg.norm(boxes.velocity, axis=1)) > 0.9
+    ends = boxes.centre[:, :2] + boxes.velocity * boxes.until[:, None]
+    begins = boxes.centre[:, :2] + boxes.velocity * boxes.since[:, None]
+    same = (boxes.until[:, None] == boxes.since[None, :]) & (boxes.half[:, None] == boxes.half[None]).all(-1)
+    gap = np.linalg.norm(ends[:, None] - begins[None], axis=-1)[same]
+    assert len(gap) > 100 and np.median(gap) < 0.3
+    assert set(boxes.label.tolist()) <= set(MOVING.values())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_all_classes_occur_in_six_hundred_metres(seed):
+    world = world_of(LOOP, seed)
+    raw = np.concatenate([*(shapes.label for shapes in world.scene), np.unique(world.ground.label)])
+    missing = set(range(20)) - set(to_classes(raw.astype(int)).tolist())
+    assert {CATEGORIES[i] for i in missing} == set()
+    assert {252, 253, 254, 255, 258, 259} <= set(raw.tolist())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_shapes_stand_on_the_ground(seed):
+    world = world_of(LOOP, seed)
+    for shapes in world.scene:
+        moves = np.any(shapes.velocity != 0, axis=1)
+        time = np.where(moves, shapes.since.clip(-1e6, 1e6) + shapes.until.clip(-1e6, 1e6), 0) / 2
+        where = shapes.centre[:, :2] + shapes.velocity * time[:, None]
+        above = shapes.centre[:, 2] - shapes.half[:, 2] - surface_height(world.ground, where)
+        upright = np.isin(shapes.label, [TRUNK, POLE]) & (shapes.half[:, 2] > 0.4)
+        assert np.mean(np.abs(above[upright]) < 0.15) > 0.97 if upright.any() else True
+        built = shapes.label == BUILDING
+        assert above[built].max(initial=0) < 12.5 and np.all(above + 2 * shapes.half[:, 2] > 0.2)
+        assert np.all(shapes.half > 0) and all(np.isfinite(leaf).all() for leaf in shapes[:8])
+
+
+@pytest.mark.parametrize("corners", [LOOP, THERE_AND_BACK])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_vehicle_drives_on_road(corners, seed):
+    label = label_at(world_of(corners, seed).ground, drive(corners)[0])
+    assert np.isin(label, (ROAD, LANE_MARKING)).all() and not is_raised(label).any()
+
+
+def test_parked_cars_come_and_go_between_two_visits():
+    corners = ((0, 0), (160, 0), (160, 300), (0, 300), (0, 0), (160, 0))
+    _, times = drive(corners)
+    kept = gone = came = 0
+    for seed in (0, 1):
+        boxes = world_of(corners, seed).scene.boxes
+        near = (np.abs(boxes.centre[:, 1]) < 12) & (boxes.centre[:, 0] > 5) & (boxes.centre[:, 0] < 140)
+        cars = select(boxes, near & (boxes.label == CAR))
+        first, second = ((cars.since <= time) & (time < cars.until) for time in (times[0] + 10, times[-1] - 10))
+        kept, gone, came = kept + (first & second).sum(), gone + (first & ~second).sum(), came + (~first & second).sum()
+    assert min(kept, gone, came) > 2
+
+
+def test_a_seed_gives_one_town_and_another_seed_another():
+    one, again, other = (build_world(seed, *drive(LOOP[:3])) for seed in ((5, 1), (5, 1), (6, 1)))
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert one.scene.boxes.label.shape != other.scene.boxes.label.shape
+
+
+def test_rows_are_what_the_sensor_expects():
+    for shapes in world_of(LOOP, 0).scene:
+        count = len(shapes.label)
+        assert shapes.centre.shape == shapes.half.shape == (count, 3) and shapes.velocity.shape == (count, 2)
+        assert shapes.label.dtype == np.int32 and np.all(shapes.since < shapes.until)
+        for share in (shapes.porosity, shapes.glass):
+            assert share.min() >= 0 and share.max() <= 1
