@@ -9,6 +9,8 @@ from sglpr_jax.sim.things import Part, Thing
 
 _BELOW_M = 1.0
 """How deep a building reaches into the ground, so that none hovers on a slope."""
+_FACADE_M = 0.06
+"""How uneven a facade is: in real scans the points of a metre of facade lie 4 cm (rms) off their plane."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +26,7 @@ class House:
 def _block(width: float, depth: float, height: float, x: float, front: float, glass: float) -> Part:
     """A box whose front is at y = `front`, standing in the ground."""
     size = width, depth, height + _BELOW_M
-    return Part("box", BUILDING, size, x, front + depth / 2, -_BELOW_M, glass=glass)
+    return Part("box", BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
 
 
 def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:

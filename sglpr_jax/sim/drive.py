@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.pose_files import read_poses, read_times
 from sglpr_jax.poses import positions_from_camera
@@ -27,6 +28,10 @@ STEERING_M = 3.0
 LATERAL_ACCELERATION = 2.0
 ACCELERATION = 1.5
 """In metres per square second, as is the lateral one: how fast a corner is taken, and how fast speeds change."""
+TILT_DEG = 0.6
+"""Standard deviation of pitch and of roll against the ground: springs, bumps, and a road that is not quite smooth."""
+TILT_S = 0.5
+"""About how long a tilt lasts."""
 FREE_SPEED = 1.35
 """Speed on a free street, as a multiple of the mean one."""
 
@@ -115,10 +120,27 @@ def drive_seed(seed: int, name: str) -> tuple[int, int]:
     return seed, int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
 
 
+def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+    """Return pitch and roll of the vehicle's body against the ground at `times`, radians."""
+    steps = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
+    width = TILT_S * PATH_HZ
+    noise = gaussian_filter1d(rng.normal(size=(len(steps), 2)), width, axis=0, mode="wrap")
+    noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # the filter had made it smaller
+    return np.stack([np.interp(times, steps, axis) for axis in noise.T], axis=1)
+
+
 def poses_on(
-    relief: Relief, xy: Float[np.ndarray, "n 2"], yaw: Float[np.ndarray, " n"], *, height_m: float
+    relief: Relief,
+    xy: Float[np.ndarray, "n 2"],
+    yaw: Float[np.ndarray, " n"],
+    *,
+    height_m: float,
+    tilt: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return world_from_lidar for a vehicle on hills: z along the ground's normal, x forward, `height_m` above it."""
+    """Return world_from_lidar for a vehicle on hills: z along the ground's normal, x forward, `height_m` above it.
+
+    `tilt` is pitch and roll (radians) against the ground, see `body_tilt`.
+    """
     slope = relief_gradient(relief, xy)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     x_axis = np.concatenate([forward, (forward * slope).sum(axis=1, keepdims=True)], axis=1)
@@ -130,6 +152,8 @@ def poses_on(
     poses[:, :3, :3] = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=2)
     poses[:, :2, 3] = xy
     poses[:, 2, 3] = relief_height(relief, xy) + height_m * steepness  # `height_m` along the normal
+    if tilt is not None:
+        poses[:, :3, :3] @= Rotation.from_euler("yx", tilt).as_matrix()
     return poses
 
 

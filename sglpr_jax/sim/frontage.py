@@ -15,7 +15,7 @@ from sglpr_jax.sim.things import Part, Placed, Range, Thing, Zone
 
 Clock = tuple[float, float]
 """When the drive begins and ends, seconds."""
-STAY_S = 200.0
+STAY_S = 600.0
 """How long a parked car stays, on average."""
 CHANGING_BUSHES = 0.1
 """Share of the bushes that are there only for a while: they grow and are cut between two visits."""

@@ -19,7 +19,7 @@ COLUMNS = 32
 """Azimuth steps in a sector."""
 SLOTS = 64, 48, 128
 """The most boxes, cylinders and ellipsoids that a sector may meet; of more, the nearest are kept."""
-UNROLL = 4
+UNROLL = 2
 """Shapes tried between two looks at what is left; divides every number of slots."""
 _MARGIN = 1e-3
 _PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)

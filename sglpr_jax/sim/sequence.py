@@ -13,6 +13,7 @@ from sglpr_jax.data.sequence import ScanSequence
 from sglpr_jax.sim.drive import (
     RATE_HZ,
     Drive,
+    body_tilt,
     drive_seed,
     every_kth,
     name_of_path,
@@ -70,7 +71,8 @@ def simulate_sequence(
     seeds = drive_seed(seed, name)
     world = build_world(seeds, path.xy, path.times)
     xy, yaw, times = thinned(path, scans)
-    drive = Drive(poses_on(world.ground.relief, xy, yaw, height_m=sensor.height_m), times)
+    tilt = body_tilt(np.random.default_rng((*seeds, 2)), times)
+    drive = Drive(poses_on(world.ground.relief, xy, yaw, height_m=sensor.height_m, tilt=tilt), times)
     speed = speeds(path)[every_kth(path, scans)]
     key = jax.random.fold_in(jax.random.key(seed), seeds[1])
 

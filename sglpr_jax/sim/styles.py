@@ -57,7 +57,7 @@ STYLES = {
         bays=0.75,
         verge=0.12,
         street_trees=0.15,
-        trees=0.08,
+        trees=0.16,
         bystanders=0.05,
         signs=0.035,
     ),
@@ -72,8 +72,8 @@ STYLES = {
         bays=0.4,
         verge=0.25,
         street_trees=0.2,
-        wood=0.08,
-        trees=0.6,
+        wood=0.15,
+        trees=0.9,
         banks=0.1,
         bystanders=0.025,
     ),
@@ -92,7 +92,7 @@ STYLES = {
         verge=0.5,
         median=0.15,
         street_trees=0.4,
-        trees=0.45,
+        trees=0.6,
         bystanders=0.03,
     ),
     "works": Style(
@@ -111,7 +111,7 @@ STYLES = {
         verge=0.5,
         median=0.25,
         street_trees=0.25,
-        trees=0.2,
+        trees=0.3,
         banks=0.15,
         bystanders=0.015,
     ),
@@ -130,7 +130,7 @@ STYLES = {
         verge=0.3,
         median=0.2,
         street_trees=0.4,
-        trees=0.8,
+        trees=1.1,
         wood=0.35,
         banks=0.35,
         bystanders=0.03,
@@ -162,9 +162,9 @@ STYLES = {
         border=("none", "none", "hedge"),
         verge=0.2,
         street_trees=0.15,
-        trees=0.3,
-        wood=0.5,
-        banks=0.4,
+        trees=0.5,
+        wood=0.6,
+        banks=0.3,
         signs=0.012,
         lamps=False,
     ),
@@ -183,7 +183,7 @@ STYLES = {
     ),
 }
 SHARES = {
-    "centre": 0.3, "suburb": 0.32, "estate": 0.1, "works": 0.05, "park": 0.09, "square": 0.03, "country": 0.12
+    "centre": 0.33, "suburb": 0.33, "estate": 0.09, "works": 0.04, "park": 0.08, "square": 0.02, "country": 0.11
 }  # fmt: skip
 """How often each style begins a new neighbourhood; a highway is where the vehicle drives fast."""
 

@@ -39,11 +39,12 @@ def sensor_over(relief: Relief, x: float, y: float) -> np.ndarray:
 def test_points_lie_on_the_ground_and_bear_its_label(x, y, relief):
     ground = striped_ground(relief, ROAD, TERRAIN)
     distance, label, _, points = cast(ground, sensor_over(relief, x, y), rays())
-    # Far away, a flat ray into a kerb's face may be given metres behind it: KERB_M below the surface.
-    for reach, tolerance in ((20, 0.01), (60, KERB_M + 0.01)):
+    for reach, tolerance in ((20, 0.01), (60, 0.1)):
         near = (distance < reach) & (np.abs(points[..., 1]) > 0.3)
         assert near.sum() > 200
-        np.testing.assert_allclose(points[near][:, 2], surface_height(ground, points[near][:, :2]), atol=tolerance)
+        error = np.abs(points[near][:, 2] - surface_height(ground, points[near][:, :2]))
+        # A flat ray along the kerb into its face may be given metres behind it, that is below the surface.
+        assert np.mean(error < tolerance) > 0.98 and error.max() < KERB_M + tolerance
         np.testing.assert_array_equal(label[near], np.where(points[near][:, 1] > 0, ROAD, TERRAIN))
 
 
