@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from range_images import range_image_paths, read_range_image
 from scan_statistics import HISTOGRAMS, NUMBERS, Measures, image_measures, scan_measures, total_variation
 
 from sglpr_jax.data import Drive, ImageSequence, open_sequence, sequence_names
@@ -93,18 +94,10 @@ def _image(drive: Drive, i: int) -> np.ndarray:
 
 def measure_range_images(folder: Path) -> Iterator[Source]:
     """Yield one source for each drive of a folder of range images."""
-    paths = sorted(folder.glob("*.npz"))
-    if not paths:
-        raise SystemExit(f"{folder}: expected range images (*.npz), found none")
-    for name, of_drive in itertools.groupby(paths, key=lambda path: path.stem[:2]):
-        scans = [_read_range_image(path) for path in of_drive]
+    for name, of_drive in itertools.groupby(range_image_paths(folder), key=lambda path: path.stem[:2]):
+        scans = [read_range_image(path) for path in of_drive]
         image = np.rot90(density_image(scans[0][0]), -1)
         yield Source(f"real range images {name}", [scan_measures(*scan) for scan in scans], image)
-
-
-def _read_range_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return np.ascontiguousarray(file["points"][:, :3]), file["label"].astype(np.int32)
 
 
 def numbers_table(sources: Sequence[Source]) -> str:

@@ -39,6 +39,8 @@ class ModelConfig:
     """How point counts become network input: as they are, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"
     """`circle` blanks the cells outside the largest circle, so that a rotation moves nothing in or out of view."""
+    blind_m: float = 0.0
+    """Blanks the cells nearer than this to the sensor: they hold the vehicle's own body."""
     polar: tuple[int, int] | None = None
     """(rings, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
     patch: int = 4

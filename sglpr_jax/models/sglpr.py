@@ -84,11 +84,12 @@ def prepare(bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfi
 
 
 def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
-    """Which cells the network sees: all, or those inside the largest circle."""
+    """Which cells the network sees: all, or those inside the largest circle, but not those of the vehicle itself."""
     grid = config.grid
     down, right = np.mgrid[: grid.height, : grid.width]
     distance = np.hypot(down - (grid.height - 1) / 2, right - (grid.width - 1) / 2)
-    return (distance < min(grid.height, grid.width) / 2)[None] | (config.field == "square")
+    seen = (distance < min(grid.height, grid.width) / 2) | (config.field == "square")
+    return (seen & (distance * grid.resolution_m >= config.blind_m))[None]
 
 
 @jax.jit

@@ -155,6 +155,14 @@ def test_the_circle_blanks_what_a_rotation_would_move_out_of_view():
     np.testing.assert_allclose(prepared[..., 0], np.broadcast_to(sees * np.log(2), (2, 32, 48)), rtol=1e-6)
 
 
+def test_the_vehicle_itself_is_not_seen():
+    grid = Grid(resolution_m=0.5, height=32, width=32)
+    sees = field_of_view(dataclasses.replace(CONFIG, grid=grid, field="square", blind_m=2.0))[0]
+    x = (np.arange(32) - 15.5) * 0.5
+    np.testing.assert_array_equal(sees, np.hypot(*np.meshgrid(x, x)) >= 2.0)
+    assert 40 < (~sees).sum() < 60
+
+
 def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(random_params, images):
     params = random_params(POLAR)
     outside = ~field_of_view(POLAR)[0]

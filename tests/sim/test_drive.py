@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sglpr_jax.poses import distances
 from sglpr_jax.sim import plan_trajectory, poses_on, read_path
-from sglpr_jax.sim.drive import name_of_path, plan_path, speeds, thinned
+from sglpr_jax.sim.drive import TILT_DEG, body_tilt, name_of_path, plan_path, speeds, thinned
 from sglpr_jax.sim.ground import Relief, draw_relief, relief_height
 from sglpr_jax.sim.routes import ROLES, plan_walk
 
@@ -127,10 +127,25 @@ def test_poses_stand_on_the_hills():
     assert np.abs(rotation[:, 2, 0]).max() > 1e-3
 
 
+PLAIN = Relief(np.zeros(1), np.ones((1, 2)), np.zeros(1))
+
+
 def test_poses_on_a_plain_are_level():
-    plain = Relief(np.zeros(1), np.ones((1, 2)), np.zeros(1))
-    (pose,) = poses_on(plain, np.array([[3.0, 4.0]]), np.array([np.pi / 2]), height_m=2.0)
+    (pose,) = poses_on(PLAIN, np.array([[3.0, 4.0]]), np.array([np.pi / 2]), height_m=2.0)
     np.testing.assert_allclose(pose, [[0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 2], [0, 0, 0, 1]], atol=1e-15)
+
+
+def test_the_body_tilts_on_the_spot():
+    times = np.linspace(0, 400, 2000)
+    tilt = body_tilt(np.random.default_rng(0), times)
+    np.testing.assert_allclose(np.degrees(tilt.std(axis=0)), TILT_DEG, rtol=0.2)
+    assert np.abs(np.diff(tilt, axis=0)).max() < np.abs(tilt).max() / 4  # it takes about a second
+    xy, yaw = np.zeros((2000, 2)), np.full(2000, 0.7)
+    level, tilted = (poses_on(PLAIN, xy, yaw, height_m=2.0, tilt=t) for t in (None, tilt))
+    np.testing.assert_array_equal(level[:, :3, 3], tilted[:, :3, 3])
+    turn = level[:, :3, :3].transpose(0, 2, 1) @ tilted[:, :3, :3]
+    np.testing.assert_allclose(turn[:, 0, 2], tilt[:, 0], atol=1e-3)  # nose down lifts what lies ahead
+    np.testing.assert_allclose(turn[:, 2, 1], tilt[:, 1], atol=1e-3)
 
 
 def pose_file(path, xy, yaw):
