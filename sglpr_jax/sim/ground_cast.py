@@ -24,7 +24,6 @@ from sglpr_jax.sim.ground import (
 )
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 
-
 _NEAR_M = 3.0
 """The parabola is fitted no nearer than this: there the hills bend by less than a millimetre."""
 
@@ -62,8 +61,9 @@ def meet_ground(
 ) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"], Float[Array, "*rays"]]:
     """Return distance, label and facing of the ground that each ray from the sensor meets.
 
-    `rays` are of length 1, along the world's axes. Up to `reach_m` the ground is where it should be. Facing is the cosine between ray and normal. A ray that meets no
-    ground has distance inf. A ray into a kerb's face gets the label of what lies behind the kerb.
+    `rays` are of length 1, along the world's axes. Facing is the cosine between ray and normal. A ray that meets no
+    ground has distance inf; beyond `reach_m`, distances are rough. A ray into a kerb's face gets the label of what lies
+    behind the kerb, and the distance at which it would meet the road there.
     """
     slope = ground.gradient[0] * rays.x + ground.gradient[1] * rays.y
     curvature, closing = ground.curvature, slope - rays.z
@@ -91,7 +91,7 @@ def _height(relief: Relief, x: Array, y: Array) -> Array:
     return jax.lax.scan(add_wave, jnp.zeros_like(x), relief)[0]
 
 
-def _crossing(bend: Array, closing: Array, height: Array) -> Array:
+def _crossing(bend: Array, closing: Array, height: AnyArray) -> Array:
     """The first t > 0 at which the ray is in the ground: bend t^2 + closing t > height; inf where there is none.
 
     This form of the root holds for bend = 0 as well. `height` is positive.

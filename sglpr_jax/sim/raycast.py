@@ -18,7 +18,10 @@ from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors
 COLUMNS = 32
 """Azimuth steps in a sector."""
 SLOTS = 64, 48, 128
-"""The most boxes, cylinders and ellipsoids that a sector may meet; of more, the nearest are kept."""
+"""The most boxes, cylinders and ellipsoids that a sector may meet; of more, the nearest are kept.
+
+Towns need some 30, 30 and 110: nothing is left out there.
+"""
 UNROLL = 2
 """Shapes tried between two looks at what is left; divides every number of slots."""
 _MARGIN = 1e-3
@@ -113,7 +116,7 @@ def _listed(shapes: Shapes, sensor: Float[np.ndarray, "3"], overlap: np.ndarray,
     table = np.full((slots, overlap.shape[1]), -1)
     table[slot[which, sector], sector] = order[which]
 
-    def fill(values: np.ndarray, empty: float, dtype: type = np.float32) -> np.ndarray:
+    def fill(values: AnyArray, empty: float, dtype: type = np.float32) -> np.ndarray:
         return np.append(values, empty)[table].astype(dtype)
 
     (hx, hy, hz), origin = shapes.half.T, -inside / shapes.half
@@ -169,7 +172,7 @@ def nearest_hit(
 def _nearest_of_kind(
     rays: Vectors, candidates: Candidates, first: int, solid: Solid, best: Nearest, chance: Chance
 ) -> Nearest:
-    """`best` after the rays (lasers, sectors, columns) have been tried against one kind, whose slots begin at `first`."""
+    """`best` after rays (lasers, sectors, columns) have been tried against a kind whose slots begin at `first`."""
     slots = len(candidates.nearest)
     pore_factors = jnp.asarray(_PORE_FACTORS[first : first + slots])
 

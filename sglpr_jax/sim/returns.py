@@ -99,8 +99,8 @@ def echo_returns(
 ) -> Bool[Array, "lasers azimuths"]:
     """Whether a ray's echo is seen. `chance` is uniform in [0, 1).
 
-    An echo is as strong as e = reflectivity x facing / distance^2, and seen with probability 1 - exp(-(e / faintest)^2):
-    flat ground vanishes between 35 and 55 m, as in KITTI's scans, a wall much later.
+    An echo is as strong as e = reflectivity x facing / distance^2, and seen with probability
+    1 - exp(-(e / faintest_echo)^2): a flat road vanishes between 35 and 55 m, as in KITTI's scans, a wall much later.
     """
     echo = reflectivity(surface.label) * surface.facing / jnp.maximum(surface.distance, 1) ** 2
     seen = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))

@@ -109,10 +109,8 @@ def scan(
 
     Raises ValueError where the pose is not rigid, or a velocity is needed and missing.
     """
-    turn = cast_turn(key, view_of(world, world_from_lidar, sensor=sensor, time=time, velocity=velocity), sensor=sensor)
-    points, labels, returned = (np.asarray(part) for part in turn)
-    rows = np.flatnonzero(returned)
-    return points.reshape(-1, 4).take(rows, axis=0), labels.take(rows)
+    view = view_of(world, world_from_lidar, sensor=sensor, time=time, velocity=velocity)
+    return returned_points(cast_turn(key, view, sensor=sensor))
 
 
 def view_of(
@@ -140,18 +138,48 @@ def view_of(
 @functools.partial(jax.jit, static_argnames="sensor")
 def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
     """Cast the rays of one turn. A pure function of arrays: `jax.vmap` over keys and views gives many turns."""
-    key_chance, key_returns = jax.random.split(key)
-    rays = _rays(sensor)
-    surface = _meet(key_chance, rays, view, max_range_m=sensor.max_range_m)
+    key_surface, key_echoes = jax.random.split(key)
+    surface = first_surface(key_surface, view, sensor=sensor)
+    reach, returned = _echoes(key_echoes, surface, sensor)
     steps = sensor.azimuth_steps
-    rays, surface = jax.tree.map(lambda values: values[:, :steps], (rays, surface))
-    reach, returned = _echoes(key_returns, surface, sensor)
-    points = [axis * reach for axis in rays]
+    points = [axis[:, :steps] * reach for axis in _rays(sensor)]
     if sensor.motion_distortion:
         since_middle = TURN_S * (jnp.arange(steps, dtype=jnp.float32) / steps - 0.5)
         points = [axis - view.velocity[i] * since_middle[None, :] for i, axis in enumerate(points)]
     intensity = reflectivity(surface.label) * (0.5 + 0.5 * surface.facing)
     return Turn(jnp.stack([*points, intensity], axis=-1), surface.label, returned)
+
+
+def returned_points(turn: Turn) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
+    """Points and labels of what came back of one turn, on the host."""
+    points, labels, returned = (np.asarray(part) for part in turn)
+    rows = np.flatnonzero(returned)
+    return points.reshape(-1, 4).take(rows, axis=0), labels.take(rows)
+
+
+@functools.partial(jax.jit, static_argnames="sensor")
+def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
+    """What every ray (lasers, azimuths) meets first, ground or shape, within the sensor's range.
+
+    A few lasers are cast at a time: low ones see the ground in front of most shapes, so that they are soon through.
+    """
+    rays = _rays(sensor)
+    lasers, azimuths = rays.x.shape
+    key_depth, key_pores = jax.random.split(key)
+    chance = Chance(jax.random.exponential(key_depth, rays.x.shape), jax.random.bits(key_pores, rays.x.shape))
+
+    def of_block(block: tuple[Vectors, Chance]) -> Surface:
+        rays, chance = block
+        upright = Vectors(*(row[0] * rays.x + row[1] * rays.y + row[2] * rays.z for row in view.rotation))
+        distance, label, facing = meet_ground(upright, view.ground, reach_m=sensor.max_range_m)
+        distance = jnp.minimum(distance, sensor.max_range_m)
+        ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
+        hit, slot = nearest_hit(upright, view.candidates, distance, chance)
+        return nearer(ground, surface_of_shapes(upright, hit, slot, view.candidates))
+
+    in_blocks = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
+    surface = jax.lax.map(of_block, jax.tree.map(lambda values: values.reshape(in_blocks), (rays, chance)))
+    return jax.tree.map(lambda values: values.reshape(lasers, azimuths)[:, : sensor.azimuth_steps], surface)
 
 
 def _rays(sensor: Sensor) -> Vectors:
@@ -160,31 +188,12 @@ def _rays(sensor: Sensor) -> Vectors:
     azimuth = (np.arange(columns) * (2 * np.pi / sensor.azimuth_steps))[None, :]
     elevation = np.radians(sensor.elevations_deg)[:, None]
     level = np.cos(elevation)
-    axes = level * np.cos(azimuth), level * np.sin(azimuth), np.broadcast_to(np.sin(elevation), (len(elevation), columns))
+    axes = (
+        level * np.cos(azimuth),
+        level * np.sin(azimuth),
+        np.broadcast_to(np.sin(elevation), (len(elevation), columns)),
+    )
     return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in axes))
-
-
-def _meet(key: Array, rays: Vectors, view: View, *, max_range_m: float) -> Surface:
-    """The first surface on every ray, ground or shape.
-
-    A few lasers are cast at a time: low ones see the ground in front of most shapes, so that they are soon through.
-    """
-    lasers, azimuths = rays.x.shape
-    key_depth, key_pores = jax.random.split(key)
-    chance = Chance(jax.random.exponential(key_depth, rays.x.shape), jax.random.bits(key_pores, rays.x.shape))
-
-    def of_block(block: tuple[Vectors, Chance]) -> Surface:
-        rays, chance = block
-        upright = Vectors(*(row[0] * rays.x + row[1] * rays.y + row[2] * rays.z for row in view.rotation))
-        distance, label, facing = meet_ground(upright, view.ground, reach_m=max_range_m)
-        distance = jnp.minimum(distance, max_range_m)
-        ground = Surface(distance, label, facing, jnp.zeros(distance.shape, bool))
-        hit, slot = nearest_hit(upright, view.candidates, distance, chance)
-        return nearer(ground, surface_of_shapes(upright, hit, slot, view.candidates))
-
-    in_blocks = (-1, math.gcd(lasers, LASERS_AT_A_TIME), azimuths)
-    surface = jax.lax.map(of_block, jax.tree.map(lambda values: values.reshape(in_blocks), (rays, chance)))
-    return jax.tree.map(lambda values: values.reshape(lasers, azimuths), surface)
 
 
 def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:

@@ -26,7 +26,9 @@ def shapes(*rows: tuple[float, ...], **columns) -> Shapes:
         since=np.full(n, -np.inf),
         until=np.full(n, np.inf),
     )
-    return plain._replace(**{name: np.broadcast_to(value, getattr(plain, name).shape) for name, value in columns.items()})
+    return plain._replace(
+        **{name: np.broadcast_to(value, getattr(plain, name).shape) for name, value in columns.items()}
+    )
 
 
 NOTHING = shapes()

@@ -136,7 +136,9 @@ def test_nothing_beyond_the_limit_is_hit():
     scene, where = random_scene(1, COUNT), pose()
     rays = directions(where)
     near = np.full(rays.shape[:2], 15.0, np.float32)
-    distance, slot = map(np.asarray, jitted_nearest_hit(as_vectors(rays), candidates_of(scene, where), near, no_chance(rays)))
+    distance, slot = map(
+        np.asarray, jitted_nearest_hit(as_vectors(rays), candidates_of(scene, where), near, no_chance(rays))
+    )
     far_distance, _, _ = cast(scene, where)
     np.testing.assert_array_equal(distance, np.minimum(far_distance, 15))
     assert np.all((slot < 0) == (distance == 15)) and np.any(slot >= 0)
@@ -161,7 +163,9 @@ def test_rough_shapes_return_from_within_and_let_long_shots_through():
     scene, rays = Scene(hedge, NOTHING, NOTHING), directions(pose())
     plain, slot, _ = cast(scene, pose())
     deep, _, _ = cast(scene, pose(), no_chance(rays)._replace(depth=np.full(rays.shape[:2], 2.0, np.float32)))
-    through, through_slot, _ = cast(scene, pose(), no_chance(rays)._replace(depth=np.full(rays.shape[:2], 9.0, np.float32)))
+    through, through_slot, _ = cast(
+        scene, pose(), no_chance(rays)._replace(depth=np.full(rays.shape[:2], 9.0, np.float32))
+    )
     ahead = (slot >= 0) & (rays[..., 0] > 0.9)
     np.testing.assert_allclose((deep - plain)[ahead], 0.5, atol=1e-4)
     assert np.all(through_slot[ahead] == -1) and np.all(through[ahead] == REACH_M)

@@ -79,7 +79,10 @@ def test_windows_cover_the_share_of_glass_in_a_lattice():
 def flat_surface(distance: float, facing: float, label: int, window: bool = False) -> Surface:
     shape = (50, 400)
     return Surface(
-        *(jnp.full(shape, value, dtype) for value, dtype in ((distance, float), (label, int), (facing, float), (window, bool)))
+        *(
+            jnp.full(shape, value, dtype)
+            for value, dtype in ((distance, float), (label, int), (facing, float), (window, bool))
+        )
     )
 
 
