@@ -14,7 +14,9 @@ from sglpr_jax.train.config import LossConfig, OptimizerConfig, TrainConfig
 CONFIG = TrainConfig(
     model=model_preset("small"),
     sampling=TupleConfig(negatives=0),  # the batch's other places are the negatives
-    loss=LossConfig(margin=0.3, squared=True, temperature=0.1, segment_every=2, ignore_unlabelled=True),
+    loss=LossConfig(
+        margin=0.3, squared=True, temperature=0.1, segment_every=2, ignore_unlabelled=True, class_balance=0.5
+    ),
     optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=100, decay_rate=0.5, decay_steps=650, clip_norm=1.0),
     steps=3000,
     tuples=20,

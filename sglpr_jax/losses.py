@@ -50,13 +50,24 @@ def lazy_triplet(
 
 
 def cross_entropy(
-    logits: Float[Array, "*b h w k"], labels: Int[Array, "*b h w"], *, where: Bool[Array, "*b h w"] | None = None
+    logits: Float[Array, "*b h w k"],
+    labels: Int[Array, "*b h w"],
+    *,
+    where: Bool[Array, "*b h w"] | None = None,
+    balance: float = 0.0,
 ) -> Float[Array, "*b"]:
-    """Equation 6: cross-entropy of each image, averaged over its pixels (those of `where`; zero if there are none)."""
+    """Equation 6: cross-entropy of each image, averaged over its pixels (those of `where`; zero if there are none).
+
+    With `balance` a, a pixel of a class that n pixels of the image have weighs n^-a: 0 is the plain average, with 1 all
+    classes weigh the same.
+    """
     each = optax.softmax_cross_entropy_with_integer_labels(logits, labels)
-    if where is None:
-        return each.mean((-2, -1))
-    return jnp.where(where, each, 0.0).sum((-2, -1)) / jnp.maximum(where.sum((-2, -1)), 1)
+    weight = jnp.ones_like(each) if where is None else where.astype(each.dtype)
+    if balance:
+        classes = jax.nn.one_hot(labels, logits.shape[-1], dtype=each.dtype)
+        pixels = jnp.einsum("...hw,...hwk->...k", weight, classes)
+        weight = weight * jnp.einsum("...k,...hwk->...hw", jnp.maximum(pixels, 1) ** -balance, classes)
+    return (weight * each).sum((-2, -1)) / jnp.maximum(weight.sum((-2, -1)), 1e-6)
 
 
 def dice_sums(

@@ -51,6 +51,8 @@ class ModelConfig:
     mlp_ratio: int = 4
     drop_path: float = 0.2
     classes: int = 20
+    detail: int = 0
+    """Width of a layer that shows the segmentation head the image beside the features. 0: none, as in the paper."""
     head: HeadConfig = HeadConfig()
 
     def __post_init__(self):

@@ -18,6 +18,7 @@ _SMALL = ModelConfig(
     heads=(2, 4, 8),
     window=4,
     drop_path=0.0,
+    detail=32,
     head=HeadConfig(tap="tokens", channels=(64, 128, 256), kernels=(3, 3, 3), strides=(1, 1, 2)),
 )
 

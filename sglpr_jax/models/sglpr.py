@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.detail import Detail
 from sglpr_jax.models.layers import Linear, torch_uniform
 from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.polar import from_polar, to_polar
@@ -66,6 +67,8 @@ class SGLPR(nn.Module):
         if segment:
             pixels = features[::segment] if reads_pixels else expand(tokens[::segment])
             intermediates["pixels"] = pixels
+            if config.detail:
+                pixels = Detail(config.detail, config.polar is not None, name="detail")(pixels, image[::segment])
             to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
             logits = to_logits(pixels)
             if config.polar:  # after the linear layer, which commutes with the resampling and leaves fewer channels

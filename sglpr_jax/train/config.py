@@ -23,6 +23,8 @@ class LossConfig:
     dice_weight: float = 0.6
     segment_every: int = 1
     """Take the segmentation losses on every n-th image of a step only; all are segmented in the paper."""
+    class_balance: float = 0.0
+    """Exponent a of the cross-entropy's class weights n^-a, n being the class's pixels in the image; 0 in the paper."""
     ignore_unlabelled: bool = False
     """Leave cells of class 0 (empty or unlabelled) out of the segmentation losses, as the scores do."""
 

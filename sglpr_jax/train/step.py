@@ -92,7 +92,7 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
     outputs = forward(params, chunk.images, key=chunk.key, segment=config.segment_every)
     maps, labelled = (x[:: config.segment_every] for x in (chunk.maps, chunk.labelled))
     counted = labelled[:, None, None] & ((maps != UNLABELLED) | (not config.ignore_unlabelled))
-    cross_entropy = losses.cross_entropy(outputs.logits, maps, where=counted).sum()
+    cross_entropy = losses.cross_entropy(outputs.logits, maps, where=counted, balance=config.class_balance).sum()
     return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, maps, counted))
 
 
