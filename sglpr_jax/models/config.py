@@ -41,6 +41,9 @@ class ModelConfig:
     """`circle` blanks the cells outside the largest circle, so that a rotation moves nothing in or out of view."""
     blind_m: float = 0.0
     """Blanks the cells nearer than this to the sensor: they hold the vehicle's own body."""
+    range_channel: bool = False
+    """A second input channel with every cell's distance: how many points the bare ground returns depends on it, and
+    windowed attention knows only relative positions."""
     polar: tuple[int, int] | None = None
     """(rings, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
     patch: int = 4
@@ -58,10 +61,17 @@ class ModelConfig:
     def __post_init__(self):
         if len(self.depths) != len(self.heads):
             raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
+        if self.polar and self.field != "circle":
+            raise ValueError(f"a polar image covers a circle: expected field 'circle', found {self.field!r}")
         step = self.patch * 2 ** (len(self.depths) - 1)
         for size in self.image_size:
             if size % step:
                 raise ValueError(f"the backbone's image must be a multiple of {step} cells, found {self.image_size}")
+
+    @property
+    def channels(self) -> int:
+        """Channels of the image that the network sees."""
+        return 2 if self.range_channel else 1
 
     @property
     def image_size(self) -> tuple[int, int]:

@@ -20,7 +20,7 @@ class Detail(nn.Module):
     circular: bool
 
     @nn.compact
-    def __call__(self, pixels: Float[Array, "b h w c"], image: Float[Array, "b h w 1"]) -> Float[Array, "b h w d"]:
+    def __call__(self, pixels: Float[Array, "b h w c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w d"]:
         around = _LOCAL_CELLS // 2
         columns = "wrap" if self.circular else "constant"
         image = jnp.pad(image, ((0, 0), (around, around), (0, 0), (0, 0)))

@@ -11,6 +11,7 @@ _SMALL = ModelConfig(
     grid=Grid(resolution_m=0.4, height=128, width=128),
     field="circle",
     blind_m=2.6,
+    range_channel=True,
     polar=(64, 256),
     patch=8,
     embed_dim=64,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sglpr_jax.bev import Grid
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.detail import Detail
 from sglpr_jax.models.layers import Linear, torch_uniform
@@ -76,23 +77,34 @@ class SGLPR(nn.Module):
         return Outputs(descriptor, logits, intermediates | head)
 
 
-def prepare(bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w 1"]:
+def prepare(
+    bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfig
+) -> Float[Array, "b h w {config.channels}"]:
     """Point counts as network input: rescaled as `config.counts` says, blank where it does not see."""
     image = jnp.asarray(bev, jnp.float32)
     if config.counts == "log1p":
         image = jnp.log1p(image)
     elif config.counts == "clipped":
         image = jnp.minimum(image, CLIP_COUNT) / CLIP_COUNT
-    return jnp.where(field_of_view(config), image, 0.0)[..., None]
+    image = jnp.where(field_of_view(config), image, 0.0)[..., None]
+    if config.range_channel:
+        distance = cell_distance(config.grid) / cell_distance(config.grid).max()
+        image = jnp.concatenate([image, jnp.broadcast_to(distance[None, ..., None], image.shape)], axis=-1)
+    return image
 
 
 def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
     """Which cells the network sees: all, or those inside the largest circle, but not those of the vehicle itself."""
-    grid = config.grid
+    grid, distance = config.grid, cell_distance(config.grid)
+    seen = (distance < grid.resolution_m * min(grid.height, grid.width) / 2) | (config.field == "square")
+    return (seen & (distance >= config.blind_m))[None]
+
+
+def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
+    """How far the middle of each cell lies from the sensor, metres."""
     down, right = np.mgrid[: grid.height, : grid.width]
-    distance = np.hypot(down - (grid.height - 1) / 2, right - (grid.width - 1) / 2)
-    seen = (distance < min(grid.height, grid.width) / 2) | (config.field == "square")
-    return (seen & (distance * grid.resolution_m >= config.blind_m))[None]
+    cells = np.hypot(down - (grid.height - 1) / 2, right - (grid.width - 1) / 2)
+    return (grid.resolution_m * cells).astype(np.float32)
 
 
 @jax.jit
@@ -138,6 +150,6 @@ def forward(
 def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None) -> Params:
     """Fresh weights for a named preset, or for a `config` of your own."""
     config = model_preset(preset) if config is None else config
-    image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
+    image = jnp.zeros((1, config.grid.height, config.grid.width, config.channels))
     weights = jax.jit(SGLPR(config).init, static_argnames="segment")(key, image, segment=True)["params"]
     return Params(weights, config)
