@@ -1,7 +1,7 @@
 """Resampling between the Cartesian image and a polar one, in which a rotation about the sensor is a shift.
 
 The polar image has `rings` rows, the innermost first, and `sectors` columns, counter-clockwise from x. It covers the
-largest circle in the grid. Both directions are bilinear with fixed weights: each value is a weighted sum of four others.
+largest circle in the grid. Both directions are bilinear with fixed weights: a value is a weighted sum of four others.
 """
 
 from typing import NamedTuple
