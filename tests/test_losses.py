@@ -69,6 +69,18 @@ def test_cross_entropy_is_one_number_per_image(images):
     np.testing.assert_allclose(jax.vmap(losses.cross_entropy)(*images), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
+def test_a_balanced_cross_entropy_weighs_pixels_by_their_class(images, balance):
+    logits, labels = images
+    log_probability = np.asarray(jax.nn.log_softmax(logits), np.float64)
+    where = np.random.default_rng(0).random(labels.shape) < 0.7
+    for i, (own, pixel) in enumerate(zip(np.asarray(labels), where, strict=True)):
+        each = -np.take_along_axis(log_probability[i], own[..., None], -1)[..., 0][pixel]
+        weight = np.bincount(own[pixel], minlength=logits.shape[-1])[own[pixel]] ** -balance
+        found = losses.cross_entropy(logits, labels, where=jnp.asarray(where), balance=balance)[i]
+        np.testing.assert_allclose(found, (weight * each).sum() / weight.sum(), rtol=1e-5)
+
+
 def test_sums_of_chunks_give_the_dice_of_the_batch(images):
     logits, labels = images
     chunks = [losses.dice_sums(logits[i : i + 1], labels[i : i + 1]) for i in range(len(logits))]

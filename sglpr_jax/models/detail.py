@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.layers import Linear, gelu
 
-_LOCAL_CHANNELS = 16
-_LOCAL_CELLS = 5
+_LOCAL = ((5, 16), (3, 16))
+"""Cells and channels of the convolutions: together they see what lies within three cells."""
 
 
 class Detail(nn.Module):
@@ -21,10 +21,15 @@ class Detail(nn.Module):
 
     @nn.compact
     def __call__(self, pixels: Float[Array, "b h w c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w d"]:
-        around = _LOCAL_CELLS // 2
-        columns = "wrap" if self.circular else "constant"
-        image = jnp.pad(image, ((0, 0), (around, around), (0, 0), (0, 0)))
-        image = jnp.pad(image, ((0, 0), (0, 0), (around, around), (0, 0)), mode=columns)
-        local = nn.Conv(_LOCAL_CHANNELS, (_LOCAL_CELLS, _LOCAL_CELLS), padding="VALID", name="local")(image)
-        both = jnp.concatenate([pixels, nn.relu(local)], axis=-1)
+        for i, (cells, channels) in enumerate(_LOCAL):
+            convolution = nn.Conv(channels, (cells, cells), padding="VALID", name=f"local{i}")
+            image = nn.relu(convolution(self._pad(image, cells)))
+        both = jnp.concatenate([pixels, image], axis=-1)
         return gelu(Linear(self.width, name="mix")(both))
+
+    def _pad(self, image: Array, cells: int) -> Array:
+        """Columns go around where the image is polar."""
+        around = (cells // 2, cells // 2)
+        columns = "wrap" if self.circular else "constant"
+        image = jnp.pad(image, ((0, 0), around, (0, 0), (0, 0)))
+        return jnp.pad(image, ((0, 0), (0, 0), around, (0, 0)), mode=columns)

@@ -163,6 +163,17 @@ def test_the_vehicle_itself_is_not_seen():
     assert 40 < (~sees).sum() < 60
 
 
+def test_the_range_channel_tells_how_far_a_cell_is():
+    grid = Grid(resolution_m=0.5, height=32, width=48)
+    config, plain = (dataclasses.replace(CONFIG, grid=grid, range_channel=x) for x in (True, False))
+    x, y = (np.arange(48) - 23.5) * 0.5, (np.arange(32) - 15.5) * 0.5
+    expected = np.hypot(x, y[:, None]) / np.hypot(x[0], y[0])
+    prepared = prepare(jnp.ones((2, 32, 48)), config)
+    assert prepared.shape == (2, 32, 48, config.channels) == (2, 32, 48, 2)
+    np.testing.assert_allclose(prepared[1, ..., 1], expected, rtol=1e-6)
+    np.testing.assert_array_equal(prepared[..., :1], prepare(jnp.ones((2, 32, 48)), plain))
+
+
 def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(random_params, images):
     params = random_params(POLAR)
     outside = ~field_of_view(POLAR)[0]
