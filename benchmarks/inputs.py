@@ -21,12 +21,12 @@ def comparable_model(preset: str) -> ModelConfig:
     """The preset's model, less what is not the same arithmetic in both frameworks.
 
     A polar model is left without its resampling and circular borders: the image comes in the size of the polar one.
-    Stochastic depth, which is random, is off.
+    Nothing is out of view, for the labels of such cells are dropped. Stochastic depth, which is random, is off.
     """
     config = model_preset(preset)
     height, width = config.image_size
     grid = Grid(config.grid.resolution_m, height, width)
-    return dataclasses.replace(config, grid=grid, field="square", polar=None, drop_path=0.0)
+    return dataclasses.replace(config, grid=grid, field="square", blind_m=0.0, polar=None, drop_path=0.0)
 
 
 def random_params(config: ModelConfig) -> Params:

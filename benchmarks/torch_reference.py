@@ -81,11 +81,11 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """One token per patch of the image (b, h, w, 1)."""
+    """One token per patch of the image (b, h, w, c)."""
 
-    def __init__(self, channels: int, patch: int):
+    def __init__(self, inputs: int, channels: int, patch: int):
         super().__init__()
-        self.proj = nn.Conv2d(1, channels, patch, patch)
+        self.proj = nn.Conv2d(inputs, channels, patch, patch)
         self.norm = nn.LayerNorm(channels)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -193,6 +193,19 @@ class NetVlad(nn.Module):
         return y * self.gate(y).sigmoid()
 
 
+class Detail(nn.Module):
+    """Two convolutions on the image, mixed with the features of every pixel."""
+
+    def __init__(self, inputs: int, channels: int, width: int):
+        super().__init__()
+        self.local0, self.local1 = nn.Conv2d(inputs, 16, 5, padding=2), nn.Conv2d(16, 16, 3, padding=1)
+        self.mix = nn.Linear(channels + 16, width)
+
+    def forward(self, pixels: Tensor, image: Tensor) -> Tensor:
+        local = self.local1(self.local0(image.permute(0, 3, 1, 2)).relu()).relu().permute(0, 2, 3, 1)
+        return F.gelu(self.mix(torch.cat([pixels, local], dim=-1)))
+
+
 class SGLPR(nn.Module):
     """Swin-Unet with the place head and the segmentation head."""
 
@@ -201,7 +214,7 @@ class SGLPR(nn.Module):
         if config.polar:
             raise ValueError("the PyTorch model has no polar resampling")
         self.tap, levels, channels = config.head.tap, len(config.depths), config.embed_dim
-        self.patch_embed = PatchEmbed(channels, config.patch)
+        self.patch_embed = PatchEmbed(config.channels, channels, config.patch)
         self.layers = nn.ModuleList(Stage(level, config) for level in range(levels))
         self.layers_up = nn.ModuleList([PatchExpand(channels * 2 ** (levels - 1), 2, channels * 2 ** (levels - 2))])
         self.concat_back_dim = nn.ModuleList([nn.Identity()])
@@ -215,14 +228,17 @@ class SGLPR(nn.Module):
                 self.layers_up[-1].upsample = PatchExpand(width, 2, width // 2)
         self.norm, self.norm_up = nn.LayerNorm(channels * 2 ** (levels - 1)), nn.LayerNorm(channels)
         self.up = PatchExpand(channels, config.patch, channels)
-        self.output = nn.Linear(channels, config.classes, bias=False)
+        self.detail = Detail(config.channels, channels, config.detail) if config.detail else None
+        self.output = nn.Linear(config.detail or channels, config.classes, bias=False)
         self.place_head = Place(channels, config.head)
 
     def forward(self, image: Tensor, *, segment: bool = False) -> tuple[Tensor, Tensor | None]:
-        """Descriptors (b, d) and, if asked for, logits (b, h, w, classes) of prepared images (b, h, w, 1)."""
+        """Descriptors (b, d) and, if asked for, logits (b, h, w, classes) of prepared images (b, h, w, c)."""
         tokens = self._backbone(image)
         pixels = self.up(tokens) if segment or self.tap == "pixels" else None
         descriptor = self.place_head(tokens if self.tap == "tokens" else pixels)
+        if segment and self.detail is not None:
+            pixels = self.detail(pixels, image)
         return descriptor, self.output(pixels) if segment else None
 
     def _backbone(self, image: Tensor) -> Tensor:
