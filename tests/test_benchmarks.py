@@ -1,4 +1,4 @@
-"""The benchmarks: rasterising runs for real; those against PyTorch say so where it is not installed."""
+"""The benchmarks run for real; those against PyTorch say so where it is not installed."""
 
 import importlib
 import subprocess
@@ -11,15 +11,28 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
+def printed(benchmark: str, *options: str) -> str:
+    command = (sys.executable, BENCHMARKS / benchmark, *options)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def test_rasterize_agrees_with_numpy_and_prints_ratios():
     options = ("--points", "2000", "--size", "32", "--repeats", "2", "--calls", "1", "--threads", "1")
-    command = (sys.executable, BENCHMARKS / "rasterize.py", *options)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert "rasterize: largest difference 0" in done.stdout
-    assert "rasterize_labels: largest difference 0" in done.stdout
-    assert "JAX / numpy" in done.stdout
-    assert "--points 2000" in done.stdout
+    output = printed("rasterize.py", *options)
+    assert "rasterize: largest difference 0" in output
+    assert "rasterize_labels: largest difference 0" in output
+    assert "JAX / numpy" in output
+    assert "--points 2000" in output
+
+
+def test_simulate_prints_its_rate_and_where_the_time_goes():
+    output = printed("simulate.py", "--sensor", "vlp16", "--azimuth-steps", "90", "--scans", "2", "--repeats", "1")
+    for words in ("cull", "cast", "returns", "copy", "2 thread(s):", "scans per second", "Shapes in range", "vlp16"):
+        assert words in output
+    shares = [int(line.split("%")[0].split()[-1]) for line in output.splitlines() if "%" in line]
+    assert len(shares) == 4 and 97 <= sum(shares) <= 103
 
 
 @pytest.mark.parametrize("name", ["describe", "train_step"])
