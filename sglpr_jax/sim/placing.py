@@ -31,6 +31,14 @@ class Anchors(NamedTuple):
     until: np.ndarray  # (n,)
 
 
+_NO_ROWS = Shapes(
+    **dict.fromkeys(("centre", "half"), np.zeros((0, 3))),
+    **dict.fromkeys(("yaw", "roughness", "porosity", "glass", "since", "until"), np.zeros(0)),
+    label=np.zeros(0, np.int32),
+    velocity=np.zeros((0, 2)),
+)
+
+
 def place(parts: list[Part], anchors: Anchors, ground: Ground) -> Shapes:
     """The parts in the world, of all kinds in one table; every thing stands on the ground at its anchor."""
     x, y, bottom, yaw, size = (
@@ -64,7 +72,8 @@ def select(shapes: Shapes, keep: np.ndarray) -> Shapes:
 
 
 def join(*tables: Shapes) -> Shapes:
-    return Shapes(*(np.concatenate(leaves) for leaves in zip(*tables, strict=True)))
+    """All rows of the tables, of which there may be none."""
+    return Shapes(*(np.concatenate(leaves) for leaves in zip(_NO_ROWS, *tables, strict=True)))
 
 
 def to_scene(shapes: Shapes, parts: list[Part]) -> Scene:

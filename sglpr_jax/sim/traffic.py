@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.sim import vehicles
 from sglpr_jax.sim.ground import Ground
-from sglpr_jax.sim.placing import CLEARANCE_M, Anchors, footprint_distance, place
+from sglpr_jax.sim.placing import CLEARANCE_M, Anchors, footprint_distance, join, place
 from sglpr_jax.sim.shapes import Shapes
 from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
 from sglpr_jax.sim.things import Part, Range, Thing
@@ -97,8 +97,7 @@ def traffic(rng: np.random.Generator, network: Network, path: Path, ground: Grou
     pieces = [piece for flow in FLOWS for piece in _movers(rng, flow, lines, path)]
     rows = [_rows(piece, path, ground) for piece in pieces]
     tables = [shapes for shapes, _ in rows]
-    shapes = Shapes(*(np.concatenate(leaves) for leaves in zip(*tables, strict=True)))
-    return shapes, [part for _, parts in rows for part in parts]
+    return join(*tables), [part for _, parts in rows for part in parts]
 
 
 def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Pieces]:

@@ -140,3 +140,11 @@ def test_rows_are_what_the_sensor_expects():
         assert shapes.label.dtype == np.int32 and np.all(shapes.since < shapes.until)
         for share in (shapes.porosity, shapes.glass):
             assert share.min() >= 0 and share.max() <= 1
+
+
+@pytest.mark.parametrize(("length_m", "shapes_at_least"), [(2.5, 0), (12.0, 20)])
+def test_a_few_metres_are_a_drive_even_if_nobody_comes_by(length_m, shapes_at_least):
+    trajectory = np.linspace([0, 0], [length_m, 0], 12)
+    scene = build_world(0, trajectory, np.arange(12) * 0.1).scene
+    assert sum(len(shapes.label) for shapes in scene) >= shapes_at_least
+    assert all(shapes.label.dtype == np.int32 for shapes in scene)
