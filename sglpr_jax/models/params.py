@@ -16,7 +16,7 @@ import safetensors.numpy
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.sglpr import SGLPR, Params
+from sglpr_jax.models.sglpr import Params, init
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -101,9 +101,8 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 def _match(flat: dict[str, np.ndarray], config: ModelConfig, *, source: Path) -> Any:
     """The tree of weights, after checking it against the shapes that the configuration asks for."""
-    image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, 1), np.float32)
-    init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=True), jax.random.key(0), image)
-    expected = {name: leaf.shape for name, leaf in _flatten(init["params"]).items()}
+    fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
+    expected = {name: leaf.shape for name, leaf in _flatten(fresh.weights).items()}
     found = {name: leaf.shape for name, leaf in flat.items()}
     if expected != found:
         name = sorted(set(expected.items()) ^ set(found.items()))[0][0]

@@ -38,6 +38,12 @@ def test_every_preset_s_configuration_survives_json(preset, tmp_path):
     assert hash(config_from_dict(values, source="here")) == hash(config)
 
 
+@pytest.mark.parametrize("changes", [{"range_channel": True, "detail": 8}, {"detail": 4}])
+def test_weights_of_any_configuration_come_back(random_params, changes, tmp_path):
+    params = random_params(dataclasses.replace(model_preset("tiny"), **changes))
+    chex.assert_trees_all_equal(load(save(params, tmp_path / "weights")), jax.tree.map(np.asarray, params))
+
+
 def test_arrays_that_are_not_contiguous_come_back_as_they_are(params, tmp_path):
     """Imported PyTorch weights are transposed views."""
     kernel = params.weights["segmentation_head"]["kernel"]
