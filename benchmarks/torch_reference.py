@@ -194,16 +194,16 @@ class NetVlad(nn.Module):
 
 
 class Detail(nn.Module):
-    """Two convolutions on the image, mixed with the features of every pixel."""
+    """Two convolutions on the image, mixed with the features of every cell."""
 
     def __init__(self, inputs: int, channels: int, width: int):
         super().__init__()
         self.local0, self.local1 = nn.Conv2d(inputs, 16, 5, padding=2), nn.Conv2d(16, 16, 3, padding=1)
         self.mix = nn.Linear(channels + 16, width)
 
-    def forward(self, pixels: Tensor, image: Tensor) -> Tensor:
+    def forward(self, features: Tensor, image: Tensor) -> Tensor:
         local = self.local1(self.local0(image.permute(0, 3, 1, 2)).relu()).relu().permute(0, 2, 3, 1)
-        return F.gelu(self.mix(torch.cat([pixels, local], dim=-1)))
+        return F.gelu(self.mix(torch.cat([features, local], dim=-1)))
 
 
 class SGLPR(nn.Module):
@@ -228,7 +228,8 @@ class SGLPR(nn.Module):
                 self.layers_up[-1].upsample = PatchExpand(width, 2, width // 2)
         self.norm, self.norm_up = nn.LayerNorm(channels * 2 ** (levels - 1)), nn.LayerNorm(channels)
         self.up = PatchExpand(channels, config.patch, channels)
-        self.detail = Detail(config.channels, channels, config.detail) if config.detail else None
+        self.detail = Detail(config.channels, config.detail, config.detail) if config.detail else None
+        self.narrow = nn.Linear(channels, config.detail) if config.detail else None
         self.output = nn.Linear(config.detail or channels, config.classes, bias=False)
         self.place_head = Place(channels, config.head)
 
@@ -238,7 +239,7 @@ class SGLPR(nn.Module):
         pixels = self.up(tokens) if segment or self.tap == "pixels" else None
         descriptor = self.place_head(tokens if self.tap == "tokens" else pixels)
         if segment and self.detail is not None:
-            pixels = self.detail(pixels, image)
+            pixels = self.detail(self.narrow(pixels), image)
         return descriptor, self.output(pixels) if segment else None
 
     def _backbone(self, image: Tensor) -> Tensor:

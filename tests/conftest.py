@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.sglpr import SGLPR, Params
+from sglpr_jax.models.sglpr import Params, init
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -29,14 +29,13 @@ def random_params():
 
     def make(config: ModelConfig) -> Params:
         rng = np.random.default_rng(0)
-        image = jnp.zeros((1, config.grid.height, config.grid.width, 1))
-        shapes = jax.eval_shape(lambda key: SGLPR(config).init(key, image, segment=True), jax.random.key(0))
+        shapes = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
 
         def draw(path, leaf) -> jax.Array:
             inputs = np.prod(leaf.shape[:-1])
             values = rng.normal(scale=inputs**-0.5 if inputs > 1 else 0.1, size=leaf.shape)
             return jnp.asarray(values + (path[-1].key == "scale"), leaf.dtype)
 
-        return Params(jax.tree_util.tree_map_with_path(draw, shapes["params"]), config)
+        return Params(jax.tree_util.tree_map_with_path(draw, shapes.weights), config)
 
     return make

@@ -46,9 +46,9 @@ class SGLPR(nn.Module):
     @nn.compact
     def __call__(self, image: Float[Array, "b h w c"], *, segment: int = 0, train: bool = False) -> Outputs:
         """`segment` n: semantic logits of every n-th image (True: of all); 0: that head does not exist."""
-        config = self.config
+        config, seen = self.config, image
         if config.polar:
-            image = to_polar(image, config.grid, *config.polar)
+            seen = to_polar(image, config.grid, *config.polar)
         tokens, intermediates = SwinUnet(
             embed_dim=config.embed_dim,
             depths=config.depths,
@@ -59,7 +59,7 @@ class SGLPR(nn.Module):
             drop_path=config.drop_path,
             circular=config.polar is not None,
             name="backbone",
-        )(image, train=train)
+        )(seen, train=train)
         expand = FinalPatchExpand(config.patch, name="expand")
         reads_pixels = config.head.tap == "pixels"
         features = expand(tokens) if reads_pixels else tokens
@@ -68,13 +68,16 @@ class SGLPR(nn.Module):
         if segment:
             pixels = features[::segment] if reads_pixels else expand(tokens[::segment])
             intermediates["pixels"] = pixels
-            if config.detail:
-                pixels = Detail(config.detail, config.polar is not None, name="detail")(pixels, image[::segment])
-            to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
-            logits = to_logits(pixels)
-            if config.polar:  # after the linear layer, which commutes with the resampling and leaves fewer channels
-                logits = from_polar(logits, config.grid)
+            logits = self._logits(pixels, image[::segment])
         return Outputs(descriptor, logits, intermediates | head)
+
+    def _logits(self, pixels: Float[Array, "b p q c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w k"]:
+        """The segmentation head. Few channels cross from the polar image to the grid: a linear layer comes first."""
+        config = self.config
+        to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
+        crossing = Linear(config.detail, name="narrow")(pixels) if config.detail else to_logits(pixels)
+        on_grid = from_polar(crossing, config.grid) if config.polar else crossing
+        return to_logits(Detail(config.detail, name="detail")(on_grid, image)) if config.detail else on_grid
 
 
 def prepare(
