@@ -101,11 +101,25 @@ def test_describe_computes_nothing_of_the_segmentation_head(params, images):
     assert operations(compiled(forward, params, images)) >= without_head + head
 
 
-def test_a_head_that_taps_tokens_spares_describe_the_expansion_too(random_params):
-    params, image = random_params(POLAR), jnp.zeros((1, SIZE, SIZE))
+@pytest.mark.parametrize(("detail", "spared"), [(0, set()), (4, {"narrow", "detail"})])
+def test_a_head_that_taps_tokens_spares_describe_the_expansion_too(random_params, detail, spared):
+    config = dataclasses.replace(POLAR, detail=detail)
+    params, image = random_params(config), jnp.zeros((1, SIZE, SIZE))
     needed = {name: part for name, part in params.weights.items() if name in ("backbone", "place_head")}
-    assert params.weights.keys() - needed.keys() == {"segmentation_head", "expand"}
-    assert operations(compiled(describe, params, image)) == operations(compiled(describe, Params(needed, POLAR), image))
+    assert params.weights.keys() - needed.keys() == {"segmentation_head", "expand"} | spared
+    assert operations(compiled(describe, params, image)) == operations(compiled(describe, Params(needed, config), image))
+
+
+def test_with_detail_the_logits_of_a_cell_depend_on_its_own_count(random_params, images):
+    """More than those of other cells; what lies beyond the circle still counts for nothing."""
+    corner = images.at[:, 2, 3].add(50)
+    config = dataclasses.replace(POLAR, detail=4)
+    params, segments = random_params(config), jax.jit(segment, compiler_options=FAST_COMPILE)
+    assert segments(params, images).shape == (len(images), SIZE, SIZE, 20)
+    np.testing.assert_array_equal(segments(params, corner), segments(params, images))
+    inside = images.at[:, 16, 20].add(50)
+    changed = np.abs(segments(params, inside) - segments(params, images)).max((0, 3))
+    assert changed[16, 20] > 3 * np.median(changed)
 
 
 def test_forward_gives_descriptors_logits_and_every_named_map(params, images, descriptors):
