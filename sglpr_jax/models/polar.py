@@ -88,5 +88,5 @@ def _transposed(taps: Taps, pixels: int) -> Taps:
 
 def _read(flat: Float[Array, "b p c"], taps: Taps) -> Float[Array, "b n c"]:
     """The weighted sums that the taps describe."""
-    read = [flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True)]
-    return sum(read[1:], start=read[0])
+    first, *others = (flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True))
+    return sum(others, start=first)

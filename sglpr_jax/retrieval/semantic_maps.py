@@ -50,4 +50,4 @@ def _maps(
     known = segment(params, counts)[..., UNLABELLED + 1 :]  # a cell with points in it is not "unlabelled"
     predicted = known.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
     truth = rasterize_labels(points, classes, grid=grid, count=count)
-    return counts, *(jnp.where(seen, classes, UNLABELLED) for classes in (predicted, truth))
+    return counts, jnp.where(seen, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)
