@@ -4,9 +4,11 @@ The polar image has `rings` rows, the innermost first, and `sectors` columns, co
 largest circle in the grid. Both directions are bilinear with fixed weights: a value is a weighted sum of four others.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -88,5 +90,5 @@ def _transposed(taps: Taps, pixels: int) -> Taps:
 
 def _read(flat: Float[Array, "b p c"], taps: Taps) -> Float[Array, "b n c"]:
     """The weighted sums that the taps describe."""
-    first, *others = (flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True))
-    return sum(others, start=first)
+    read = (flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True))
+    return functools.reduce(jnp.add, read)
