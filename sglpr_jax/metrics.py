@@ -23,6 +23,11 @@ class PrecisionRecallCurve:
         return _ratio(2 * self.precision * self.recall, self.precision + self.recall)
 
     @property
+    def average_precision(self) -> float:
+        """The area under the curve as steps: each precision times how much recall it adds."""
+        return float(np.sum(self.precision * -np.diff(self.recall, append=0.0)))
+
+    @property
     def best(self) -> int:
         """Where F1 is highest; of equal ones the highest threshold."""
         return len(self.thresholds) - 1 - int(np.argmax(self.f1[::-1]))
@@ -43,15 +48,17 @@ def decision_curve(
     """Return the curve of n >= 1 decisions to accept or reject; equal scores are accepted together.
 
     An accepted item is a true positive, a false positive or, flagged as neither, counts for nothing; a rejected one is
-    a false negative or a true negative. Where no item could be missed, recall is 1, as scikit-learn has it; elsewhere
-    0 / 0 is 0. Raises ValueError where a score is not finite.
+    a false negative or a true negative. A score of -inf is rejected at every threshold. Where no item could be missed,
+    recall is 1, as scikit-learn has it; elsewhere 0 / 0 is 0. Raises ValueError where another score is not finite, or
+    none is.
     """
-    if not np.all(np.isfinite(scores)):
+    offered = ~np.isneginf(scores)
+    if not np.all(np.isfinite(scores[offered])) or not offered.any():
         raise ValueError(f"expected finite scores, found {np.sum(~np.isfinite(scores))} of {len(scores)} that are not")
-    thresholds, group = np.unique(scores, return_inverse=True)
+    thresholds, group = np.unique(scores[offered], return_inverse=True)
 
     def count(flags):
-        return np.bincount(group, weights=flags, minlength=len(thresholds))
+        return np.bincount(group, weights=flags[offered], minlength=len(thresholds))
 
     def accepted(flags):
         return np.cumsum(count(flags)[::-1])[::-1]
