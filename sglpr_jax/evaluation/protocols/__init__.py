@@ -6,7 +6,7 @@ descriptor file or a top-k list; `scored_pairs_f1max` takes scored pairs.
 """
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from sglpr_jax.evaluation.protocols.bevplace import (
@@ -52,13 +52,12 @@ CROSS_SESSION_PROTOCOLS: dict[str, Callable[..., Result]] = {
 """Every protocol of two descriptor files, one session each, by the name a command line takes."""
 
 
-def protocol_named(name: str) -> Callable[..., Result]:
+def protocol_named(name: str, protocols: Mapping[str, Callable[..., Result]] = PROTOCOLS) -> Callable[..., Result]:
     """Return a protocol by its name; ValueError with the nearest name where there is none."""
-    known = PROTOCOLS | CROSS_SESSION_PROTOCOLS
-    if name not in known:
-        nearest = difflib.get_close_matches(name, known, n=1, cutoff=0)
-        raise ValueError(f"no protocol {name!r}; did you mean {nearest[0]!r}? There are {', '.join(known)}")
-    return known[name]
+    if name not in protocols:
+        nearest = difflib.get_close_matches(name, protocols, n=1, cutoff=0)
+        raise ValueError(f"no protocol {name!r}; did you mean {nearest[0]!r}? There are {', '.join(protocols)}")
+    return protocols[name]
 
 
 __all__ = [

@@ -44,8 +44,9 @@ def f1_max_interval(
         return 0.0, 0.0
     edges = edges[np.unique(np.linspace(0, len(edges) - 1, THRESHOLDS).round().astype(np.int64))]
     bins = np.searchsorted(edges, scores, side="right")  # accepted at the edges [:bins]
-    _, row = np.unique(query, return_inverse=True)
-    shape = (int(row.max()) + 1, len(edges) + 1)
+    present = np.bincount(query) > 0
+    row = (np.cumsum(present) - 1)[query]
+    shape = (int(present.sum()), len(edges) + 1)
 
     def accepted(flags: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "queries edges"]:
         cells = np.bincount(row[flags] * shape[1] + bins[flags], minlength=shape[0] * shape[1]).reshape(shape)

@@ -9,7 +9,9 @@ from sglpr_jax.evaluation.protocols.source import Source, TopK
 from sglpr_jax.poses import distances
 
 BLOCK = 512
-"""Queries compared with the whole database at a time."""
+"""Queries whose descriptors are compared with the whole database at a time."""
+POSITION_BLOCK = 32
+"""Queries whose positions are: so few that the distances stay in the cache."""
 
 Near = Callable[[np.ndarray], np.ndarray]
 """From distances in metres to whether they are those of one place, such as `lambda apart: apart < 5`."""
@@ -53,10 +55,11 @@ def has_near(
 ) -> Bool[np.ndarray, " q"]:
     """Return whether each query has a near position among the first `ends` of the database."""
     found = np.zeros(len(queries), dtype=bool)
-    frames = np.arange(len(database))
-    for start in range(0, len(queries), BLOCK):
-        rows = slice(start, start + BLOCK)
-        found[rows] = np.any(near(distances(queries[rows], database)) & (frames < ends[rows, None]), axis=1)
+    for start in range(0, len(queries), POSITION_BLOCK):
+        rows = slice(start, start + POSITION_BLOCK)
+        last = ends[rows].max()
+        close = near(distances(queries[rows], database[:last]))
+        found[rows] = np.any(close & (np.arange(last) < ends[rows, None]), axis=1)
     return found
 
 

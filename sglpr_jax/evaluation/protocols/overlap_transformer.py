@@ -22,7 +22,7 @@ NUMBERS = (1, 5, 10, 20)
 
 
 def overlap_transformer_f1max(
-    source: Source, overlapping: Int[np.ndarray, "pairs 2"] | None = None, *, seed: int = 0
+    source: Source, overlapping: Int[np.ndarray, "listed 2"] | None = None, *, seed: int = 0
 ) -> Result:
     """Score top-1 retrieval and Recall@N as OverlapTransformer does: an overlap above 0.3, a gap of 100 frames.
 
@@ -59,7 +59,7 @@ def overlap_transformer_f1max(
     return score_answers(source, result, answers, seed=seed)
 
 
-def _overlaps(source: Source, overlapping: Int[np.ndarray, "pairs 2"] | None) -> tuple[Int[np.ndarray, " pairs"], str]:
+def _overlaps(source: Source, overlapping: Int[np.ndarray, "listed 2"] | None) -> tuple[Int[np.ndarray, " pairs"], str]:
     """Return the pairs (i, j) of a query and a right answer in its database, as i * n + j, and in words."""
     if overlapping is None:
         near = frame_pairs(positions_of(source, 2), lambda apart, gap: (apart < STAND_IN_M) & (gap > GAP))

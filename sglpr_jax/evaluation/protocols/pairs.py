@@ -12,10 +12,10 @@ from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.poses import distances
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
-BLOCK = 512
+BLOCK = 32
 """Frames compared with all others at a time."""
-PAIR_BLOCK = 1 << 14
-"""Pairs compared at a time."""
+PAIR_BLOCK = 1 << 10
+"""Pairs compared at a time: so few that their descriptors stay in the cache."""
 
 
 def score_pairs(
@@ -34,7 +34,8 @@ def score_pairs(
     result = replace(result, counts=counts)
     if not positive.any():
         return result
-    curve = metrics.classification_curve(scores, positive)
+    # Between two positive pairs only precision falls: a curve of the millions of negative scores would say no more.
+    curve = metrics.classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
     interval = f1_max_interval(
         scores,
         true_if_accepted=positive,
@@ -65,7 +66,7 @@ def frame_pairs(
 def pair_distances(
     descriptors: Float[np.ndarray, "n d"], pairs: Int[np.ndarray, "2 pairs"]
 ) -> Float[np.ndarray, " pairs"]:
-    """Return the distance between the descriptors of each pair, a block at a time: the gathered rows would be large."""
+    """Return the distance between the descriptors of each pair."""
     apart = np.empty(pairs.shape[1])
     for start in range(0, pairs.shape[1], PAIR_BLOCK):
         i, j = pairs[:, start : start + PAIR_BLOCK]

@@ -59,7 +59,7 @@ def _retrieve(
     return first_hits(here, there, nearest, _near), has_near(here, there, ends, _near), one_percent
 
 
-def _score(result: Result, answered: Sequence[tuple[Int[np.ndarray, " q"], int]], seed: int) -> Result:
+def _score(result: Result, answered: Sequence[tuple[Int[np.ndarray, " _"], int]], seed: int) -> Result:
     """Complete `result` with the means over the pairs of runs."""
     rng = np.random.default_rng(seed)
     recalls = [recall_at(ranks, range(1, NEIGHBOURS + 1)) for ranks, _ in answered]

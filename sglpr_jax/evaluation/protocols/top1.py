@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8
+from jaxtyping import Bool, Int, Int8
 
 from sglpr_jax import metrics
 from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
@@ -14,16 +14,18 @@ from sglpr_jax.evaluation.protocols.source import Source, TopK, positions_of
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """One answer to each query, and what it is by the protocol's rule."""
+    """One answer to each of q queries, and what it is by the protocol's rule."""
 
-    queries: Int[np.ndarray, " q"]
-    distance: Float[np.ndarray, " q"]
-    """Of the descriptors; infinite where there is no answer."""
-    right: Bool[np.ndarray, " q"]
-    wrong: Bool[np.ndarray, " q"]
-    """An answer may be neither: then it counts for nothing once accepted."""
-    revisited: Bool[np.ndarray, " q"]
-    """Whether there was a right answer to find: then to reject is to miss."""
+    queries: np.ndarray
+    """(q,) int64."""
+    distance: np.ndarray
+    """(q,) float64: of the descriptors; infinite where there is no answer."""
+    right: np.ndarray
+    """(q,) bool."""
+    wrong: np.ndarray
+    """(q,) bool. An answer may be neither: then it counts for nothing once accepted."""
+    revisited: np.ndarray
+    """(q,) bool: whether there was a right answer to find: then to reject is to miss."""
 
 
 def score_top1_by_distance(
