@@ -42,6 +42,9 @@ PROTOCOLS: dict[str, Callable[..., Result]] = {
 }
 """Every protocol of one descriptor file, by the name a command line takes."""
 
+TOP_K_PROTOCOLS = {name: protocol for name, protocol in PROTOCOLS.items() if "pairs" not in name}
+"""Those that score a top-k list too: all but the ones that compare pairs of frames."""
+
 HEADLINES = ("top1-f1max", "pairs-f1max", "bevplace-recall-at-1")
 """The protocols to print where none are asked for."""
 
@@ -64,6 +67,7 @@ __all__ = [
     "CROSS_SESSION_PROTOCOLS",
     "HEADLINES",
     "PROTOCOLS",
+    "TOP_K_PROTOCOLS",
     "Decision",
     "Result",
     "ScoredPairs",

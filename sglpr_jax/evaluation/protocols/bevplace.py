@@ -8,7 +8,7 @@ import numpy as np
 from sglpr_jax.evaluation.protocols.nearest import first_hits, has_near, nearest_descriptors, nearest_frames
 from sglpr_jax.evaluation.protocols.recall import recall_decisions, score_recall
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.evaluation.protocols.source import Source, check_same_length, positions_of
+from sglpr_jax.evaluation.protocols.source import Source, check_same_length, pose_sources, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 POSITIVE_M = 5.0
@@ -66,7 +66,7 @@ def bevplace_nclt_recall(database: DescriptorFile, queries: DescriptorFile, *, s
         name="NCLT Recall@1",
         rule=f"{POSITIVE_M:g} m, map {database.sequence}, queries {queries.sequence}",
         dimensions=2,
-        pose_source=f"{database.pose_source}, {queries.pose_source}",
+        pose_source=pose_sources(database, queries),
         published_on="NCLT's ground truth",
     )
     return score_recall(result, first_hits(here, there, nearest, _near), has_near(here, there, ends, _near), seed=seed)

@@ -10,7 +10,7 @@ from sglpr_jax.evaluation.protocols.bootstrap import interval, resampled_means
 from sglpr_jax.evaluation.protocols.nearest import first_hits, has_near, nearest_descriptors
 from sglpr_jax.evaluation.protocols.recall import recall_at
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.evaluation.protocols.source import check_same_length, positions_of
+from sglpr_jax.evaluation.protocols.source import check_same_length, pose_sources, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 POSITIVE_M = 25.0
@@ -35,7 +35,7 @@ def pointnetvlad_recall(*runs: DescriptorFile, seed: int = 0) -> Result:
         name="PointNetVLAD Recall@1 %",
         rule=f"{POSITIVE_M:g} m, every ordered pair of {len(runs)} runs",
         dimensions=2,
-        pose_source=", ".join(dict.fromkeys(str(run.pose_source) for run in runs)),
+        pose_source=pose_sources(*runs),
         published_on="Oxford RobotCar's positions",
         counts={
             "run pairs": sum(bool(revisited.any()) for _, revisited, _ in asked),

@@ -89,3 +89,8 @@ def check_same_length(database: DescriptorFile, queries: DescriptorFile) -> None
         raise ValueError(
             f"expected descriptors of {there} numbers in {queries.sequence} as in {database.sequence}, found {here}"
         )
+
+
+def pose_sources(*files: DescriptorFile) -> str | None:
+    """Return every pose source of the files once, as one text; None where none is named."""
+    return ", ".join(dict.fromkeys(file.pose_source for file in files if file.pose_source)) or None

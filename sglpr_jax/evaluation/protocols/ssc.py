@@ -56,10 +56,10 @@ def ssc_recall(source: Source, *, seed: int = 0) -> Result:
     """Score Recall@1 to 25 as SSC and RINet do: 5 m in x and y, a gap of 50 frames.
 
     The database of frame i is frames 0 to i - 51. A frame is a query if its database has a frame no farther than 5 m;
-    it is found at N if such a frame is among the first N. Of a top-k list every row is a query: SSC's own lists (ids of
-    804, 315, 503, 270, 122 and 345 queries for 00 02 05 06 07 08) hold rows that have nothing to find on these poses,
-    and its numbers count them. Published on SemanticKITTI's poses (lilin-hitcrt/SSC, script/recall.py). The interval of
-    Recall@1 resamples queries.
+    it is found at N if such a frame is among the first N. Of a top-k list every row is a query and counts: a list says
+    itself what was asked. So SSC's own lists give the numbers published, though on these poses one or two rows of some
+    sequences have nothing to find. Published on SemanticKITTI's poses (lilin-hitcrt/SSC, script/recall.py). The
+    interval of Recall@1 resamples queries.
     """
     positions = positions_of(source, 2)
     ends = older_by(len(source), GAP + 1)

@@ -37,14 +37,11 @@ def score_top1_by_distance(
     """
     positions = positions_of(source, result.dimensions or 3)
     queries = np.flatnonzero(ends)
+    nearest, distance = nearest_frames(source, queries, ends[queries])
+    apart = np.linalg.norm(positions[queries] - positions[nearest[:, 0]], axis=1)
+    answered = nearest[:, 0] >= 0
     revisited = has_near(positions[queries], positions, ends[queries], right)
-    nothing = np.zeros(len(queries), dtype=bool)
-    answers = Answers(queries, np.full(len(queries), np.inf), nothing, nothing, revisited)
-    if revisited.any():
-        nearest, distance = nearest_frames(source, queries, ends[queries])
-        apart = np.linalg.norm(positions[queries] - positions[nearest[:, 0]], axis=1)
-        answered = nearest[:, 0] >= 0
-        answers = Answers(queries, distance, right(apart) & answered, wrong(apart) & answered, revisited)
+    answers = Answers(queries, distance, right(apart) & answered, wrong(apart) & answered, revisited)
     return score_answers(source, result, answers, seed=seed)
 
 
