@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.protocols.bootstrap import RESAMPLES, f1_max_interval, interval, resampled_means
-from sglpr_jax.metrics import classification_curve
+from sglpr_jax.metrics import classification_curve, decision_curve
 
 
 def f1_interval(scores, positive, query, seed=0):
@@ -34,6 +34,23 @@ def test_the_interval_is_that_of_resampling_in_a_loop(pairs):
         items = np.concatenate([np.flatnonzero(query == frame) for frame in rng.choice(frames, len(frames))])
         resamples.append(classification_curve(scores[items], positive[items]).f1_max)
     assert f1_interval(scores, positive, query) == pytest.approx(interval(np.array(resamples)), abs=0.015)
+
+
+def test_answers_that_count_for_nothing_are_resampled_too():
+    rng = np.random.default_rng(0)
+    outcome = rng.integers(4, size=200)  # right, not counted, wrong though there is a revisit, wrong
+    scores = rng.normal(size=200) + 0.5 * (outcome < 2)
+    flags = {
+        "true_if_accepted": outcome == 0,
+        "false_if_accepted": outcome > 1,
+        "missed_if_rejected": outcome < 3,
+    }
+    resamples = []
+    for items in rng.integers(200, size=(RESAMPLES, 200)):
+        chosen = {name: flag[items] for name, flag in flags.items()}
+        resamples.append(decision_curve(scores[items], **chosen).f1_max)
+    found = f1_max_interval(scores, **flags, query=np.arange(200), seed=0)
+    assert found == pytest.approx(interval(np.array(resamples)), abs=0.015)
 
 
 def test_pairs_of_one_query_are_worth_less_than_pairs_of_many(pairs):

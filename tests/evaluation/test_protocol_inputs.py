@@ -126,7 +126,10 @@ def test_scored_pairs_must_fit(change, error):
     ("change", "error"),
     [
         ({"queries": np.zeros(0, dtype=np.int64)}, "at least one query, found none"),
-        ({"queries": np.array([3, 4])}, "expected 2 rows of retrieved frames, found 800"),
+        ({"queries": np.array([3, 4])}, r"expected 2 rows of retrieved frames, found \(800, 800\)"),
+        ({"nearest": np.zeros((800, 0), dtype=np.int64)}, r"expected 800 rows of retrieved frames, found \(800, 0\)"),
+        ({"positions": np.full((800, 3), np.nan)}, "expected finite positions"),
+        ({"times": np.zeros(3)}, "expected 800 times"),
         ({"queries": np.arange(800) // 2}, "found one listed twice"),
         ({"queries": np.arange(1, 801)}, "expected query frames from 0 to 799, found 800 in row 799"),
         ({"nearest": np.full((800, 800), 800)}, "expected retrieved frames from -1 to 799, found 800 in row 0"),

@@ -37,11 +37,11 @@ def f1_max_interval(
     """Return the interval of F1max over the decisions of `metrics.decision_curve`, of which item i is `query[i]`'s.
 
     All items of a query are drawn or left out together. Every resample has its own best threshold, sought among at most
-    256 scores of true positives: F1 is never highest elsewhere.
+    256 scores of items that are right or could be missed: accepting any other cannot raise F1.
     """
-    edges = np.unique(scores[true_if_accepted & np.isfinite(scores)])
-    if not edges.size:
+    if not np.any(true_if_accepted & np.isfinite(scores)):
         return 0.0, 0.0
+    edges = np.unique(scores[(true_if_accepted | missed_if_rejected) & np.isfinite(scores)])
     edges = edges[np.unique(np.linspace(0, len(edges) - 1, THRESHOLDS).round().astype(np.int64))]
     bins = np.searchsorted(edges, scores, side="right")  # accepted at the edges [:bins]
     present = np.bincount(query) > 0

@@ -13,7 +13,7 @@ class TopK:
     """A top-k list: for some frames of a sequence, the frames that a method retrieved for them, best first.
 
     A frame that is not listed has no answer: where it is a query, it is missed. Raises ValueError where a frame is out
-    of range or listed twice, or a score is not finite.
+    of range or listed twice, numbers of rows differ, or a value is not finite.
     """
 
     sequence: str
@@ -32,8 +32,12 @@ class TopK:
     def __post_init__(self):
         if len(self.queries) == 0:
             raise ValueError("expected a list with at least one query, found none")
-        if len(self.nearest) != len(self.queries):
-            raise ValueError(f"expected {len(self.queries)} rows of retrieved frames, found {len(self.nearest)}")
+        if self.positions.shape != (len(self), 3) or not np.isfinite(self.positions).all():
+            raise ValueError(f"expected finite positions (n, 3), found others in {self.positions.shape}")
+        if self.times is not None and self.times.shape != (len(self),):
+            raise ValueError(f"expected {len(self)} times, one for each position, found {self.times.shape}")
+        if self.nearest.ndim != 2 or len(self.nearest) != len(self.queries) or self.nearest.shape[1] == 0:
+            raise ValueError(f"expected {len(self.queries)} rows of retrieved frames, found {self.nearest.shape}")
         check_frames("query", self.queries, 0, len(self))
         check_frames("retrieved", self.nearest, -1, len(self))
         if len(np.unique(self.queries)) < len(self.queries):
