@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from sklearn.metrics import precision_recall_curve
+from sklearn.metrics import average_precision_score, precision_recall_curve
 
 from sglpr_jax.metrics import classification_curve, decision_curve
 
@@ -16,6 +16,7 @@ def assert_is_sklearns(scores, positive):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "No positive class found", UserWarning)
         precision, recall, thresholds = precision_recall_curve(positive, scores)
+        average_precision = average_precision_score(positive, scores)
     curve = classification_curve(scores, positive)
     np.testing.assert_array_equal(curve.thresholds, thresholds)
     # scikit-learn adds a last point, precision 1 and recall 0, at which nothing is accepted.
@@ -24,13 +25,27 @@ def assert_is_sklearns(scores, positive):
     with np.errstate(invalid="ignore"):
         f1 = np.nan_to_num(2 * precision * recall / (precision + recall))
     np.testing.assert_allclose(curve.f1_max, f1.max(), atol=1e-12)
+    np.testing.assert_allclose(curve.average_precision, average_precision, atol=1e-12)
+    assert_needs_no_other_thresholds(scores, positive, curve)
+
+
+def assert_needs_no_other_thresholds(scores, positive, curve):
+    """F1max, where it is, and average precision rest on the scores of the positive items alone."""
+    if positive.any():
+        short = classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
+        assert short.f1_max == curve.f1_max
+        assert short.thresholds[short.best] == curve.thresholds[curve.best]
+        np.testing.assert_allclose(short.average_precision, curve.average_precision, atol=1e-12)
 
 
 @given(st.lists(st.tuples(TIED_SCORES | SCORES, st.booleans()), min_size=1, max_size=40))
 @settings(deadline=None, max_examples=100)
-@example([(0.5, True)])
+@example([(0.5, True)])  # one query
 @example([(0.5, False)])
-@example([(1.0, False), (2.0, False)])
+@example([(0.5, True), (0.5, False), (0.5, False)])  # all ties
+@example([(0.5, True), (0.5, True)])
+@example([(0.0, False), (-0.0, True)])
+@example([(1.0, False), (2.0, False)])  # no positives
 @example([(1.0, True), (1.0, False), (1.0, True)])
 def test_the_curve_is_scikit_learns(items):
     scores, positive = zip(*items, strict=True)
@@ -69,6 +84,16 @@ def test_best_is_the_highest_of_equally_good_thresholds():
     # F1 is 2/3 when only the first is accepted, and again when all four are.
     assert curve.f1_max == pytest.approx(2 / 3)
     assert curve.thresholds[curve.best] == 3.0
+
+
+def test_a_score_of_minus_infinity_is_never_accepted():
+    scores, positive = np.array([2.0, -np.inf, 1.0, -np.inf]), np.array([True, True, False, False])
+    curve = classification_curve(scores, positive)
+    assert curve.thresholds.tolist() == [1.0, 2.0]
+    assert curve.precision.tolist() == [0.5, 1.0]
+    assert curve.recall.tolist() == [0.5, 0.5]
+    with pytest.raises(ValueError, match="expected finite scores, found 2 of 2"):
+        classification_curve(scores[[1, 3]], positive[[1, 3]])
 
 
 def test_scores_that_are_not_finite_are_refused():

@@ -6,22 +6,32 @@ from typing import Any
 
 from rich.table import Table
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS, Result
+from sglpr_jax.evaluation.protocols import HEADLINES, Result, protocol_named
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
-def evaluate(file: DescriptorFile) -> list[Result]:
-    """Return the result of every protocol on one file. Raises ValueError where the file has no positions."""
-    return [protocol(file) for protocol in PROTOCOLS.values()]
+def evaluate(file: DescriptorFile, protocols: Sequence[str] = HEADLINES) -> list[Result]:
+    """Return the result of each named protocol on one file.
+
+    Raises ValueError where the file has no positions, or a name is no protocol of one file.
+    """
+    return [protocol_named(name)(file) for name in protocols]
 
 
 def table(results: Sequence[Result], *, title: str = "") -> Table:
     """Return one row per protocol: what it is, its score, and what that rests on."""
-    rows = Table("protocol", "rule", "score", "rests on", "distance", "poses", title=title)
+    rows = Table("protocol", "rule", "score", "95 %", "rests on", "distance", "poses", title=title)
     for result in results:
         counts = "\n".join(f"{count} {name}" for name, count in result.counts.items())
+        distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
         rows.add_row(
-            result.name, result.rule, format_score(result), counts, f"{result.dimensions}-D", result.pose_source
+            result.name,
+            result.rule,
+            format_score(result),
+            _format_interval(result),
+            counts,
+            distance,
+            result.pose_source,
         )
     return rows
 
@@ -40,17 +50,26 @@ def format_score(result: Result) -> str:
     return "no revisit" if math.isnan(result.score) else f"{result.score:.3f}"
 
 
+def _format_interval(result: Result) -> str:
+    """Return the bootstrap interval of the score to three places; empty where there is none."""
+    return "" if result.interval is None else "{:.3g} to {:.3g}".format(*result.interval)
+
+
 def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return plain values for `json.dump`: the score (null: no revisit), its rule, counts and where F1 is highest."""
+    """Return plain values for `json.dump`: the score (null: no revisit), its interval, rule, counts, curve in short."""
     return [
         {
             "protocol": result.name,
             "rule": result.rule,
             "score": None if math.isnan(result.score) else result.score,
+            "interval": None if result.interval is None else list(result.interval),
             "counts": result.counts,
             "dimensions": result.dimensions,
             "poses": result.pose_source,
+            "published_on": result.published_on,
+            "average_precision": None if result.curve is None else result.curve.average_precision,
             "at_f1max": _at_f1max(result),
+            "recall_at": {str(n): recall for n, recall in result.recalls.items()},
         }
         for result in results
     ]

@@ -7,13 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data import open_sequence
 from sglpr_jax.evaluation.baselines import polar_fft, thumbnail
-from sglpr_jax.evaluation.protocols import bevplace_recall_at_1, pairs_f1max, top1_f1max
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.evaluation.protocols import top1_f1max
 
-KITTI_BEV_RADIUS = 62.0
-"""Pixels: the images of `kitti_bev` are 151 x 151, with content in the middle 125 x 125."""
+from .kitti_bev import KITTI_BEV_RADIUS, read_kitti_bev
 
 
 def rotate(images, angles):
@@ -100,32 +97,8 @@ def test_descriptors_have_unit_length_and_an_empty_image_gives_zeros(streets, me
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), [1, 1, 1, 1, 0], atol=1e-6)
 
 
-def read(shared, name):
-    """Return the images of a real sequence, and its descriptor file still without real descriptors."""
-    sequence = open_sequence(shared / "data" / "kitti_bev", name)
-    images = np.stack([sequence.image(i) for i in range(len(sequence))])
-    file = DescriptorFile(
-        name, sequence.ids, sequence.positions, sequence.times, images[:, 0], sequence.pose_source, {}, ""
-    )
-    return images, file
-
-
-@pytest.mark.parametrize(
-    ("name", "revisits", "top1", "pairs", "recall"),
-    [("00", 774, 0.941, 0.710, 0.955), ("02", 217, 0.689, 0.763, 0.638), ("06", 268, 0.920, 0.694, 0.978)],
-)
-def test_polar_fft_scores_on_real_scans_as_measured_elsewhere(shared, name, revisits, top1, pairs, recall):
-    images, file = read(shared, name)
-    file = replace(file, descriptors=polar_fft(images, radius=KITTI_BEV_RADIUS))
-    result = top1_f1max(file)
-    assert result.counts["revisits"] == revisits
-    assert result.score == pytest.approx(top1, abs=0.03)
-    assert pairs_f1max(file).score == pytest.approx(pairs, abs=0.03)
-    assert bevplace_recall_at_1(file).score == pytest.approx(recall, abs=0.03)
-
-
 def test_rotated_real_scans_leave_polar_fft_and_break_the_thumbnail(shared):
-    images, file = read(shared, "06")
+    images, file = read_kitti_bev(shared, "06")
     angles = np.random.default_rng(0).uniform(-np.pi, np.pi, len(images)).astype(np.float32)
     turned = rotate(images, angles)
     score = {

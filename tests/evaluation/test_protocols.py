@@ -14,22 +14,7 @@ from sglpr_jax.evaluation.protocols import (
 )
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
-
-def distance(a, b):
-    return float(np.linalg.norm(a - b))
-
-
-def f1_max(thresholds, count):
-    """The highest F1 over (tp, fp, fn) counted at every threshold."""
-    return max((2 * tp / (2 * tp + fp + fn) if tp else 0.0) for tp, fp, fn in map(count, thresholds))
-
-
-def random_drive(seed, n=60):
-    """A drive in which frames are often 0 to 30 m from older ones; descriptors that know only part of it."""
-    rng = np.random.default_rng(seed)
-    positions = rng.uniform(-15, 15, (n, 3)) * [1, 1, 0.2]
-    descriptors = (positions + rng.normal(scale=4, size=(n, 3))) @ rng.normal(size=(3, 8)) / 20
-    return positions, descriptors.astype(np.float32), np.sort(rng.uniform(0, 120, n))
+from .by_the_letter import distance, f1_max, random_drive
 
 
 def top1_by_the_letter(file: DescriptorFile) -> tuple[float, int]:
@@ -92,21 +77,43 @@ def test_pairs_follow_the_rule_to_the_letter(make_file, seed):
     assert result.score == pytest.approx(expected, nan_ok=True)
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS.values())
-def test_descriptors_that_know_the_place_score_one(make_file, two_laps, protocol):
-    result = protocol(make_file(two_laps, two_laps / 200))
+THREE_D = {"top1-f1max", "top1-strict-f1max", "contour-context-f1max", "bevplace-recall-at-1"}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_descriptors_that_know_the_place_score_one(make_file, two_laps, name):
+    result = PROTOCOLS[name](make_file(two_laps, two_laps / 200))
     assert result.score == 1.0
+    assert result.interval == (1.0, 1.0)
     assert result.pose_source == "made up"
-    assert result.dimensions == (2 if result.name == "pairs F1max" else 3)
+    assert result.published_on
+    assert result.dimensions == (3 if name in THREE_D else 2)
+    assert sum(result.counts.values()) > 0
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS.values())
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_the_interval_holds_the_score_and_every_result_has_another_name(make_file, two_laps, name):
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
+    file = make_file(two_laps, two_laps / 200 + noise)
+    result, again, other = (PROTOCOLS[name](file, seed=seed) for seed in (0, 0, 1))
+    low, high = result.interval
+    assert 0 < low <= result.score <= high <= 1
+    assert high - low < 0.25
+    assert again.interval == result.interval
+    if 0 < result.score < 1:
+        assert other.interval != result.interval
+    assert [PROTOCOLS[other](file).name for other in PROTOCOLS].count(result.name) == 1
+
+
+# SGPR's positive pairs are mostly neighbours: it has a score on any drive.
+@pytest.mark.parametrize("protocol", [PROTOCOLS[name] for name in PROTOCOLS if name != "sgpr-pairs-f1max"])
 def test_without_a_revisit_there_is_no_score(make_file, straight, protocol):
     # In the middle of the drive a gap of 20 m, so that the first query is far from the map.
     positions = straight + np.where(np.arange(800) >= 480, 20.0, 0.0)[:, None] * [1, 0, 0]
     result = protocol(make_file(positions, np.ones((800, 4))))
     assert np.isnan(result.score)
     assert result.curve is None
+    assert result.interval is None
     assert result.counts.get("revisits", result.counts.get("positive pairs")) == 0
 
 
@@ -199,10 +206,10 @@ def test_blocks_leave_no_seam(make_file, monkeypatch):
     positions, descriptors, times = random_drive(3)
     file = make_file(positions, descriptors, times=times)
     whole = [protocol(file) for protocol in PROTOCOLS.values()]
-    monkeypatch.setattr("sglpr_jax.evaluation.protocols.BLOCK", 7)
-    monkeypatch.setattr("sglpr_jax.evaluation.protocols.PAIR_BLOCK", 7)
+    for block in ("nearest.BLOCK", "nearest.POSITION_BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
+        monkeypatch.setattr(f"sglpr_jax.evaluation.protocols.{block}", 7)
     for one, other in zip(whole, [protocol(file) for protocol in PROTOCOLS.values()], strict=True):
-        assert one.score == pytest.approx(other.score)
+        assert one.score == pytest.approx(other.score, nan_ok=True)
         assert one.counts == other.counts
 
 

@@ -37,6 +37,18 @@ def test_every_protocol_is_reported_with_what_it_rests_on(found):
     for result in found:
         assert 0 < result.score <= 1
         assert f"{result.score:.3f}" in text
+        assert f"{result.interval[0]:.3g} to {result.interval[1]:.3g}" in text
+
+
+def test_other_protocols_are_reported_where_they_are_named(make_file, two_laps):
+    file = make_file(two_laps, two_laps / 200)
+    results = report.evaluate(file, ["ssc-recall", "scan-context-f1max"])
+    assert [result.name for result in results] == ["SSC Recall@1", "Scan Context F1max"]
+    recall, top1 = report.to_json(results)
+    assert list(recall["recall_at"].values()) == [1.0] * 25 and recall["average_precision"] is None
+    assert list(top1["recall_at"]) == ["1"] and top1["average_precision"] == 1.0
+    with pytest.raises(ValueError, match="did you mean 'ssc-recall'"):
+        report.evaluate(file, ["ssc-recal"])
 
 
 def test_a_sequence_without_revisits_says_so(nothing_to_find):
@@ -58,6 +70,10 @@ def test_json_says_the_same(found, nothing_to_find):
     assert top1["score"] == found[0].score
     assert top1["counts"] == {"queries": 510, "revisits": 400}
     assert (top1["dimensions"], pairs["dimensions"], recall["dimensions"]) == (3, 2, 3)
+    assert (top1["published_on"], pairs["published_on"]) == ("SemanticKITTI's poses", "KITTI's own poses")
+    assert top1["interval"] == list(found[0].interval)
+    assert pairs["average_precision"] == found[1].curve.average_precision
+    assert recall["recall_at"] == {"1": recall["score"]}
     best = pairs["at_f1max"]
     harmonic = 2 * best["precision"] * best["recall"] / (best["precision"] + best["recall"])
     assert harmonic == pytest.approx(pairs["score"])

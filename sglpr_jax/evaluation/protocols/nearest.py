@@ -1,0 +1,85 @@
+"""Retrieval: which frames a query is answered with, and whether its database has a right answer."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sglpr_jax.evaluation.protocols.source import Source, TopK
+from sglpr_jax.poses import distances
+
+BLOCK = 512
+"""Queries whose descriptors are compared with the whole database at a time."""
+POSITION_BLOCK = 32
+"""Queries whose positions are: so few that the distances stay in the cache."""
+
+Near = Callable[[np.ndarray], np.ndarray]
+"""From distances in metres to whether they are those of one place, such as `lambda apart: apart < 5`."""
+
+
+def nearest_frames(
+    source: Source, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], *, k: int = 1
+) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
+    """Return for each query the best k among the first `ends` frames, best first, and the descriptor distance of the
+    best. -1 fills a row that has fewer; without any the distance is infinite."""
+    if isinstance(source, TopK):
+        return source.lookup(queries, ends, k)
+    return nearest_descriptors(source.descriptors[queries], source.descriptors, ends, k=k)
+
+
+def nearest_descriptors(
+    queries: Float[np.ndarray, "q d"],
+    database: Float[np.ndarray, "n d"],
+    ends: Int[np.ndarray, " q"],
+    *,
+    k: int = 1,
+) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
+    """Return for each query the nearest k of the first `ends` >= 1 descriptors (L2), and the distance of the nearest.
+
+    -1 fills a row that has fewer than k.
+    """
+    norms = np.sum(database**2, axis=1)
+    nearest = np.full((len(queries), k), -1, dtype=np.int64)
+    for start in range(0, len(queries), BLOCK):
+        rows = slice(start, start + BLOCK)
+        # |q - d|^2 without |q|^2, which is the same for the whole row.
+        ranking = norms[None, :] - 2 * queries[rows] @ database.T
+        ranking[np.arange(len(database)) >= ends[rows, None]] = np.inf
+        nearest[rows, : min(k, len(database))] = _smallest(ranking, min(k, len(database)))
+    distance = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
+    return np.where(nearest < ends[:, None], nearest, -1), distance
+
+
+def has_near(
+    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], ends: Int[np.ndarray, " q"], near: Near
+) -> Bool[np.ndarray, " q"]:
+    """Return whether each query has a near position among the first `ends` of the database."""
+    found = np.zeros(len(queries), dtype=bool)
+    for start in range(0, len(queries), POSITION_BLOCK):
+        rows = slice(start, start + POSITION_BLOCK)
+        last = ends[rows].max()
+        close = near(distances(queries[rows], database[:last]))
+        found[rows] = np.any(close & (np.arange(last) < ends[rows, None]), axis=1)
+    return found
+
+
+def first_hits(
+    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
+) -> Int[np.ndarray, " q"]:
+    """Return for each query the rank, from 0, of its first answer that is near; k where none is."""
+    apart = np.linalg.norm(queries[:, None] - database[nearest], axis=2)
+    return first_true(near(apart) & (nearest >= 0))
+
+
+def first_true(flags: Bool[np.ndarray, "q k"]) -> Int[np.ndarray, " q"]:
+    """Return the first true column of each row; k where none is."""
+    return np.where(flags.any(axis=1), np.argmax(flags, axis=1), flags.shape[1])
+
+
+def _smallest(values: Float[np.ndarray, "q n"], k: int) -> Int[np.ndarray, "q {k}"]:
+    """Return the columns of the k smallest values of each row, rising."""
+    if k == 1:
+        return np.argmin(values, axis=1)[:, None]
+    columns = np.sort(np.argpartition(values, k - 1, axis=1)[:, :k], axis=1)
+    order = np.argsort(np.take_along_axis(values, columns, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(columns, order, axis=1)

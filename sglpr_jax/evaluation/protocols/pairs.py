@@ -1,0 +1,89 @@
+"""Pairs of frames, each positive or negative: drawn from a sequence, or listed with scores."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sglpr_jax import metrics
+from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.poses import distances
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+BLOCK = 32
+"""Frames compared with all others at a time."""
+PAIR_BLOCK = 1 << 10
+"""Pairs compared at a time: so few that their descriptors stay in the cache."""
+
+
+def score_pairs(
+    result: Result,
+    pairs: Int[np.ndarray, "2 pairs"],
+    scores: Float[np.ndarray, " pairs"],
+    positive: Bool[np.ndarray, " pairs"],
+    *,
+    seed: int,
+) -> Result:
+    """Complete `result` with counts, and where a pair is positive with F1max, its curve and interval.
+
+    The interval resamples the first frame of the pairs: all pairs of a query frame are drawn or left out together.
+    """
+    counts = {"positive pairs": int(positive.sum()), "negative pairs": int((~positive).sum())}
+    result = replace(result, counts=counts)
+    if not positive.any():
+        return result
+    # Between two positive pairs only precision falls: a curve of the millions of negative scores would say no more.
+    curve = metrics.classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
+    interval = f1_max_interval(
+        scores,
+        true_if_accepted=positive,
+        false_if_accepted=~positive,
+        missed_if_rejected=positive,
+        query=pairs[0],
+        seed=seed,
+    )
+    return replace(result, score=curve.f1_max, curve=curve, interval=interval)
+
+
+def frame_pairs(
+    positions: Float[np.ndarray, "n d"], keep: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> Int[np.ndarray, " pairs"]:
+    """Return every ordered pair (i, j) that `keep(apart, gap)` keeps, as i * n + j.
+
+    `apart` is their distance in metres and `gap` i - j, how many frames i is the later.
+    """
+    n = len(positions)
+    found = []
+    for start in range(0, n, BLOCK):
+        gap = np.arange(start, min(start + BLOCK, n))[:, None] - np.arange(n)[None, :]
+        apart = distances(positions[start : start + BLOCK], positions)
+        found.append(start * n + np.flatnonzero(keep(apart, gap)))
+    return np.concatenate(found)
+
+
+def pair_distances(
+    descriptors: Float[np.ndarray, "n d"], pairs: Int[np.ndarray, "2 pairs"]
+) -> Float[np.ndarray, " pairs"]:
+    """Return the distance between the descriptors of each pair."""
+    apart = np.empty(pairs.shape[1])
+    for start in range(0, pairs.shape[1], PAIR_BLOCK):
+        i, j = pairs[:, start : start + PAIR_BLOCK]
+        apart[start : start + PAIR_BLOCK] = np.linalg.norm(descriptors[i] - descriptors[j], axis=1)
+    return apart
+
+
+def score_drawn_pairs(
+    file: DescriptorFile,
+    result: Result,
+    positive: Int[np.ndarray, " positives"],
+    negative: Int[np.ndarray, " negatives"],
+    *,
+    seed: int,
+) -> Result:
+    """Complete `result` with pairs that `frame_pairs` found."""
+    pairs = np.stack(np.divmod(np.concatenate([positive, negative]), len(file)))
+    is_positive = np.arange(pairs.shape[1]) < len(positive)
+    scores = -pair_distances(file.descriptors, pairs) if len(positive) else np.zeros(pairs.shape[1])
+    return score_pairs(result, pairs, scores, is_positive, seed=seed)

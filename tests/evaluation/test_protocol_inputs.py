@@ -1,0 +1,205 @@
+"""What protocols are given: top-k lists and scored pairs in place of descriptors, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sglpr_jax.evaluation.protocols import (
+    CROSS_SESSION_PROTOCOLS,
+    PROTOCOLS,
+    TOP_K_PROTOCOLS,
+    Decision,
+    ScoredPairs,
+    TopK,
+    bevplace_recall_at_1,
+    overlap_transformer_f1max,
+    pointnetvlad_recall,
+    protocol_named,
+    scan_context_f1max,
+    score_listed_pairs,
+    scored_pairs_f1max,
+    ssc_recall,
+    top1_f1max,
+)
+
+
+@pytest.fixture
+def file(make_file, two_laps):
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
+    return make_file(two_laps, two_laps / 200 + noise)
+
+
+@pytest.fixture
+def listed(file) -> TopK:
+    """All frames of `file` for each of its frames, best first."""
+    apart = np.linalg.norm(file.descriptors[:, None] - file.descriptors[None], axis=2)
+    nearest = np.argsort(apart, axis=1)
+    scores = -np.take_along_axis(apart, nearest, axis=1).astype(np.float64)
+    return TopK("town", file.positions, None, "made up", np.arange(800), nearest, scores)
+
+
+# SSC's recall counts the rows of a list in another way: see below.
+@pytest.mark.parametrize("protocol", [TOP_K_PROTOCOLS[name] for name in TOP_K_PROTOCOLS if name != "ssc-recall"])
+def test_a_list_scores_as_the_descriptors_it_was_made_of(file, listed, protocol):
+    by_descriptors, by_list = protocol(file), protocol(listed)
+    assert by_list.score == pytest.approx(by_descriptors.score)
+    assert by_list.interval == pytest.approx(by_descriptors.interval, abs=1e-3)
+    assert by_list.recalls == pytest.approx(by_descriptors.recalls)
+    assert by_list.counts == by_descriptors.counts
+    np.testing.assert_array_equal(by_list.decisions, by_descriptors.decisions)
+
+
+def test_ssc_counts_every_row_of_a_list(file, listed):
+    asked = ssc_recall(file)
+    queries = np.flatnonzero(asked.decisions)
+    rows = replace(listed, queries=queries, nearest=listed.nearest[queries], scores=None)
+    assert ssc_recall(rows).recalls == asked.recalls
+    more = np.append(queries, 100)  # a frame of the first lap, with nothing to find
+    result = ssc_recall(replace(listed, queries=more, nearest=listed.nearest[more], scores=None))
+    assert result.counts == {"queries": len(more), "revisits": len(queries)}
+    assert result.recalls[25] == pytest.approx(asked.recalls[25] * len(queries) / len(more))
+
+
+def test_a_frame_that_is_not_listed_is_missed(listed):
+    whole = top1_f1max(listed)
+    found = np.flatnonzero(whole.decisions == Decision.TRUE_POSITIVE)
+    rows = np.setdiff1d(np.arange(800), found[::2])
+    half = top1_f1max(replace(listed, queries=rows, nearest=listed.nearest[rows], scores=listed.scores[rows]))
+    assert half.counts == whole.counts
+    assert np.all(half.decisions[found[::2]] == Decision.FALSE_NEGATIVE)
+    assert half.score < whole.score
+
+
+def test_a_list_without_answers_scores_nothing(listed):
+    empty = replace(listed, nearest=np.full((800, 1), -1), scores=np.zeros((800, 1)))
+    for protocol in (top1_f1max, scan_context_f1max, bevplace_recall_at_1):
+        result = protocol(empty)
+        assert (result.score, result.interval) == (0.0, (0.0, 0.0))
+        assert not np.any(result.decisions == Decision.TRUE_POSITIVE)
+
+
+def test_a_threshold_needs_scores(listed):
+    with pytest.raises(ValueError, match="top-1 F1max: expected a list with scores"):
+        top1_f1max(replace(listed, scores=None))
+    assert bevplace_recall_at_1(replace(listed, scores=None)).score == bevplace_recall_at_1(listed).score
+
+
+def test_pairs_without_labels_are_labelled_by_position(file):
+    pairs = np.array([[400, 0], [401, 0], [405, 0], [100, 0], [1, 0], [700, 300]])  # 0, 3.1, 16, 200, 3.1, 0 m
+    labels = np.array([True, False, True])
+    given = scored_pairs_f1max(score_listed_pairs(file, pairs[[0, 3, 5]], labels))
+    told = scored_pairs_f1max(score_listed_pairs(file, pairs))
+    assert told.counts == given.counts == {"positive pairs": 2, "negative pairs": 1}
+    assert told.score == given.score == 1.0
+    assert (told.dimensions, given.dimensions) == (2, None)
+    assert np.isnan(scored_pairs_f1max(ScoredPairs(pairs, np.zeros(6), np.zeros(6, dtype=bool))).score)
+
+
+@pytest.mark.parametrize("frame", [-1, 800])
+def test_pairs_out_of_range_are_refused(file, frame):
+    pairs = np.array([[5, 0], [frame, 3]])
+    with pytest.raises(ValueError, match=f"expected pairs of frames from 0 to 799, found {frame} in row 1"):
+        score_listed_pairs(file, pairs)
+    with pytest.raises(ValueError, match=f"found {frame} in row 1"):
+        ScoredPairs(pairs, np.zeros(2), positions=file.positions)
+    with pytest.raises(ValueError, match=f"expected overlapping frames from 0 to 799, found {frame} in row 1"):
+        overlap_transformer_f1max(file, pairs)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"pairs": np.zeros((0, 2), dtype=np.int64)}, "at least one pair, found none"),
+        ({"scores": np.zeros(3)}, "expected 2 pairs"),
+        ({"labels": np.array([True])}, "expected 2 pairs"),
+        ({"labels": None}, "expected labels, or positions"),
+    ],
+)
+def test_scored_pairs_must_fit(change, error):
+    pairs = ScoredPairs(np.array([[5, 0], [6, 0]]), np.zeros(2), np.array([True, False]))
+    with pytest.raises(ValueError, match=error):
+        replace(pairs, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"queries": np.zeros(0, dtype=np.int64)}, "at least one query, found none"),
+        ({"queries": np.array([3, 4])}, r"expected 2 rows of retrieved frames, found \(800, 800\)"),
+        ({"nearest": np.zeros((800, 0), dtype=np.int64)}, r"expected 800 rows of retrieved frames, found \(800, 0\)"),
+        ({"positions": np.full((800, 3), np.nan)}, "expected finite positions"),
+        ({"times": np.zeros(3)}, "expected 800 times"),
+        ({"queries": np.arange(800) // 2}, "found one listed twice"),
+        ({"queries": np.arange(1, 801)}, "expected query frames from 0 to 799, found 800 in row 799"),
+        ({"nearest": np.full((800, 800), 800)}, "expected retrieved frames from -1 to 799, found 800 in row 0"),
+        ({"scores": np.full((800, 800), np.nan)}, "expected a finite score"),
+        ({"scores": np.zeros((800, 1))}, "expected a finite score"),
+    ],
+)
+def test_a_list_must_fit(listed, change, error):
+    with pytest.raises(ValueError, match=error):
+        replace(listed, **change)
+
+
+def test_nan_descriptors_are_refused(make_file, two_laps):
+    descriptors = np.ones((800, 4))
+    descriptors[17, 2] = np.nan
+    with pytest.raises(ValueError, match="expected finite descriptors, found others in 1 rows, the first in row 17"):
+        make_file(two_laps, descriptors)
+
+
+def test_an_empty_sequence_is_refused(make_file):
+    with pytest.raises(ValueError, match="expected at least one scan, found none"):
+        make_file(np.zeros((0, 3)), np.zeros((0, 4)))
+
+
+def test_as_many_descriptors_as_poses_are_needed(make_file, two_laps):
+    with pytest.raises(
+        ValueError, match=r"expected positions as float64 \(700, 3\) for 700 ids, found float64 \(800, 3\)"
+    ):
+        make_file(two_laps, np.ones((700, 4)))
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [("top1-f1mx", "top1-f1max"), ("contour", "contour-context-f1max"), ("SSC-recall", "ssc-recall"), ("", "top1")],
+)
+def test_an_unknown_protocol_names_the_nearest(name, nearest):
+    with pytest.raises(
+        ValueError, match=f"no protocol '{name}'; did you mean '{nearest}.*There are .*sgpr-pairs-f1max"
+    ):
+        protocol_named(name)
+
+
+def test_protocols_go_by_their_name():
+    assert protocol_named("ssc-recall") is ssc_recall
+    assert protocol_named("pointnetvlad-recall", CROSS_SESSION_PROTOCOLS) is pointnetvlad_recall
+
+
+@pytest.mark.parametrize("name", CROSS_SESSION_PROTOCOLS)
+def test_sessions_must_be_described_alike(make_file, two_laps, name):
+    database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
+    with pytest.raises(ValueError, match="expected descriptors of 4 numbers in later as in town, found 5"):
+        CROSS_SESSION_PROTOCOLS[name](database, queries)
+    with pytest.raises(ValueError, match="expected positions to score sequence town"):
+        CROSS_SESSION_PROTOCOLS[name](replace(database, positions=None), database)
+
+
+def test_one_run_is_not_enough(file):
+    with pytest.raises(ValueError, match="expected at least two runs, found 1"):
+        pointnetvlad_recall(file)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_two_frames_are_too_few_to_find_anything_but_no_error(make_file, name):
+    result = PROTOCOLS[name](make_file(np.array([[0.0, 0, 0], [100, 0, 0]]), np.ones((2, 4))))
+    assert np.isnan(result.score) or name == "sgpr-pairs-f1max"
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_descriptors_that_are_all_alike_make_one_threshold(make_file, two_laps, name):
+    result = PROTOCOLS[name](make_file(two_laps, np.ones((800, 4))))
+    assert 0 <= result.interval[0] <= result.score <= result.interval[1] <= 1
+    if result.curve is not None:
+        assert len(result.curve.thresholds) == 1

@@ -1,0 +1,100 @@
+"""Outcomes that other methods' authors published, scored by our protocols: the numbers they printed."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.kitti import read_trajectory
+from sglpr_jax.evaluation.protocols import (
+    TopK,
+    contour_context_f1max,
+    score_listed_pairs,
+    scored_pairs_f1max,
+    ssc_recall,
+    top1_f1max,
+)
+from sglpr_jax.evaluation.protocols.ssc import positive_pairs
+
+
+@pytest.mark.parametrize(
+    ("sequence", "rows", "recall"),
+    [
+        ("00", 804, 0.9925),
+        ("02", 315, 0.9333),
+        ("05", 503, 0.9960),
+        ("06", 270, 1.0),
+        ("07", 122, 0.9672),
+        ("08", 345, 0.9826),
+    ],
+)
+def test_sscs_lists_give_its_recall(shared, sequence, rows, recall):
+    positions, times, source = read_trajectory(shared / "data/kitti_odometry", sequence, poses="semantickitti")
+    listed = np.loadtxt(shared / f"data/protocol/ssc_top25_{sequence}.txt", dtype=np.int64)
+    result = ssc_recall(TopK(sequence, positions, times, source, listed[:, 0], listed[:, 1:]))
+    assert round(result.score, 4) == recall
+    assert result.counts["queries"] == rows
+    assert result.recalls[1] <= result.recalls[25] <= 1
+
+
+def test_contour_contexts_outcome_gives_its_f1max(shared):
+    lines = (shared / "data/protocol/contour_context_outcome_08.txt").read_text().splitlines()
+    fields = [line.split() for line in lines]
+    pairs = [field[1].split("-") for field in fields]  # "2000-x": no answer
+    poses = np.loadtxt(shared / "data/protocol/contour_context_poses_08.txt")[:, 1:].reshape(-1, 3, 4)
+    outcome = TopK(
+        sequence="08",
+        positions=poses[:, :, 3],
+        times=None,
+        pose_source="contour_context_poses_08.txt",
+        queries=np.array([int(query) for query, _ in pairs]),
+        nearest=np.array([[-1 if answer == "x" else int(answer)] for _, answer in pairs]),
+        scores=np.array([[float(field[2])] for field in fields]),
+    )
+    result = contour_context_f1max(outcome)
+    best = result.curve.best
+    assert len(outcome) == 4071
+    assert result.counts["revisits"] == 347
+    assert round(result.score, 4) == 0.9556
+    assert round(result.curve.precision[best], 4) == 0.9758
+    assert round(result.curve.recall[best], 4) == 0.9362
+    assert result.curve.thresholds[best] == 0.649282
+    assert round(result.recalls[1], 4) == 0.9481
+
+
+@pytest.mark.parametrize(
+    ("sequence", "revisits"), [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
+)
+def test_revisits_are_logg3ds(shared, make_file, sequence, revisits):
+    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, poses="semantickitti")
+    result = top1_f1max(make_file(positions, positions, times=times, sequence=sequence))
+    assert result.counts["revisits"] == revisits
+
+
+@pytest.fixture(scope="module")
+def neg_100(shared):
+    """Return RINet's list for 07: pairs (p, 2) and whether each is positive."""
+    rows = np.loadtxt(shared / "data/protocol/neg_100_07.txt", dtype=np.int64)
+    return rows[:, :2], rows[:, 2] == 1
+
+
+def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
+    pairs, positive = neg_100
+    published = {tuple(pair) for pair in pairs[positive].tolist()}
+    found = {}
+    for poses in ("kitti", "semantickitti"):
+        positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", poses=poses)
+        found[poses] = set(zip(*np.divmod(positive_pairs(positions[:, :2]), len(positions)), strict=True))
+    assert found["kitti"] == published
+    assert len(published) == 1833
+    assert found["semantickitti"] != published
+
+
+def test_rinets_list_scores_descriptors(shared, make_file, neg_100):
+    pairs, positive = neg_100
+    positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", poses="kitti")
+    noise = np.random.default_rng(0).normal(scale=10, size=positions.shape)
+    file = make_file(positions, positions + noise, sequence="07")
+    by_label = scored_pairs_f1max(score_listed_pairs(file, pairs, positive))
+    by_position = scored_pairs_f1max(score_listed_pairs(file, pairs))
+    assert by_label.counts == by_position.counts == {"positive pairs": 1833, "negative pairs": 183_300}
+    assert by_label.score == by_position.score
+    assert 0 < by_label.interval[0] < by_label.score < by_label.interval[1] < 1
