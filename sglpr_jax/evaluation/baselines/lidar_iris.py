@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex64, Float, Float32, Int, UInt64
+from jaxtyping import Bool, Complex64, Complex128, Float, Float32, Float64, Int, UInt64
 
 from sglpr_jax.evaluation.pairwise import correlate_spectra, in_blocks
 
@@ -73,8 +73,8 @@ def lidar_iris_distance(
     return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare)
 
 
-def responses(images: Float[np.ndarray, "n 80 360"]) -> np.ndarray:
-    """Return the complex log-Gabor responses (filters, n, 80, 360) of every ring.
+def responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "filters 80 360"]:
+    """Return the complex log-Gabor responses of every ring.
 
     A filter of wavelength w has the gain exp(-ln(f w)^2 / (2 ln(sigma)^2)) at the frequency f > 0, and 0 elsewhere.
     """
@@ -83,7 +83,7 @@ def responses(images: Float[np.ndarray, "n 80 360"]) -> np.ndarray:
     gains = np.zeros((len(WAVELENGTHS), COLUMNS))
     ratio = np.log(np.outer(WAVELENGTHS, frequency[positive]))
     gains[:, positive] = np.exp(-(ratio**2) / (2 * np.log(SIGMA) ** 2))
-    return np.fft.ifft(np.fft.fft(images)[None] * gains[:, None, None])
+    return np.fft.ifft(np.fft.fft(image)[None] * gains[:, None])
 
 
 def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> _Iris:
@@ -91,14 +91,20 @@ def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> _Iris:
     spectra = np.fft.rfft(images)
     size = np.abs(spectra)
     phases = np.divide(spectra, size, out=np.zeros_like(spectra), where=size > 0)
-    found = responses(images.astype(np.float64))
+    bits, faint = zip(*map(_encode, images), strict=True)
+    return _Iris(phases, np.stack(bits), np.stack(faint))
+
+
+def _encode(image: Float32[np.ndarray, "80 360"]) -> tuple[UInt64[np.ndarray, "360 words"], ...]:
+    """Return the signs of an image's responses, and which of them are faint."""
+    found = responses(image.astype(np.float64))
     faint = np.abs(found) < FAINT
-    return _Iris(phases, _pack(np.stack([np.real(found) > 0, np.imag(found) > 0])), _pack(np.stack([faint, faint])))
+    return _pack(np.stack([np.real(found) > 0, np.imag(found) > 0])), _pack(np.stack([faint, faint]))
 
 
-def _pack(bits: np.ndarray) -> UInt64[np.ndarray, "n 360 words"]:
-    """Return bits (parts, filters, n, rings, columns) as words of 64, column by column."""
-    by_column = np.transpose(bits, (2, 4, 0, 1, 3)).reshape(bits.shape[2], COLUMNS, -1)
+def _pack(bits: Bool[np.ndarray, "parts filters 80 360"]) -> UInt64[np.ndarray, "360 words"]:
+    """Return the bits of every column as words of 64."""
+    by_column = bits.reshape(-1, COLUMNS).T
     return np.ascontiguousarray(np.packbits(by_column, axis=-1)).view(np.uint64)
 
 
