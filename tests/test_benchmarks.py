@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sglpr_jax.sim import Sensor, write_dataset
+
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
@@ -33,6 +35,17 @@ def test_simulate_prints_its_rate_and_where_the_time_goes():
         assert words in output
     shares = [int(line.split("%")[0].split()[-1]) for line in output.splitlines() if "%" in line]
     assert len(shares) == 4 and 97 <= sum(shares) <= 103
+
+
+def test_baselines_are_scored_raw_and_rotated(tmp_path):
+    sensor = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
+    write_dataset(tmp_path, names=("00",), scans=60, sensor=sensor)
+    output = printed("baselines.py", "--data", str(tmp_path), "--methods", "scan-context", "random")
+    assert "60 scans" in output and "revisits" in output
+    cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in output.splitlines() if "│" in line]
+    scores = {row[0]: [float(cell) for cell in row[4:8]] for row in cells}
+    assert list(scores) == ["scan-context", "random"]
+    assert min(scores["scan-context"]) > max(scores["random"])
 
 
 @pytest.mark.parametrize("name", ["describe", "train_step"])

@@ -15,6 +15,8 @@ from sglpr_jax.data.scan_files import ScanFormat
 from sglpr_jax.models.params import load
 from sglpr_jax.models.presets import model_preset
 
+MethodName = Literal["sglpr", "scan-context", "m2dp", "lidar-iris", "ssc", "solid", "polar-fft", "thumbnail", "random"]
+
 
 @dataclasses.dataclass(frozen=True)
 class EmbedCommand:
@@ -23,7 +25,7 @@ class EmbedCommand:
     Examples:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
       bin/embed --weights runs/small-08 --data my_scans/ --out mine.npz --skip-bad
-      bin/embed --method polar-fft --data KITTI --seq 08 --out reference.npz
+      bin/embed --method scan-context --data KITTI --seq 08 --out reference.npz
     """
 
     data: Path
@@ -32,8 +34,8 @@ class EmbedCommand:
     """The descriptor file to write (.npz)."""
     weights: Path | None = None
     """A training run's folder, or a folder with config.json and model.safetensors."""
-    method: Literal["sglpr", "polar-fft", "thumbnail"] = "sglpr"
-    """The network, or a reference that needs no weights."""
+    method: MethodName = "sglpr"
+    """The network, or a reference that needs no weights; scan-context to solid need points, ssc labels too."""
     seq: str | None = None
     """Which sequence; may be left out where there is only one."""
     poses: PoseChoice = "auto"

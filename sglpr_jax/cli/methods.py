@@ -1,27 +1,25 @@
-"""The methods a descriptor can come from, as functions of images: the network, and references without training."""
+"""The methods a descriptor can come from: the network, and references without training, on images or on points."""
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.data import Drive, ImageSequence
-from sglpr_jax.evaluation.baselines.polar_fft import polar_fft
-from sglpr_jax.evaluation.baselines.thumbnail import thumbnail
+from sglpr_jax.evaluation.baselines import BASELINES, Baseline
 from sglpr_jax.models.params import weights_hash
 from sglpr_jax.models.sglpr import Params, describe
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import DescribeFn, embed
+from sglpr_jax.retrieval.embed import DescribeFn, DescribeScanFn, embed, embed_scans
 
 BEV_IMAGE_RADIUS = 62.0
 """Pixels from the centre to which the ready-made KITTI images have content."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
+class ImageMethod:
     """A way to describe images: the function, the window it wants (None: images whole), and what to write about it."""
 
     describe: DescribeFn
@@ -35,18 +33,59 @@ class Method:
         return embed(self.describe, sequence, self.grid, config=about, weights_hash=self.weights_hash, **options)
 
 
-def network(params: Params) -> Method:
+@dataclasses.dataclass(frozen=True)
+class ScanMethod:
+    """A way to describe the points of a scan: the function, whether it wants labels, and how to compare the results."""
+
+    describe: DescribeScanFn
+    labels: bool
+    distance: str
+    about: dict[str, Any]
+
+    def embed(self, sequence: Drive, *, batch: int = 1, **options: Any) -> DescriptorFile:
+        """Describe a whole sequence; options are those of `ImageMethod`, but for `batch`: scans come one at a time.
+
+        Raises ValueError where the sequence has not the points or the labels that the method needs.
+        """
+        method = self.about["method"]
+        if isinstance(sequence, ImageSequence):
+            others = ", ".join(name for name, other in BASELINES.items() if other.input == "images")
+            raise ValueError(f"{method} needs points, found only images in sequence {sequence.name}; use {others}")
+        if self.labels and not sequence.has_labels:
+            raise ValueError(f"{method} needs labels beside the scans, found none in sequence {sequence.name}")
+        about = {"data": sequence.name, **self.about}
+        return embed_scans(self.describe, sequence, config=about, distance=self.distance, labels=self.labels, **options)
+
+
+Method = ImageMethod | ScanMethod
+
+
+def network(params: Params) -> ImageMethod:
     """The descriptors of `params`."""
     about = {"method": "sglpr", "model": dataclasses.asdict(params.config)}
-    return Method(functools.partial(describe, params), params.config.grid, about, weights_hash(params))
+    return ImageMethod(functools.partial(describe, params), params.config.grid, about, weights_hash(params))
 
 
 def reference(name: str, sequence: Drive, grid: Grid) -> Method:
-    """A reference without training, on whole images or on `grid`: `polar-fft` or `thumbnail`."""
+    """A reference without training, by its name in `BASELINES`: on points, on whole images, or on `grid`."""
+    if name not in BASELINES:
+        raise ValueError(f"no reference method {name!r}; there are {', '.join(BASELINES)}")
+    baseline = BASELINES[name]
+    return _on_images(name, sequence, grid) if baseline.input == "images" else _on_points(name, baseline)
+
+
+def _on_images(name: str, sequence: Drive, grid: Grid) -> ImageMethod:
     images_are_made = isinstance(sequence, ImageSequence)
-    radius = BEV_IMAGE_RADIUS if images_are_made else None
-    functions: dict[str, Callable] = {"polar-fft": functools.partial(polar_fft, radius=radius), "thumbnail": thumbnail}
-    if name not in functions:
-        raise ValueError(f"no reference method {name!r}; there are {', '.join(functions)}")
+    options = {"radius": BEV_IMAGE_RADIUS} if name == "polar-fft" and images_are_made else {}
     about = {"method": name} if images_are_made else {"method": name, "grid": dataclasses.asdict(grid)}
-    return Method(lambda images: functions[name](np.asarray(images)), None if images_are_made else grid, about)
+    describe = functools.partial(BASELINES[name].describe, **options)
+    return ImageMethod(lambda images: describe(np.asarray(images)), None if images_are_made else grid, about)
+
+
+def _on_points(name: str, baseline: Baseline) -> ScanMethod:
+    labels = baseline.input == "labelled points"
+
+    def describe_scan(points, classes):
+        return baseline.describe(points, classes) if labels else baseline.describe(points)
+
+    return ScanMethod(describe_scan, labels, baseline.distance, {"method": name})

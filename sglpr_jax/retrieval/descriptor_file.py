@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = "sglpr-jax descriptors 1"
+FORMAT = "sglpr-jax descriptors 2"
 """Stands in every file; its number grows when an older reader could no longer understand one."""
+FORMAT_1 = "sglpr-jax descriptors 1"
+"""Knew no distance: its descriptors are compared by L2."""
 
 REQUIRED = ("about", "ids", "descriptors")
-ABOUT = ("sequence", "pose_source", "config", "weights_hash")
+ABOUT = ("sequence", "pose_source", "config", "weights_hash", "distance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,8 @@ class DescriptorFile:
     """How the descriptors were made, as JSON can hold it."""
     weights_hash: str
     """Names the weights; empty for a method without any."""
+    distance: str = "l2"
+    """The name in `evaluation.distances` of the function that compares two descriptors."""
 
     def __post_init__(self):
         n = len(self.ids)
@@ -125,7 +129,9 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: expected JSON in `about`, found {str(text)[:40]!r}") from error
     found = about.get("format") if isinstance(about, dict) else about
-    if found != FORMAT:
+    if found == FORMAT_1:
+        about = {"distance": "l2", **about}
+    elif found != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT!r}, found {found!r}")
     if not set(ABOUT) <= set(about):
         raise ValueError(f"{path}: expected {', '.join(f'`{name}`' for name in ABOUT)}, found {', '.join(about)}")

@@ -1,19 +1,25 @@
-"""From scans or images to descriptors: any function of images, over a whole sequence."""
+"""From scans or images to descriptors: any function of images, or of points, over a whole sequence."""
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float32, Int32
 
 from sglpr_jax.bev import Grid, centre_crop, rasterize, rotate_image, rotate_points
-from sglpr_jax.data.sequence import Drive, ImageSequence
+from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
+from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 DescribeFn = Callable[[Float[Array, "b h w"]], Float[Any, "b d"]]
 """Images of point counts in, one descriptor each out."""
+DescribeScanFn = Callable[[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None], Float32[np.ndarray, " d"]]
+"""The points of one scan and, where asked for, their classes in; its descriptor out."""
+
+OnBadScan = Callable[[str, Exception], None]
+T = TypeVar("T")
 
 _POINTS_STEP = 16384
 """Clouds are padded to a multiple of this, so that few sizes are compiled."""
@@ -28,10 +34,10 @@ def embed(
     weights_hash: str = "",
     rotation_seed: int | None = None,
     batch: int = 16,
-    on_bad_scan: Callable[[str, Exception], None] | None = None,
+    on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
-    """Describe every scan of a sequence.
+    """Describe the image of every scan of a sequence.
 
     `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. With `rotation_seed`
     every scan is first turned about z by its own random angle. A scan that cannot be read raises its error, or, given
@@ -39,7 +45,11 @@ def embed(
     """
     angles = _angles(len(sequence), rotation_seed)
     rows, images, descriptors = [], [], []
-    for row, image in _images(sequence, grid, angles, on_bad_scan):
+
+    def read(row: int) -> Float[Array, "h w"]:
+        return read_image(sequence, row, grid, angle=None if angles is None else jnp.float32(angles[row]))
+
+    for row, image in _readable(sequence, read, on_bad_scan):
         rows.append(row)
         images.append(image)
         if len(images) == batch:
@@ -48,9 +58,55 @@ def embed(
             on_progress(row + 1)
     if images:
         descriptors.append(_describe_padded(describe, images, batch))
+    on_progress(len(sequence))
+    config = {**config, "rotation_seed": rotation_seed}
+    return _file(sequence, rows, descriptors, config=config, weights_hash=weights_hash)
+
+
+def embed_scans(
+    describe: DescribeScanFn,
+    sequence: ScanSequence,
+    *,
+    config: dict[str, Any],
+    distance: str,
+    labels: bool = False,
+    rotation_seed: int | None = None,
+    on_bad_scan: OnBadScan | None = None,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> DescriptorFile:
+    """Describe the finite points of every scan of a sequence, with `labels` and their classes.
+
+    `distance` names the function that compares the descriptors; the other options are those of `embed`, and equal seeds
+    turn by equal angles. Where labels are asked for, a scan without them is one that cannot be read.
+    """
+    angles = _angles(len(sequence), rotation_seed)
+    rows, descriptors = [], []
+    for row, (points, classes) in _readable(sequence, lambda row: _read_scan(sequence, row, labels), on_bad_scan):
+        rows.append(row)
+        descriptors.append(describe(points if angles is None else _turned(points, angles[row]), classes)[None])
+        on_progress(row + 1)
+    return _file(sequence, rows, descriptors, config={**config, "rotation_seed": rotation_seed}, distance=distance)
+
+
+def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
+    return None if seed is None else np.random.default_rng(seed).uniform(0, 2 * np.pi, n)
+
+
+def _readable(sequence: Drive, read: Callable[[int], T], on_bad_scan: OnBadScan | None) -> Iterator[tuple[int, T]]:
+    """Every readable scan's row and what `read` makes of it."""
+    for row in range(len(sequence)):
+        try:
+            yield row, read(row)
+        except (ValueError, OSError) as error:
+            if on_bad_scan is None:
+                raise
+            on_bad_scan(sequence.ids[row], error)
+
+
+def _file(sequence: Drive, rows: list[int], descriptors: list[np.ndarray], **about: Any) -> DescriptorFile:
+    """The descriptors of these rows of a sequence; ValueError where there are none."""
     if not rows:
         raise ValueError(f"sequence {sequence.name}: expected at least one readable scan, found none")
-    on_progress(len(sequence))
     return DescriptorFile(
         sequence=sequence.name,
         ids=tuple(sequence.ids[row] for row in rows),
@@ -58,30 +114,8 @@ def embed(
         times=None if sequence.times is None else sequence.times[rows],
         descriptors=np.concatenate(descriptors),
         pose_source=sequence.pose_source,
-        config={**config, "rotation_seed": rotation_seed},
-        weights_hash=weights_hash,
+        **{"weights_hash": "", **about},
     )
-
-
-def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
-    return None if seed is None else np.random.default_rng(seed).uniform(0, 2 * np.pi, n)
-
-
-def _images(
-    sequence: Drive,
-    grid: Grid | None,
-    angles: Float[np.ndarray, " n"] | None,
-    on_bad_scan: Callable[[str, Exception], None] | None,
-) -> Iterator[tuple[int, Array]]:
-    """Every readable scan's row and image."""
-    for row in range(len(sequence)):
-        angle = None if angles is None else jnp.float32(angles[row])
-        try:
-            yield row, read_image(sequence, row, grid, angle=angle)
-        except (ValueError, OSError) as error:
-            if on_bad_scan is None:
-                raise
-            on_bad_scan(sequence.ids[row], error)
 
 
 def read_image(
@@ -100,6 +134,27 @@ def read_image(
     padded = jnp.asarray(np.pad(points, ((0, padding), (0, 0))))
     padded = padded if angle is None else rotate_points(padded, angle)
     return rasterize(padded, grid=grid, count=count).astype(jnp.float32)
+
+
+def _read_scan(
+    sequence: ScanSequence, row: int, labels: bool
+) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
+    """The finite points of one scan and, with `labels`, their classes; ValueError where it has none."""
+    points = sequence.points(row)
+    finite = np.isfinite(points).all(axis=1)
+    if not labels:
+        return points[finite], None
+    raw = sequence.labels(row)
+    if raw is None:
+        raise ValueError(f"scan {sequence.ids[row]} of sequence {sequence.name}: expected labels, found none")
+    return points[finite], to_classes(raw[finite])
+
+
+def _turned(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndarray, "n 3"]:
+    """What `rotate_points` returns, without compiling for every number of points."""
+    x, y, z = points.astype(np.float64).T
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)
 
 
 def _describe_padded(describe: DescribeFn, images: list[Array], batch: int) -> Float[np.ndarray, "b d"]:

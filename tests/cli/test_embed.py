@@ -1,11 +1,15 @@
 import json
 import shutil
+from typing import get_args
 
 import numpy as np
 import pytest
 import safetensors.numpy
 
 import sglpr_jax
+from sglpr_jax.cli.embed import MethodName
+from sglpr_jax.evaluation.baselines import BASELINES
+from sglpr_jax.evaluation.distances import distance_function
 
 from .conftest import assert_one_line_error
 
@@ -167,3 +171,36 @@ def test_images_smaller_than_the_models_window_are_refused(embed, images, traine
     (folder / "config.json").write_text(json.dumps(config))
     ended, _ = embed("--data", images, "--seq", "06", "--weights", folder)
     assert_one_line_error(ended, "32 x 32", "(22, 20)")
+
+
+def test_every_baseline_can_be_chosen():
+    assert get_args(MethodName) == ("sglpr", *BASELINES)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_baseline_describes_a_sequence_and_names_its_distance(embed, town, name):
+    ended, out = embed("--method", name, "--data", town, "--seq", "08")
+    assert ended.status == 0, ended.error
+    file = load(out)
+    assert file.config["method"] == name and file.distance == BASELINES[name].distance and len(file) == 40
+    distances = distance_function(file.distance)(file.descriptors[:2], file.descriptors)
+    assert distances.shape == (2, 40)
+    assert distances[0, 0] < 1e-3 < distances[0, 1:].min()
+
+
+@pytest.mark.parametrize("name", [name for name, method in BASELINES.items() if method.input != "images"])
+def test_methods_on_points_refuse_images(embed, images, name):
+    ended, out = embed("--method", name, "--data", images, "--seq", "06", "--skip-bad")
+    assert_one_line_error(ended, f"{name} needs points", "only images in sequence 06", "polar-fft, thumbnail, random")
+    assert not out.exists()
+
+
+def test_semantic_scan_context_needs_labels(embed, scans):
+    ended, _ = embed("--method", "ssc", "--data", scans, "--skip-bad")
+    assert_one_line_error(ended, "ssc needs labels", "found none in sequence my_scans")
+
+
+def test_turned_points_have_other_descriptors(embed, town):
+    options = ("--method", "scan-context", "--data", town, "--seq", "08")
+    raw, turned = (load(embed(*options, *more)[1]) for more in ((), ("--rotate-seed", 1)))
+    assert (raw.descriptors != turned.descriptors).any(axis=1).all()

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ def file():
         pose_source="08/poses.txt (SemanticKITTI)",
         config={"preset": "small", "grid": {"resolution_m": 0.4}},
         weights_hash="abc",
+        distance="scan-context",
     )
 
 
@@ -115,8 +117,8 @@ def test_missing_arrays_are_listed(tmp_path):
 @pytest.mark.parametrize(
     ("about", "message"),
     [
-        ("{}", "expected format 'sglpr-jax descriptors 1', found None"),
-        ("[1]", r"expected format 'sglpr-jax descriptors 1', found \[1\]"),
+        ("{}", "expected format 'sglpr-jax descriptors 2', found None"),
+        ("[1]", r"expected format 'sglpr-jax descriptors 2', found \[1\]"),
         ("{", "expected JSON in `about`, found '{'"),
         ('{"format": "sglpr-jax descriptors 1"}', "expected `sequence`, `pose_source`, `config`, `weights_hash`"),
     ],
@@ -125,6 +127,22 @@ def test_another_format_is_refused(tmp_path, about, message):
     np.savez(tmp_path / "x.npz", about=np.array(about), ids=np.array(["0"]), descriptors=np.zeros((1, 4), np.float32))
     with pytest.raises(ValueError, match=r"x\.npz: .*" + message):
         DescriptorFile.load(tmp_path / "x.npz")
+
+
+def test_a_file_of_format_1_is_compared_by_l2(tmp_path, file):
+    path = tmp_path / "08.npz"
+    file.save(path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    about = json.loads(str(arrays["about"]))
+    del about["distance"]
+    old = {**about, "format": "sglpr-jax descriptors 1"}
+    np.savez(path, **{**arrays, "about": np.array(json.dumps(old))})
+    assert_same(DescriptorFile.load(path), dataclasses.replace(file, distance="l2"))
+    new = {**about, "format": "sglpr-jax descriptors 2"}
+    np.savez(path, **{**arrays, "about": np.array(json.dumps(new))})
+    with pytest.raises(ValueError, match=r"expected .*`distance`, found"):
+        DescriptorFile.load(path)
 
 
 def test_a_file_whose_arrays_disagree_is_named(tmp_path, file):

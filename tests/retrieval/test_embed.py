@@ -10,7 +10,7 @@ import pytest
 from sglpr_jax.bev import Grid, rasterize, rotate_image, rotate_points
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import embed
+from sglpr_jax.retrieval.embed import embed, embed_scans
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 SCANS = 7
@@ -54,6 +54,11 @@ def pictures() -> ImageSequence:
         resolution_m=0.4,
         read_image=lambda path: values[int(path.stem)],
     )
+
+
+def mean_point(points, classes):
+    """A method on points whose descriptor is their mean and, where there are classes, the mean class."""
+    return np.append(points.mean(axis=0), [] if classes is None else classes.mean()).astype(np.float32)
 
 
 def with_bad_scan(sequence: ScanSequence, *bad: int) -> ScanSequence:
@@ -162,3 +167,46 @@ def test_a_source_without_poses_can_be_embedded(scans):
     bare = dataclasses.replace(scans, positions=None, times=None, pose_source=None)
     found = embed(flatten, bare, GRID, config={})
     assert found.positions is None and found.times is None and len(found) == SCANS
+
+
+def test_points_are_described_scan_by_scan(scans):
+    seen = []
+    found = embed_scans(mean_point, scans, config={"method": "mean"}, distance="cosine", on_progress=seen.append)
+    np.testing.assert_array_equal(found.descriptors, [cloud.mean(axis=0) for cloud in clouds()])
+    assert (found.distance, found.weights_hash, found.ids, seen) == ("cosine", "", scans.ids, [*range(1, SCANS + 1)])
+    assert found.config == {"method": "mean", "rotation_seed": None}
+
+
+def test_points_are_turned_as_images_are(scans):
+    found = embed_scans(mean_point, scans, config={}, distance="l2", rotation_seed=3)
+    expected = [
+        np.asarray(rotate_points(jnp.asarray(cloud), jnp.float32(angle))).mean(axis=0)
+        for cloud, angle in zip(clouds(), drawn_angles(3), strict=True)
+    ]
+    np.testing.assert_allclose(found.descriptors, expected, atol=1e-5)
+
+
+def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_path):
+    raw = [np.resize(np.array([10, 50, 71], "<u4"), len(cloud)) for cloud in clouds()]
+    paths = tuple(tmp_path / f"{i}.label" for i in range(SCANS))
+    for path, ids in zip(paths, raw, strict=True):
+        ids.tofile(path)
+
+    def read(path):
+        points = scans.read_scan(path).copy()
+        points[0] = np.nan
+        return points
+
+    labelled = dataclasses.replace(scans, label_paths=paths, read_scan=read)
+    found = embed_scans(mean_point, labelled, config={}, distance="l2", labels=True)
+    classes = np.select([raw[0] == 10, raw[0] == 50], [1, 13], 16)
+    np.testing.assert_allclose(found.descriptors[0], [*clouds()[0][1:].mean(axis=0), classes[1:].mean()], rtol=1e-5)
+
+    partly = dataclasses.replace(labelled, label_paths=(*paths[:2], None, *paths[3:]))
+    with pytest.raises(ValueError, match="scan 000004 of sequence 08: expected labels, found none"):
+        embed_scans(mean_point, partly, config={}, distance="l2", labels=True)
+    reported = []
+    kept = embed_scans(
+        mean_point, partly, config={}, distance="l2", labels=True, on_bad_scan=lambda name, _: reported.append(name)
+    )
+    assert reported == ["000004"] and len(kept) == SCANS - 1

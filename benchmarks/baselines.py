@@ -1,0 +1,102 @@
+"""Every baseline on one sequence, as recorded and with every scan turned by its own random angle: one table."""
+
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from sglpr_jax.cli.methods import reference
+from sglpr_jax.cli.runtime import console, progress_bar
+from sglpr_jax.data import Drive, open_sequence
+from sglpr_jax.evaluation.baselines import BASELINES
+from sglpr_jax.evaluation.distances import distance_function
+from sglpr_jax.metrics import decision_curve
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M, database_end, revisits
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+ROTATION_SEED = 0
+
+
+class Score(NamedTuple):
+    """What a method reached, how long a descriptor is, and what it took in seconds."""
+
+    f1_max: float
+    recall_at_1: float
+    numbers: int
+    per_scan_s: float
+    per_pair_s: float
+
+
+def main(data: Path, *, seq: str | None = None, methods: tuple[str, ...] = tuple(BASELINES)) -> None:
+    """Score baselines by top-1 retrieval: 3 m / 20 m, the last 30 s excluded.
+
+    Args:
+        data: a dataset in KITTI's layout; ssc needs labels in it. In a town without revisits there is nothing to score.
+        seq: which sequence; may be left out where there is only one.
+        methods: which baselines, by their names in bin/embed.
+    """
+    sequence = open_sequence(data, seq)
+    scores = {}
+    with progress_bar("baselines", 2 * len(methods)) as show:
+        for name in methods:
+            raw, rotated = (score(name, sequence, seed) for seed in (None, ROTATION_SEED))
+            scores[name] = raw, rotated
+            show(2 * len(scores))
+    console().print(table(scores, title=f"{data.name} {sequence.name}, {describe(sequence)}"))
+
+
+def describe(sequence: Drive) -> str:
+    """How much the scores rest on."""
+    if sequence.positions is None or not (found := revisits(sequence.positions, times=sequence.times)).any():
+        raise SystemExit(f"expected positions with revisits to score against, found none in sequence {sequence.name}")
+    return f"{len(sequence)} scans, {found.sum()} revisits"
+
+
+def score(name: str, sequence: Drive, seed: int | None) -> Score:
+    """Describe the sequence, compare all with all, and score."""
+    start = time.perf_counter()
+    file = reference(name, sequence, model_preset("small").grid).embed(sequence, rotation_seed=seed)
+    described = time.perf_counter()
+    distances = distance_function(file.distance)(file.descriptors, file.descriptors)
+    compared = time.perf_counter()
+    f1_max, recall_at_1 = top1(distances, file)
+    per_scan_s, per_pair_s = (described - start) / len(file), (compared - described) / len(file) ** 2
+    return Score(f1_max, recall_at_1, file.descriptors.shape[1], per_scan_s, per_pair_s)
+
+
+def top1(distances: np.ndarray, file: DescriptorFile) -> tuple[float, float]:
+    """Return F1max and Recall@1 of distances (n, n) by the rule of `protocols.top1_f1max`."""
+    assert file.positions is not None
+    ends = database_end(len(file), times=file.times)
+    queries = np.flatnonzero(ends)
+    allowed = np.where(np.arange(len(file)) < ends[queries, None], distances[queries], np.inf)
+    nearest = np.argmin(allowed, axis=1)
+    apart = np.linalg.norm(file.positions[queries] - file.positions[nearest], axis=1)
+    revisited = revisits(file.positions, times=file.times)[queries]
+    curve = decision_curve(
+        -allowed[np.arange(len(queries)), nearest].astype(np.float64),
+        true_if_accepted=apart <= POSITIVE_M,
+        false_if_accepted=apart > NEGATIVE_M,
+        missed_if_rejected=revisited,
+    )
+    return curve.f1_max, float(np.mean(apart[revisited] <= POSITIVE_M))
+
+
+def table(scores: dict[str, tuple[Score, Score]], *, title: str) -> Table:
+    """One row per method."""
+    columns = ("F1max", "rotated", "Recall@1", "rotated", "ms / scan", "µs / pair")
+    rows = Table("method", "input", "numbers", "distance", *columns, title=title)
+    for name, (raw, rotated) in scores.items():
+        reached = (raw.f1_max, rotated.f1_max, raw.recall_at_1, rotated.recall_at_1)
+        took = (f"{1e3 * raw.per_scan_s:.0f}", f"{1e6 * raw.per_pair_s:.1f}")
+        about = (BASELINES[name].input, str(raw.numbers), BASELINES[name].distance)
+        rows.add_row(name, *about, *(f"{value:.3f}" for value in reached), *took)
+    return rows
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,42 @@
+"""For distances between all pairs of two sets of descriptors: blocks that bound the memory, and all shifts at once."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+Rows = Float32[np.ndarray, "rows d"]
+
+
+def in_blocks(
+    compare: Callable[[Any, Any], np.ndarray],
+    queries: Float32[np.ndarray, "q d"],
+    database: Float32[np.ndarray, "n d"],
+    *,
+    block: int,
+    prepare: Callable[[Rows], Any] = lambda rows: rows,
+) -> Float32[np.ndarray, "q n"]:
+    """Return `compare(prepare(queries), prepare(database))`, computed for at most `block` x `block` pairs at a time."""
+    out = np.empty((len(queries), len(database)), np.float32)
+    for column in range(0, len(database), block):
+        prepared = prepare(database[column : column + block])
+        for row in range(0, len(queries), block):
+            found = compare(prepare(queries[row : row + block]), prepared)
+            out[row : row + block, column : column + block] = found
+    return out
+
+
+def correlate(
+    queries: Float32[np.ndarray, "q rings sectors"], database: Float32[np.ndarray, "n rings sectors"]
+) -> Float32[np.ndarray, "q n sectors"]:
+    """Return the sums over rings r and sectors j of queries[r, j] * database[r, j + shift], for all circular shifts."""
+    return correlate_spectra(np.fft.rfft(queries), np.fft.rfft(database), sectors=queries.shape[-1])
+
+
+def correlate_spectra(
+    queries: np.ndarray, database: np.ndarray, *, sectors: int
+) -> Float32[np.ndarray, "q n {sectors}"]:
+    """Return what `correlate` does, from the Fourier transforms along the sectors: complex (q, rings, frequencies)."""
+    by_frequency = np.moveaxis(queries, -1, 0).conj() @ np.moveaxis(database, -1, 0).swapaxes(1, 2)
+    return np.fft.irfft(np.moveaxis(by_frequency, 0, -1), n=sectors)
