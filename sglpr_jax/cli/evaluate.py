@@ -33,8 +33,6 @@ def evaluate_file(command: EvaluateCommand) -> Path:
         raise ValueError(
             f"{command.file}: expected positions to score against, found descriptors of scans without poses"
         )
-    if file.distance != "l2":
-        raise ValueError(f"{command.file}: expected descriptors to compare by l2, found some for {file.distance}")
     results = evaluate(file)
     folder = command.out or command.file.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)

@@ -51,12 +51,6 @@ def test_every_protocol_is_printed_written_and_drawn(command, drive, tmp_path):
             assert min(picture.size) > 200
 
 
-def test_descriptors_that_are_not_compared_by_l2_are_refused(command, drive, tmp_path):
-    dataclasses.replace(drive, distance="scan-context").save(tmp_path / "08.npz")
-    ended = command("evaluate", tmp_path / "08.npz")
-    assert_one_line_error(ended, tmp_path / "08.npz", "compare by l2", "scan-context")
-
-
 def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, drive, tmp_path):
     dataclasses.replace(drive, times=None).save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz", "--out", tmp_path / "a" / "b")

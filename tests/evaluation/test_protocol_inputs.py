@@ -180,8 +180,10 @@ def test_protocols_go_by_their_name():
 @pytest.mark.parametrize("name", CROSS_SESSION_PROTOCOLS)
 def test_sessions_must_be_described_alike(make_file, two_laps, name):
     database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
-    with pytest.raises(ValueError, match="expected descriptors of 4 numbers in later as in town, found 5"):
+    with pytest.raises(ValueError, match="of 4 numbers, compared by l2, in later as in town; found 5, l2"):
         CROSS_SESSION_PROTOCOLS[name](database, queries)
+    with pytest.raises(ValueError, match="compared by l2, in town as in town; found 4, cosine"):
+        CROSS_SESSION_PROTOCOLS[name](database, replace(database, distance="cosine"))
     with pytest.raises(ValueError, match="expected positions to score sequence town"):
         CROSS_SESSION_PROTOCOLS[name](replace(database, positions=None), database)
 

@@ -8,7 +8,7 @@ import numpy as np
 from sglpr_jax.evaluation.protocols.nearest import first_hits, has_near, nearest_descriptors, nearest_frames
 from sglpr_jax.evaluation.protocols.recall import recall_decisions, score_recall
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.evaluation.protocols.source import Source, check_same_length, pose_sources, positions_of
+from sglpr_jax.evaluation.protocols.source import Source, check_comparable, pose_sources, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 POSITIVE_M = 5.0
@@ -58,10 +58,10 @@ def bevplace_nclt_recall(database: DescriptorFile, queries: DescriptorFile, *, s
     the map, and 2012-02-04, 03-17, 06-15, 09-28, 11-16 and 2013-02-23 as queries (zjuluolun/BEVPlace2,
     nclt_dataset.py); which frames were taken is not published. The interval resamples the queries that count.
     """
-    check_same_length(database, queries)
+    check_comparable(database, queries)
     there, here = positions_of(database, 2), positions_of(queries, 2)
     ends = np.full(len(here), len(there))
-    nearest, _ = nearest_descriptors(queries.descriptors, database.descriptors, ends)
+    nearest, _ = nearest_descriptors(queries.descriptors, database.descriptors, ends, distance=database.distance)
     result = Result(
         name="NCLT Recall@1",
         rule=f"{POSITIVE_M:g} m, map {database.sequence}, queries {queries.sequence}",

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sglpr_jax.evaluation.distances import distance_function
 from sglpr_jax.evaluation.protocols.source import Source, TopK
 from sglpr_jax.poses import distances
 
@@ -24,7 +25,7 @@ def nearest_frames(
     best. -1 fills a row that has fewer; without any the distance is infinite."""
     if isinstance(source, TopK):
         return source.lookup(queries, ends, k)
-    return nearest_descriptors(source.descriptors[queries], source.descriptors, ends, k=k)
+    return nearest_descriptors(source.descriptors[queries], source.descriptors, ends, k=k, distance=source.distance)
 
 
 def nearest_descriptors(
@@ -33,21 +34,33 @@ def nearest_descriptors(
     ends: Int[np.ndarray, " q"],
     *,
     k: int = 1,
+    distance: str = "l2",
 ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-    """Return for each query the nearest k of the first `ends` >= 1 descriptors (L2), and the distance of the nearest.
+    """Return for each query the nearest k of the first `ends` >= 1 descriptors, and the distance of the nearest.
 
-    -1 fills a row that has fewer than k.
+    `distance` is the name of one (`distances.DISTANCES`). -1 fills a row that has fewer than k.
     """
-    norms = np.sum(database**2, axis=1)
-    nearest = np.full((len(queries), k), -1, dtype=np.int64)
+    compare = _ranking(database, distance)
+    nearest, best = np.full((len(queries), k), -1, dtype=np.int64), np.zeros(len(queries))
     for start in range(0, len(queries), BLOCK):
         rows = slice(start, start + BLOCK)
-        # |q - d|^2 without |q|^2, which is the same for the whole row.
-        ranking = norms[None, :] - 2 * queries[rows] @ database.T
+        ranking = compare(queries[rows])
         ranking[np.arange(len(database)) >= ends[rows, None]] = np.inf
         nearest[rows, : min(k, len(database))] = _smallest(ranking, min(k, len(database)))
-    distance = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
-    return np.where(nearest < ends[:, None], nearest, -1), distance
+        best[rows] = np.take_along_axis(ranking, nearest[rows, :1], axis=1)[:, 0]
+    if distance == "l2":
+        best = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
+    return np.where(nearest < ends[:, None], nearest, -1), best
+
+
+def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of queries that ranks the database as the named distance does."""
+    if distance != "l2":
+        compare = distance_function(distance)
+        return lambda queries: compare(queries, database)
+    # |q - d|^2 without |q|^2, which is the same for a whole row.
+    norms = np.sum(database**2, axis=1)
+    return lambda queries: norms[None, :] - 2 * queries @ database.T
 
 
 def has_near(

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax import metrics
+from sglpr_jax.evaluation.distances import distance_function
 from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.poses import distances
@@ -16,6 +17,8 @@ BLOCK = 32
 """Frames compared with all others at a time."""
 PAIR_BLOCK = 1 << 10
 """Pairs compared at a time: so few that their descriptors stay in the cache."""
+PARTNERS = 64
+"""Partners of a frame are compared a multiple of so many at a time."""
 
 
 def score_pairs(
@@ -63,14 +66,27 @@ def frame_pairs(
     return np.concatenate(found)
 
 
-def pair_distances(
-    descriptors: Float[np.ndarray, "n d"], pairs: Int[np.ndarray, "2 pairs"]
-) -> Float[np.ndarray, " pairs"]:
-    """Return the distance between the descriptors of each pair."""
+def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
+    """Return the distance between the descriptors of each pair, by the file's own distance."""
+    if file.distance != "l2":
+        return _distances_by_row(file, pairs)
     apart = np.empty(pairs.shape[1])
     for start in range(0, pairs.shape[1], PAIR_BLOCK):
         i, j = pairs[:, start : start + PAIR_BLOCK]
-        apart[start : start + PAIR_BLOCK] = np.linalg.norm(descriptors[i] - descriptors[j], axis=1)
+        apart[start : start + PAIR_BLOCK] = np.linalg.norm(file.descriptors[i] - file.descriptors[j], axis=1)
+    return apart
+
+
+def _distances_by_row(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
+    """Return the same where a distance is known between sets only: those of each first frame to all its partners."""
+    compare, apart = distance_function(file.distance), np.empty(pairs.shape[1])
+    order = np.argsort(pairs[0], kind="stable")
+    starts = np.flatnonzero(np.diff(pairs[0][order], prepend=-1))
+    for of_one in np.split(order, starts[1:]):
+        # Partners are repeated to a round number: a distance that is compiled is then compiled for few shapes.
+        partners = np.resize(pairs[1, of_one], -(-len(of_one) // PARTNERS) * PARTNERS)
+        found = compare(file.descriptors[pairs[0, of_one[:1]]], file.descriptors[partners])
+        apart[of_one] = found[0, : len(of_one)]
     return apart
 
 
@@ -85,5 +101,5 @@ def score_drawn_pairs(
     """Complete `result` with pairs that `frame_pairs` found."""
     pairs = np.stack(np.divmod(np.concatenate([positive, negative]), len(file)))
     is_positive = np.arange(pairs.shape[1]) < len(positive)
-    scores = -pair_distances(file.descriptors, pairs) if len(positive) else np.zeros(pairs.shape[1])
+    scores = -pair_distances(file, pairs) if len(positive) else np.zeros(pairs.shape[1])
     return score_pairs(result, pairs, scores, is_positive, seed=seed)

@@ -10,7 +10,7 @@ from sglpr_jax.evaluation.protocols.bootstrap import interval, resampled_means
 from sglpr_jax.evaluation.protocols.nearest import first_hits, has_near, nearest_descriptors
 from sglpr_jax.evaluation.protocols.recall import recall_at
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.evaluation.protocols.source import check_same_length, pose_sources, positions_of
+from sglpr_jax.evaluation.protocols.source import check_comparable, pose_sources, positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 POSITIVE_M = 25.0
@@ -51,10 +51,12 @@ def _retrieve(
     database: DescriptorFile, queries: DescriptorFile
 ) -> tuple[Int[np.ndarray, " q"], Bool[np.ndarray, " q"], int]:
     """Return the rank of each query's first right answer, which queries count, and how many answers are 1 %."""
-    check_same_length(database, queries)
+    check_comparable(database, queries)
     there, here = positions_of(database, 2), positions_of(queries, 2)
     ends = np.full(len(here), len(there))
-    nearest, _ = nearest_descriptors(queries.descriptors, database.descriptors, ends, k=NEIGHBOURS)
+    nearest, _ = nearest_descriptors(
+        queries.descriptors, database.descriptors, ends, k=NEIGHBOURS, distance=database.distance
+    )
     one_percent = min(max(round(len(there) / 100), 1), NEIGHBOURS)
     return first_hits(here, there, nearest, _near), has_near(here, there, ends, _near), one_percent
 

@@ -47,7 +47,7 @@ def score_listed_pairs(
 ) -> ScoredPairs:
     """Return listed pairs of rows of a descriptor file with the negated distances of their descriptors."""
     check_frames("pairs of", pairs, 0, len(file))
-    return ScoredPairs(pairs, -pair_distances(file.descriptors, pairs.T), labels, file.positions, file.pose_source)
+    return ScoredPairs(pairs, -pair_distances(file, pairs.T), labels, file.positions, file.pose_source)
 
 
 def scored_pairs_f1max(listed: ScoredPairs, *, seed: int = 0) -> Result:

@@ -86,12 +86,13 @@ def check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) 
         raise ValueError(f"expected {what} frames from {first} to {n - 1}, found {found} in row {row}")
 
 
-def check_same_length(database: DescriptorFile, queries: DescriptorFile) -> None:
-    """Raise ValueError unless both files' descriptors have as many numbers."""
-    there, here = database.descriptors.shape[1], queries.descriptors.shape[1]
+def check_comparable(database: DescriptorFile, queries: DescriptorFile) -> None:
+    """Raise ValueError unless both files' descriptors have as many numbers and the same distance."""
+    there, here = ((file.descriptors.shape[1], file.distance) for file in (database, queries))
     if there != here:
         raise ValueError(
-            f"expected descriptors of {there} numbers in {queries.sequence} as in {database.sequence}, found {here}"
+            f"expected descriptors of {there[0]} numbers, compared by {there[1]}, in {queries.sequence} as in "
+            f"{database.sequence}; found {here[0]}, {here[1]}"
         )
 
 

@@ -1,0 +1,62 @@
+"""Protocols compare descriptors by the distance that their file names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sglpr_jax.evaluation.distances import distance_function
+from sglpr_jax.evaluation.protocols import CROSS_SESSION_PROTOCOLS, PROTOCOLS
+from sglpr_jax.evaluation.protocols.nearest import nearest_descriptors
+from sglpr_jax.evaluation.protocols.pairs import pair_distances
+
+from .by_the_letter import random_drive
+
+
+@pytest.fixture(scope="module")
+def by_cosine(make_file):
+    positions, descriptors, times = random_drive(0, n=230)
+    return replace(make_file(positions, descriptors, times=times), distance="cosine")
+
+
+@pytest.fixture(scope="module")
+def of_unit_length(by_cosine):
+    """The same directions, compared by L2: they rank alike."""
+    lengths = np.linalg.norm(by_cosine.descriptors, axis=1, keepdims=True)
+    return replace(by_cosine, descriptors=by_cosine.descriptors / lengths, distance="l2")
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_cosine_is_l2_of_unit_length(by_cosine, of_unit_length, name):
+    protocol = PROTOCOLS[name]
+    expected = protocol(of_unit_length).score
+    assert protocol(by_cosine).score == pytest.approx(expected, abs=1e-6)
+    assert expected > 0.05
+
+
+@pytest.mark.parametrize("name", CROSS_SESSION_PROTOCOLS)
+def test_so_it_is_across_sessions(by_cosine, of_unit_length, name):
+    def scored(file):
+        other = replace(file, descriptors=file.descriptors[::-1], positions=file.positions[::-1] + 2.0)
+        return CROSS_SESSION_PROTOCOLS[name](file, other).score
+
+    assert scored(by_cosine) == pytest.approx(scored(of_unit_length), abs=1e-6)
+
+
+def test_without_its_distance_the_same_file_scores_otherwise(by_cosine):
+    by_l2 = replace(by_cosine, distance="l2")
+    assert PROTOCOLS["pairs-f1max"](by_l2).score != pytest.approx(PROTOCOLS["pairs-f1max"](by_cosine).score, abs=1e-3)
+
+
+def test_a_distance_between_sets_serves_for_pairs_and_for_neighbours(make_file):
+    rng = np.random.default_rng(0)
+    rows = rng.uniform(size=(90, 1200)).astype(np.float32)
+    file = replace(make_file(np.zeros((90, 3)), rows), distance="scan-context")
+    table = distance_function("scan-context")(rows, rows)
+    pairs = rng.integers(90, size=(2, 700))
+    np.testing.assert_allclose(pair_distances(file, pairs), table[pairs[0], pairs[1]], atol=1e-6)
+    ends = np.arange(1, 91)
+    nearest, best = nearest_descriptors(rows, rows, ends, k=3, distance="scan-context")
+    for i in range(3, 90):
+        np.testing.assert_array_equal(nearest[i], np.argsort(table[i, : i + 1])[:3])
+    np.testing.assert_allclose(best, table[np.arange(90), nearest[:, 0]], atol=1e-6)
