@@ -95,28 +95,51 @@ def learning_curve(
 
 def segmentation_panel(
     bev: Num[np.ndarray, "h w"],
-    truth: Int[np.ndarray, "h w"],
+    truth: Int[np.ndarray, "h w"] | None,
     prediction: Int[np.ndarray, "h w"],
     *,
     resolution_m: float,
     title: str = "",
 ) -> "matplotlib.figure.Figure":
-    """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7)."""
-    figure = _figure(11.0, 4.9)
+    """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7).
+
+    Without a truth it has no panel.
+    """
+    pictures = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
+    if truth is not None:
+        pictures["true classes"] = COLORS[truth]
+    pictures["predicted classes"] = COLORS[prediction]
+    figure = _figure(3.7 * len(pictures), 4.9)
     figure.suptitle(title)
-    brightness = np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
-    pictures = {
-        "point counts": np.repeat(brightness[..., None], 3, axis=-1),
-        "true classes": COLORS[truth],
-        "predicted classes": COLORS[prediction],
-    }
     height, width = np.array(bev.shape) * resolution_m / 2
-    for axes, (name, picture) in zip(figure.subplots(1, 3, sharey=True), pictures.items(), strict=True):
+    for axes, (name, picture) in zip(figure.subplots(1, len(pictures), sharey=True), pictures.items(), strict=True):
         axes.imshow(picture, extent=(-width, width, -height, height), interpolation="nearest")
         axes.set(title=name, xlabel="x [m]")
     figure.axes[0].set_ylabel("y [m]")
-    _add_class_legend(figure, np.union1d(truth, prediction))
+    _add_class_legend(figure, np.unique(prediction) if truth is None else np.union1d(truth, prediction))
     return figure
+
+
+def heat_maps(
+    bev: Num[np.ndarray, "h w"], maps: Mapping[str, Float[np.ndarray, "h w"]], *, title: str = ""
+) -> "matplotlib.figure.Figure":
+    """Draw point counts and named maps of how strongly features answer, each on its own scale (figure 8)."""
+    figure = _figure(2.1 * (1 + len(maps)), 2.6)
+    figure.suptitle(title)
+    panels = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
+    panels[0].imshow(brightness(bev), cmap="gray")
+    panels[0].set_title("point counts", fontsize=9)
+    for axes, (name, values) in zip(panels[1:], maps.items(), strict=True):
+        axes.imshow(values, cmap="inferno")
+        axes.set_title(name, fontsize=9)
+    for axes in panels:
+        axes.set_axis_off()
+    return figure
+
+
+def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return point counts as grey values from 0 to 1, by their logarithm."""
+    return np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
 
 
 def _figure(width: float, height: float) -> "matplotlib.figure.Figure":
