@@ -67,17 +67,17 @@ def _format_of(path: Path) -> str:
 
 
 def _read_kitti(path: Path) -> Trajectory:
-    return Trajectory(positions_from_camera(read_poses(path)), None, f"{path} (camera)")
+    return Trajectory(positions_from_camera(read_poses(path)), None, _said(path, "camera"))
 
 
 def _read_lidar(path: Path) -> Trajectory:
-    return Trajectory(read_poses(path)[:, :, 3], None, f"{path} (z up)")
+    return Trajectory(read_poses(path)[:, :, 3], None, _said(path, "z up"))
 
 
 def _read_tum(path: Path) -> Trajectory:
     rows = read_rows(path, columns=8)
     check_times(path, rows[:, 0])
-    return Trajectory(rows[:, 1:4], rows[:, 0], f"{path} (TUM)")
+    return Trajectory(rows[:, 1:4], rows[:, 0], _said(path, "TUM"))
 
 
 def _read_csv(path: Path) -> Trajectory:
@@ -90,7 +90,12 @@ def _read_csv(path: Path) -> Trajectory:
     columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
     if "t" in columns:
         check_times(path, columns["t"])
-    return Trajectory(np.stack([columns[axis] for axis in "xyz"], axis=1), columns.get("t"), f"{path} (csv)")
+    return Trajectory(np.stack([columns[axis] for axis in "xyz"], axis=1), columns.get("t"), _said(path, "csv"))
+
+
+def _said(path: Path, format: str) -> str:
+    """Name the file shortly: a table has no room for a whole path."""
+    return f"{Path(*path.parts[-2:])} ({format})"
 
 
 READERS = {"kitti": _read_kitti, "lidar": _read_lidar, "tum": _read_tum, "csv": _read_csv}

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 DOTS_PER_INCH = 150
+MOST_INSIDE = 4
+"""So many lines are named inside the axes; more names would cover the lines."""
 
 DECISIONS = {
     Decision.NOT_A_QUERY: ("not a query", "#c8c8c8", 4),
@@ -41,14 +43,18 @@ def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
     """Draw precision over recall, a line for each named curve with a dot where F1 is highest (figure 5)."""
-    figure = _figure(5.2, 4.8)
+    many = len(curves) > MOST_INSIDE
+    figure = _figure(8.0 if many else 5.2, 4.8)
     axes = figure.add_subplot(title=title, xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
     _draw_equal_f1(axes)
     for name, curve in curves.items():
         (line,) = axes.plot(curve.recall, curve.precision, linewidth=1.8, label=f"{name} {curve.f1_max:.3f}")
         axes.plot(curve.recall[curve.best], curve.precision[curve.best], "o", color=line.get_color(), markersize=6)
     axes.set_aspect("equal")
-    axes.legend(title="dot: highest F1", loc="lower left", framealpha=0.95)
+    if many:
+        figure.legend(title="dot: highest F1", loc="outside right upper", frameon=False)
+    else:
+        axes.legend(title="dot: highest F1", loc="lower left", framealpha=0.95)
     return figure
 
 
@@ -56,7 +62,8 @@ def trajectory(
     positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
     """Draw every frame where it was taken, seen from above, coloured by its `Decision` (figure 6)."""
-    figure = _figure(7.0, 5.6)
+    across, along = np.ptp(positions[:, :2], axis=0)
+    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))  # a long street lies flat
     axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
     for decision, (name, colour, size) in DECISIONS.items():
         x, y = positions[decisions == decision, :2].T
@@ -109,7 +116,7 @@ def segmentation_panel(
     if truth is not None:
         pictures["true classes"] = COLORS[truth]
     pictures["predicted classes"] = COLORS[prediction]
-    figure = _figure(3.7 * len(pictures), 4.9)
+    figure = _figure(3.7 * len(pictures), 5.2)
     figure.suptitle(title)
     height, width = np.array(bev.shape) * resolution_m / 2
     for axes, (name, picture) in zip(figure.subplots(1, len(pictures), sharey=True), pictures.items(), strict=True):

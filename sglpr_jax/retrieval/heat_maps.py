@@ -8,24 +8,32 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from sglpr_jax.models.polar import from_polar
-from sglpr_jax.models.sglpr import Params, forward
-
-NAMES = {
-    "patch_embed": "patches",
-    "bottleneck_norm": "bottleneck",
-    "norm_up": "decoder",
-    "cbam": "CBAM",
-}
-"""Which intermediates of the network are shown, and as what."""
+from sglpr_jax.models.sglpr import Params, field_of_view, forward
 
 
 def heat_maps(params: Params, bev: Num[Array | np.ndarray, "h w"]) -> Mapping[str, Float[np.ndarray, "h w"]]:
-    """Return by name the root mean square over the channels of a feature map, from 0 to 1.
+    """Return by name the root mean square over the channels of a feature map, from 0 to 1; NaN where it does not look.
 
-    A polar map is read back onto the grid; beyond its circle it is 0.
+    The maps are those after the first and the last stage of the encoder, after the decoder, and after CBAM.
     """
     found = jax.device_get(_maps(params, jnp.asarray(bev)))
-    return {name: values / max(float(values.max()), 1e-9) for name, values in found.items()}
+    return {name: _scaled(found[layer]) for name, layer in _layers(params).items()}
+
+
+def _layers(params: Params) -> dict[str, str]:
+    """Return which intermediate is shown under which name; a normalised one would be as strong everywhere."""
+    last = len(params.config.depths) - 1
+    return {
+        "encoder, first": "enc0_out",
+        "encoder, last": f"enc{last}_out",
+        "decoder": f"dec{last}_out",
+        "CBAM": "cbam",
+    }
+
+
+def _scaled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    low, high = np.nanmin(values), np.nanmax(values)
+    return (values - low) / max(high - low, 1e-9)
 
 
 @jax.jit
@@ -36,7 +44,9 @@ def _maps(params: Params, bev: Num[Array, "h w"]) -> dict[str, Float[Array, "h w
     def on_grid(features: Float[Array, "1 p q c"]) -> Float[Array, "h w"]:
         strength = jnp.sqrt(jnp.mean(features**2, axis=-1, keepdims=True))
         if params.config.polar:
-            return from_polar(strength, grid)[0, ..., 0]
-        return jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
+            whole = from_polar(strength, grid)[0, ..., 0]
+        else:
+            whole = jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
+        return jnp.where(field_of_view(params.config)[0], whole, jnp.nan)
 
-    return {shown: on_grid(outputs.intermediates[name]) for name, shown in NAMES.items()}
+    return {layer: on_grid(outputs.intermediates[layer]) for layer in set(_layers(params).values())}

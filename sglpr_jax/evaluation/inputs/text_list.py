@@ -1,6 +1,6 @@
 """Text files with one item a line; empty lines and lines that start with # say nothing."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +40,7 @@ def check_rows(where: list[str], frames: Int[np.ndarray, "rows _"], n: int, sour
         raise ValueError(f"{where[row]}: expected frames from 0 to {n - 1} ({source}), found {frames[row, column]}")
 
 
-def padded(rows: list[list[float]], fill: float) -> Float[np.ndarray, "rows columns"]:
+def padded(rows: Sequence[Sequence[int | float]], fill: int | float) -> Float[np.ndarray, "rows columns"]:
     """Return rows of unequal length as one array, with at least one column."""
     columns = max([1, *map(len, rows)])
     return np.array([[*row, *[fill] * (columns - len(row))] for row in rows], dtype=np.float64)

@@ -26,10 +26,10 @@ h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 0.9rem; }
 th, td { padding: 0.35rem 0.7rem; text-align: left; vertical-align: top; border-bottom: 1px solid #e4e4e4;
-  white-space: pre-line; }
+  white-space: pre-line; overflow-wrap: break-word; }
 th { background: #f5f5f5; }
 td.number { font-variant-numeric: tabular-nums; white-space: pre; }
-figure { margin: 0.8rem 0; }
+figure { margin: 0.8rem 0; display: inline-block; vertical-align: top; }
 figure img { max-width: 100%; }
 .pairs { display: flex; flex-wrap: wrap; gap: 1.2rem 2rem; }
 .pairs figure { width: 21rem; margin: 0; }
@@ -74,12 +74,13 @@ def missing(text: str) -> str:
     return f'<p class="missing">{escape(text)}</p>'
 
 
-def figure_html(figure: "matplotlib.figure.Figure", name: str) -> str:
-    """Return a matplotlib figure as a picture in the page; `name` says what it shows."""
+def figure_html(figure: "matplotlib.figure.Figure", name: str, *, caption: str = "") -> str:
+    """Return a matplotlib figure as a picture in the page; `name` says what it shows, the caption below it more."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=DOTS_PER_INCH)
     width = round(figure.get_figwidth() * 96)  # a CSS pixel is 1/96 of an inch
-    return f'<figure><img src="{_uri(stream)}" width="{width}" alt="{escape(name)}"></figure>'
+    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f'<figure><img src="{_uri(stream)}" width="{width}" alt="{escape(name)}">{below}</figure>'
 
 
 def bev_html(bev: Num[np.ndarray, "h w"], name: str) -> str:

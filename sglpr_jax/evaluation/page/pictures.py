@@ -26,7 +26,7 @@ class HeatPicture:
     image: np.ndarray
     """(h, w) point counts."""
     maps: Mapping[str, np.ndarray]
-    """(h, w) from 0 to 1, by the name of the layer."""
+    """(h, w) from 0 to 1, NaN where the network does not look, by the name of the layer."""
 
 
 @dataclass(frozen=True, eq=False)

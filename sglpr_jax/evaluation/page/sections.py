@@ -81,25 +81,22 @@ def semantic_section(found: Mapping[str, SemanticPicture] | str) -> Section:
     """Figure 7."""
     if isinstance(found, str):
         return Section("Semantic maps", missing(found))
-    body = "\n".join(
-        figure_html(
-            figures.segmentation_panel(
-                one.counts, one.truth, one.predicted, resolution_m=one.resolution_m, title=f"frame {frame}"
-            ),
-            f"semantic map of frame {frame}",
-        )
-        for frame, one in found.items()
-    )
-    return Section("Semantic maps", body)
+    return Section("Semantic maps", "\n".join(_semantic(frame, one) for frame, one in found.items()))
+
+
+def _semantic(frame: str, one: SemanticPicture) -> str:
+    panel = figures.segmentation_panel(one.counts, one.truth, one.predicted, resolution_m=one.resolution_m)
+    return figure_html(panel, f"semantic map of frame {frame}", caption=f"frame {frame}")
 
 
 def heat_section(found: Mapping[str, HeatPicture] | str) -> Section:
     """Figure 8."""
     if isinstance(found, str):
         return Section("Feature heat maps", missing(found))
-    about = "<p>How strongly the features of each layer answer: root mean square over the channels.</p>"
-    body = "\n".join(
-        figure_html(figures.heat_maps(one.image, one.maps, title=f"frame {frame}"), f"heat maps of frame {frame}")
-        for frame, one in found.items()
-    )
-    return Section("Feature heat maps", about + body)
+    about = "<p>How strongly the features of each layer answer: root mean square over the channels.</p>\n"
+    return Section("Feature heat maps", about + "\n".join(_heat(frame, one) for frame, one in found.items()))
+
+
+def _heat(frame: str, one: HeatPicture) -> str:
+    panel = figures.heat_maps(one.image, one.maps)
+    return figure_html(panel, f"feature heat maps of frame {frame}", caption=f"frame {frame}")
