@@ -47,7 +47,7 @@ class EvaluateCommand:
     times: Path | None = None
     """Seconds, one number a line, beside --poses."""
     distance: str | None = None
-    """How descriptors are compared: l2, cosine, ... None: as the descriptor file says, l2 for a .npy."""
+    """How the descriptors of a .npy are compared: l2 (None), cosine, ... A descriptor file says it itself."""
     protocols: tuple[str, ...] = ()
     """Their names, or `all`. None named: top1-f1max, pairs-f1max and bevplace-recall-at-1."""
     compare: tuple[Path, ...] = ()

@@ -55,7 +55,8 @@ def read_methods(
     for path in paths:
         name = seq or (path.stem if sequence is None else sequence.name)
         trajectory = given or (None if path.suffix == ".npz" else own)
-        methods[_name(path, paths)] = read_input(path, trajectory, sequence=name, distance=distance)
+        compared_by = distance if path == paths[0] or path.suffix == ".npy" else None
+        methods[_name(path, paths)] = read_input(path, trajectory, sequence=name, distance=compared_by)
     if sequence is not None:
         sequence_rows(sequence, next(iter(methods.values())))
     return methods

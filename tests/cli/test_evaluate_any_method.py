@@ -94,7 +94,7 @@ def test_a_top_k_list_and_scored_pairs(score, laps):
 
 def test_methods_are_compared_on_one_page(score, laps):
     ended, folder = score("mine.npy", "--poses", laps / "tum.txt", "--compare", laps / "blind.npy", laps / "topk.txt",
-                          "--protocols", "top1-f1max", "bevplace-recall-at-1")  # fmt: skip
+                          "--protocols", "top1-f1max", "bevplace-recall-at-1", "--distance", "l2")  # fmt: skip
     assert ended.status == 0, ended.error
     report = json.loads((folder / "results.json").read_text())
     assert list(report["compared"]) == ["blind", "topk"]

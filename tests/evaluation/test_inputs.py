@@ -47,8 +47,8 @@ def test_own_files_keep_what_nothing_replaces(tmp_path, make_file, two_laps, pos
     file.save(tmp_path / "own.npz")
     same = read_input(tmp_path / "own.npz", None, sequence="x")
     assert (same.sequence, same.distance, same.pose_source) == ("town", "cosine", "made up")
-    other = read_input(tmp_path / "own.npz", poses, sequence="x", distance="l2")
-    assert (other.distance, other.pose_source) == ("l2", "laps.csv (csv)")
+    other = read_input(tmp_path / "own.npz", poses, sequence="x")
+    assert (other.distance, other.pose_source) == ("cosine", "laps.csv (csv)")
     np.testing.assert_array_equal(other.positions, poses.positions)
 
 
@@ -124,8 +124,9 @@ def test_positions_are_needed(read, name, content):
 
 
 def test_a_distance_is_for_descriptors(read, tmp_path):
-    with pytest.raises(ValueError, match="expected no --distance for a list"):
-        read("list.txt", "5: 0\n", distance="l2")
+    for name in ("list.txt", "own.npz"):
+        with pytest.raises(ValueError, match=rf"{name}: expected a \.npy beside --distance"):
+            read(name, "5: 0\n", distance="l2")
     with pytest.raises(ValueError, match="did you mean cosine"):
         read("mine.npy", np.ones((800, 2)), distance="cosin")
     with pytest.raises(FileNotFoundError, match=r"no\.npy: expected .*found none"):

@@ -23,19 +23,19 @@ Input = Source | ScoredPairs
 def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str | None = None) -> Input:
     """Read a file of any kind, to be scored on `trajectory`; None: what the file itself knows is all there is.
 
-    `distance` names how descriptors are compared; None: as their file says, L2 for a matrix. Raises FileNotFoundError,
-    and ValueError naming the file, what was expected and what was found.
+    `distance` names how the descriptors of a matrix are compared; None: by L2. The other files say it themselves.
+    Raises FileNotFoundError, and ValueError naming the file, what was expected and what was found.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a descriptor file, .npy, top-k list or scored pairs, found none")
     if distance is not None:
         distance_function(distance)
-    if path.suffix == ".npz":
-        return read_own_file(path, trajectory, distance)
     if path.suffix == ".npy":
         return read_matrix(path, trajectory, sequence=sequence, distance=distance or "l2")
     if distance is not None:
-        raise ValueError(f"{path}: expected no --distance for a list, which has scores of its own, found {distance}")
+        raise ValueError(f"{path}: expected a .npy beside --distance, found a file that has its own distances")
+    if path.suffix == ".npz":
+        return read_own_file(path, trajectory)
     if is_top_k_list(path):
         return read_top_k_list(path, trajectory, sequence=sequence)
     return read_pair_list(path, trajectory)
