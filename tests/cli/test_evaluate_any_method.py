@@ -100,7 +100,7 @@ def test_methods_are_compared_on_one_page(score, laps):
     assert list(report["compared"]) == ["blind", "topk"]
     assert report["compared"]["blind"][0]["score"] < 0.5 < report["results"][0]["score"]
     text = (folder / "report.html").read_text()
-    assert "Methods side by side" in text and "<td>blind</td>" in text
+    assert "Methods side by side" in text and "<th>blind</th>" in text
     assert (folder / "precision-recall-top-1-f1max.png").is_file()
     ended, _ = score("mine.npy", "--poses", laps / "tum.txt", "--compare", laps / "topk.txt")
     assert_one_line_error(ended, "topk", "for a top-k list", "found pairs-f1max")
@@ -148,14 +148,14 @@ def test_a_list_without_an_ending_gets_a_folder_of_another_name(command, laps, t
 
 def test_data_and_weights_add_pictures(command, trained, town, tmp_path):
     np.save(tmp_path / "blind.npy", np.ones((40, 2)))  # every query is answered, mostly with another place
-    options = ("--data", town, "--seq", "08", "--protocols", "scan-context-f1max")
+    options = ("--data", town, "--seq", "08", "--protocols", "top1-f1max")
     ended = command("evaluate", tmp_path / "blind.npy", *options)
     assert ended.status == 0, ended.error
     page = (tmp_path / "blind" / "report.html").read_text()
     mistakes = json.loads((tmp_path / "blind" / "results.json").read_text())["false_positives"]
     assert page.count("from above") == 2 * len(mistakes) > 0
     assert "Semantic maps: add --weights" in page and "Feature heat maps: add --weights" in page
-    assert results(tmp_path / "blind")["Scan Context F1max"]["poses"] == "sequences/08/poses.txt"
+    assert results(tmp_path / "blind")["top-1 F1max"]["poses"] == "sequences/08/poses.txt"
 
     embedded = command(
         "embed", "--weights", trained.folder, "--data", town, "--seq", "08", "--out", tmp_path / "08.npz"

@@ -28,10 +28,10 @@ def results_section(results: Sequence[Result]) -> Section:
 
 
 def comparison_section(methods: Mapping[str, Sequence[Result]]) -> Section:
-    """One row per method, one column per protocol."""
-    protocols = [result.name for result in next(iter(methods.values()))]
-    rows = [(method, *map(format_score, results)) for method, results in methods.items()]
-    return Section("Methods side by side", html_table(("method", *protocols), rows, numbers=protocols))
+    """One row per protocol, one column per method: a page is longer than wide."""
+    of_each = zip(*methods.values(), strict=True)
+    rows = [(results[0].name, *map(format_score, results)) for results in of_each]
+    return Section("Methods side by side", html_table(("protocol", *methods), rows, numbers=list(methods)))
 
 
 def curves_section(plots: Plots, *, drawn: bool) -> Section:
