@@ -1,64 +1,132 @@
-"""bin/evaluate: score a descriptor file under every protocol."""
+"""bin/evaluate: score what any method says of a sequence under chosen protocols."""
 
 import dataclasses
-import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import tyro
 
-from sglpr_jax.cli.runtime import console, run, write_json
+from sglpr_jax.cli.evaluate_inputs import PoseOptions, open_dataset, read_methods, score
+from sglpr_jax.cli.page_pictures import take_pictures
+from sglpr_jax.cli.runtime import console, run, write_json, write_text
+from sglpr_jax.data.trajectory import PoseFormat
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.report import evaluate, table, to_json
+from sglpr_jax.evaluation.inputs import Input
+from sglpr_jax.evaluation.inputs.choice import check_names
+from sglpr_jax.evaluation.page import Evaluation, Pictures, can_draw, draw_curves, draw_trajectory, page
+from sglpr_jax.evaluation.protocols import ScoredPairs, TopK
+from sglpr_jax.evaluation.report import comparison, table, to_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+PAGE = "report.html"
 
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateCommand:
-    """Print what a descriptor file scores under every protocol; write the table and its pictures beside it.
+    """Print what a method scores under each protocol; write the table, its pictures and a page with all of them.
 
-    Example: bin/evaluate 08.npz
+    FILE is a descriptor file that bin/embed wrote, a .npy of descriptors (a row per frame), or text: a top-k list with
+    lines `query: frame frame ...` or `query: frame=score ...`, or scored pairs with lines `i j score [label]`. Frames
+    are numbered from 0, and a higher score is closer.
+
+    Examples:
+      bin/evaluate 08.npz
+      bin/evaluate mine.npy --poses poses/08.txt --pose-format kitti --times times.txt --distance cosine
+      bin/evaluate mine.npy --data KITTI --seq 08 --protocols all --compare 08.npz
     """
 
     file: tyro.conf.Positional[Path]
-    """A descriptor file that bin/embed wrote."""
+    """Descriptors, a top-k list or scored pairs."""
     out: Path | None = None
-    """Folder for results.json and the pictures. None: FILE without its ending."""
+    """Folder for results.json, report.html and the pictures. None: FILE without its ending."""
+    poses: Path | None = None
+    """Where the frames were taken, a row each. None: as the descriptor file says, or the sequence of --data."""
+    pose_format: PoseFormat = "auto"
+    """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
+    times: Path | None = None
+    """Seconds, one number a line, beside --poses."""
+    distance: str | None = None
+    """How the descriptors of a .npy are compared: l2 (None), cosine, ... A descriptor file says it itself."""
+    protocols: tuple[str, ...] = ()
+    """Their names, or `all`. None named: top1-f1max, pairs-f1max and bevplace-recall-at-1."""
+    compare: tuple[Path, ...] = ()
+    """Files of other methods on the same frames, to stand beside FILE."""
+    data: Path | None = None
+    """A dataset with the frames as scans or images: the page then shows them."""
+    seq: str | None = None
+    """The sequence: which of --data, and in which FILE has no name of its own, whose published split counts."""
+    weights: Path | None = None
+    """A training run's folder: with --data the page then shows semantic maps and feature heat maps."""
 
 
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Do what the command says; returns the folder written."""
-    file = DescriptorFile.load(command.file)
-    if file.positions is None:
-        raise ValueError(
-            f"{command.file}: expected positions to score against, found descriptors of scans without poses"
-        )
-    results = evaluate(file)
-    folder = command.out or command.file.with_suffix("")
-    folder.mkdir(parents=True, exist_ok=True)
-    console().print(table(results, title=f"sequence {file.sequence}, {len(file)} scans"))
-    about = {"file": str(command.file), "config": file.config, "weights_hash": file.weights_hash}
-    write_json(folder / "results.json", {**about, "results": to_json(results)})
-    for name in ("results.json", *_draw(file, results, folder)):
-        print(f"written: {folder / name}")
+    check_names(command.protocols)
+    sequence, params = open_dataset(command.data, command.seq, command.weights)
+    poses = PoseOptions(command.poses, command.pose_format, command.times)
+    paths = (command.file, *command.compare)
+    inputs = read_methods(paths, poses, sequence=sequence, seq=command.seq, distance=command.distance)
+    source = next(iter(inputs.values()))
+    found = Evaluation(
+        title=_title(source, command.file),
+        about=_about(source, command.file),
+        methods=score(inputs, command.protocols),
+        positions=source.positions,
+    )
+    console().print(table(found.results, title=found.title))
+    if len(found.methods) > 1:
+        console().print(comparison(found.methods))
+    pictures = Pictures() if sequence is None else take_pictures(sequence, params, source, found.worst)
+    folder = command.out or _folder(command.file)
+    _write(folder, found, pictures, _as_json(found, source, command.file))
     return folder
 
 
-def _draw(file: DescriptorFile, results: list, folder: Path) -> list[str]:
-    """Draw what can be drawn; without matplotlib, say so."""
-    if not importlib.util.find_spec("matplotlib"):
-        print("no pictures: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
-        return []
-    curves = {result.name: result.curve for result in results if result.curve is not None}
-    drawn = {}
-    if curves:
-        drawn["precision-recall.png"] = figures.precision_recall(curves, title=f"sequence {file.sequence}")
-    top1 = results[0]
-    if file.positions is not None and top1.decisions is not None:
-        drawn["trajectory.png"] = figures.trajectory(file.positions, top1.decisions)
-    for name, figure in drawn.items():
+def _write(folder: Path, found: Evaluation, pictures: Pictures, numbers: dict[str, Any]) -> None:
+    """Write numbers, plots and the page; without matplotlib, say what is left out."""
+    curves, trajectory = {}, {}
+    if can_draw():
+        curves, trajectory = draw_curves(found), draw_trajectory(found)
+    else:
+        print("no drawings: they need the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "results.json", numbers)
+    plots = curves | trajectory
+    for name, figure in plots.items():
         figures.save(figure, folder / name)
-    return list(drawn)
+    write_text(folder / PAGE, page(found, curves=curves, trajectory=trajectory, pictures=pictures))
+    for name in ("results.json", *plots, PAGE):
+        print(f"written: {folder / name}")
+
+
+def _folder(file: Path) -> Path:
+    """Return the file without its ending; a file that has none keeps its name and the folder gets another."""
+    return file.with_suffix("") if file.suffix else file.with_name(f"{file.name}-results")
+
+
+def _title(source: Input, file: Path) -> str:
+    if isinstance(source, ScoredPairs):
+        return f"{file.name}, {len(source.pairs)} pairs"
+    return f"sequence {source.sequence}, {len(source)} scans"
+
+
+def _about(source: Input, file: Path) -> str:
+    """Say what the file holds and how it is compared."""
+    if isinstance(source, ScoredPairs):
+        return f"{file}: scored pairs" + (" with labels" if source.labels is not None else "")
+    if isinstance(source, TopK):
+        return f"{file}: up to {source.nearest.shape[1]} retrieved frames for each of {len(source.queries)} queries"
+    return f"{file}: descriptors of {source.descriptors.shape[1]} numbers, compared by {source.distance}"
+
+
+def _as_json(found: Evaluation, source: Input, file: Path) -> dict[str, Any]:
+    about: dict[str, Any] = {"file": str(file)}
+    if isinstance(source, DescriptorFile):
+        about |= {"config": source.config, "weights_hash": source.weights_hash, "distance": source.distance}
+    others = {name: to_json(results) for name, results in list(found.methods.items())[1:]}
+    worst = [dataclasses.asdict(mistake) for mistake in found.worst]
+    return {**about, "results": to_json(found.results), "false_positives": worst, "compared": others}
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
 
     Raises FileNotFoundError, and ValueError naming the first line without 12 finite numbers.
     """
-    return _read_rows(path, columns=12).reshape(-1, 3, 4)
+    return read_rows(path, columns=12).reshape(-1, 3, 4)
 
 
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
@@ -20,12 +20,17 @@ def read_times(path: Path) -> Float[np.ndarray, " n"]:
 
     Raises FileNotFoundError, and ValueError naming the first line that is no finite number or runs backwards.
     """
-    times = _read_rows(path, columns=1)[:, 0]
+    times = read_rows(path, columns=1)[:, 0]
+    check_times(path, times)
+    return times
+
+
+def check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
+    """Raise ValueError naming the first row of numbers in `path` whose time is smaller than the one before."""
     backwards = np.flatnonzero(np.diff(times) < 0)
     if backwards.size:
-        line = int(backwards[0]) + 2
-        raise ValueError(f"{path}, line {line}: expected a time >= {times[line - 2]}, found {times[line - 1]}")
-    return times
+        row = int(backwards[0]) + 2
+        raise ValueError(f"{path}, line {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
 
 
 def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
@@ -42,20 +47,32 @@ def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
     return numbers
 
 
-def _read_rows(path: Path, *, columns: int) -> Float[np.ndarray, "n columns"]:
+def read_rows(
+    path: Path, *, columns: int, header_lines: int = 0, separator: str | None = None
+) -> Float[np.ndarray, "n {columns}"]:
+    """Return the numbers (n, columns) of a text file, one row a line after so many lines of header.
+
+    Columns stand apart by `separator`; None: by white space, and then lines that start with # say nothing. Raises
+    FileNotFoundError, and ValueError naming the first line without as many finite numbers.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {columns} numbers a line, one line per frame")
-    rows = [line.split() for line in path.read_text(errors="replace").rstrip().splitlines()]
-    values = np.empty((len(rows), columns))
-    for i, row in enumerate(rows):
-        if len(row) != columns:
-            raise ValueError(f"{path}, line {i + 1}: expected {columns} numbers, found {len(row)}")
-        try:
-            values[i] = row
-        except ValueError as error:
-            raise ValueError(f"{path}, line {i + 1}: expected numbers, found {' '.join(row)!r}") from error
-    not_finite = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if not_finite.size:
-        line = int(not_finite[0]) + 1
-        raise ValueError(f"{path}, line {line}: expected finite numbers, found {' '.join(rows[line - 1])!r}")
+    lines = path.read_text(errors="replace").rstrip().splitlines()
+    numbers = [i for i, line in enumerate(lines) if i >= header_lines and not line.startswith("#")]
+    values = np.empty((len(numbers), columns))
+    for row, i in enumerate(numbers):
+        values[row] = numbers_of(lines[i].split(separator), columns=columns, where=f"{path}, line {i + 1}")
+    return values
+
+
+def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.ndarray, " {columns}"]:
+    """Return words as numbers; ValueError, which begins with `where`, unless there are `columns` finite ones."""
+    if len(words) != columns:
+        raise ValueError(f"{where}: expected {columns} numbers, found {len(words)}")
+    try:
+        values = np.array(words, dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(f"{where}: expected numbers, found {' '.join(words)!r}") from error
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}: expected finite numbers, found {' '.join(words)!r}")
     return values

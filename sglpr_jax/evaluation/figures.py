@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 DOTS_PER_INCH = 150
+MOST_INSIDE = 4
+"""So many lines are named inside the axes; more names would cover the lines."""
 
 DECISIONS = {
     Decision.NOT_A_QUERY: ("not a query", "#c8c8c8", 4),
@@ -41,14 +43,18 @@ def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
     """Draw precision over recall, a line for each named curve with a dot where F1 is highest (figure 5)."""
-    figure = _figure(5.2, 4.8)
+    many = len(curves) > MOST_INSIDE
+    figure = _figure(8.0 if many else 5.2, 4.8)
     axes = figure.add_subplot(title=title, xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
     _draw_equal_f1(axes)
     for name, curve in curves.items():
         (line,) = axes.plot(curve.recall, curve.precision, linewidth=1.8, label=f"{name} {curve.f1_max:.3f}")
         axes.plot(curve.recall[curve.best], curve.precision[curve.best], "o", color=line.get_color(), markersize=6)
     axes.set_aspect("equal")
-    axes.legend(title="dot: highest F1", loc="lower left", framealpha=0.95)
+    if many:
+        figure.legend(title="dot: highest F1", loc="outside right upper", frameon=False)
+    else:
+        axes.legend(title="dot: highest F1", loc="lower left", framealpha=0.95)
     return figure
 
 
@@ -56,7 +62,8 @@ def trajectory(
     positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
     """Draw every frame where it was taken, seen from above, coloured by its `Decision` (figure 6)."""
-    figure = _figure(7.0, 5.6)
+    across, along = np.ptp(positions[:, :2], axis=0)
+    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))  # a long street lies flat
     axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
     for decision, (name, colour, size) in DECISIONS.items():
         x, y = positions[decisions == decision, :2].T
@@ -95,28 +102,51 @@ def learning_curve(
 
 def segmentation_panel(
     bev: Num[np.ndarray, "h w"],
-    truth: Int[np.ndarray, "h w"],
+    truth: Int[np.ndarray, "h w"] | None,
     prediction: Int[np.ndarray, "h w"],
     *,
     resolution_m: float,
     title: str = "",
 ) -> "matplotlib.figure.Figure":
-    """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7)."""
-    figure = _figure(11.0, 4.9)
+    """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7).
+
+    Without a truth it has no panel.
+    """
+    pictures = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
+    if truth is not None:
+        pictures["true classes"] = COLORS[truth]
+    pictures["predicted classes"] = COLORS[prediction]
+    figure = _figure(3.7 * len(pictures), 5.2)
     figure.suptitle(title)
-    brightness = np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
-    pictures = {
-        "point counts": np.repeat(brightness[..., None], 3, axis=-1),
-        "true classes": COLORS[truth],
-        "predicted classes": COLORS[prediction],
-    }
     height, width = np.array(bev.shape) * resolution_m / 2
-    for axes, (name, picture) in zip(figure.subplots(1, 3, sharey=True), pictures.items(), strict=True):
+    for axes, (name, picture) in zip(figure.subplots(1, len(pictures), sharey=True), pictures.items(), strict=True):
         axes.imshow(picture, extent=(-width, width, -height, height), interpolation="nearest")
         axes.set(title=name, xlabel="x [m]")
     figure.axes[0].set_ylabel("y [m]")
-    _add_class_legend(figure, np.union1d(truth, prediction))
+    _add_class_legend(figure, np.unique(prediction) if truth is None else np.union1d(truth, prediction))
     return figure
+
+
+def heat_maps(
+    bev: Num[np.ndarray, "h w"], maps: Mapping[str, Float[np.ndarray, "h w"]], *, title: str = ""
+) -> "matplotlib.figure.Figure":
+    """Draw point counts and named maps of how strongly features answer, each on its own scale (figure 8)."""
+    figure = _figure(2.1 * (1 + len(maps)), 2.6)
+    figure.suptitle(title)
+    panels = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
+    panels[0].imshow(brightness(bev), cmap="gray")
+    panels[0].set_title("point counts", fontsize=9)
+    for axes, (name, values) in zip(panels[1:], maps.items(), strict=True):
+        axes.imshow(values, cmap="inferno")
+        axes.set_title(name, fontsize=9)
+    for axes in panels:
+        axes.set_axis_off()
+    return figure
+
+
+def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return point counts as grey values from 0 to 1, by their logarithm."""
+    return np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
 
 
 def _figure(width: float, height: float) -> "matplotlib.figure.Figure":

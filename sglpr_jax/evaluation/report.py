@@ -1,39 +1,42 @@
-"""One descriptor file under every protocol, as a table and as JSON."""
+"""One method under chosen protocols, as a table and as JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
+from sglpr_jax.evaluation.inputs import Input
+from sglpr_jax.evaluation.inputs.choice import protocols_of
 from sglpr_jax.evaluation.protocols import HEADLINES, Result, protocol_named
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
 
 
-def evaluate(file: DescriptorFile, protocols: Sequence[str] = HEADLINES) -> list[Result]:
-    """Return the result of each named protocol on one file.
+def evaluate(source: Input, protocols: Sequence[str] = HEADLINES) -> list[Result]:
+    """Return the result of each named protocol on one file of descriptors, one top-k list or one list of pairs.
 
-    Raises ValueError where the file has no positions, or a name is no protocol of one file.
+    Raises ValueError where there are no positions, or a name is no protocol that such a file can be scored by.
     """
-    return [protocol_named(name)(file) for name in protocols]
+    known = protocols_of(source)
+    return [protocol_named(name, known)(source) for name in protocols]
 
 
 def table(results: Sequence[Result], *, title: str = "") -> Table:
     """Return one row per protocol: what it is, its score, and what that rests on."""
-    rows = Table("protocol", "rule", "score", "95 %", "rests on", "distance", "poses", title=title)
+    rows = Table(*COLUMNS, title=title)
     for result in results:
-        counts = "\n".join(f"{count} {name}" for name, count in result.counts.items())
-        distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
-        rows.add_row(
-            result.name,
-            result.rule,
-            format_score(result),
-            _format_interval(result),
-            counts,
-            distance,
-            result.pose_source,
-        )
+        rows.add_row(*map(escape, cells(result)))
     return rows
+
+
+def cells(result: Result) -> tuple[str, ...]:
+    """Return what a table says of a result, one text for each of `COLUMNS`."""
+    counts = "\n".join(f"{count} {name}" for name, count in result.counts.items())
+    distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
+    poses = result.pose_source or ""
+    return result.name, result.rule, format_score(result), _format_interval(result), counts, distance, poses
 
 
 def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> Table:

@@ -13,6 +13,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 from .conftest import assert_one_line_error
 
+FILES = ("results.json", "precision-recall.png", "trajectory.png", "report.html")
 BIN = Path(__file__).resolve().parents[2] / "bin"
 
 
@@ -42,11 +43,11 @@ def test_every_protocol_is_printed_written_and_drawn(command, drive, tmp_path):
     assert ended.out.count("sequences/08/poses.txt") == 3 and ended.out.count("1.000") == 3
     folder = tmp_path / "08"
     written = [Path(path) for path in re.findall(r"^written: (.*)$", ended.out, re.MULTILINE)]
-    assert written == [folder / name for name in ("results.json", "precision-recall.png", "trajectory.png")]
+    assert written == [folder / name for name in FILES]
     report = json.loads((folder / "results.json").read_text())
     assert [result["score"] for result in report["results"]] == [1, 1, 1]
     assert report["weights_hash"] == "abc" and report["config"] == {"method": "made up"}
-    for path in written[1:]:
+    for path in written[1:3]:
         with Image.open(path) as picture:
             assert min(picture.size) > 200
 
@@ -73,7 +74,8 @@ def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, dri
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     ended = command("evaluate", tmp_path / "08.npz")
     assert ended.status == 0 and "sglpr-jax[viz]" in ended.error
-    assert [path.name for path in (tmp_path / "08").iterdir()] == ["results.json"]
+    assert sorted(path.name for path in (tmp_path / "08").iterdir()) == ["report.html", "results.json"]
+    assert "sglpr-jax[viz]" in (tmp_path / "08" / "report.html").read_text()
 
 
 def test_descriptors_without_positions_cannot_be_scored(command, drive, tmp_path):

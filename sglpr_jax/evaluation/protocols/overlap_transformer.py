@@ -55,7 +55,7 @@ def overlap_transformer_f1max(
         result = replace(result, recalls=recall_at(first_true(right)[revisited], numbers))
     late, answered = queries >= FIRST_THRESHOLDED, nearest[:, 0] >= 0
     flags = right[:, 0], ~right[:, 0] & answered, revisited
-    answers = Answers(queries[late], distance[late], *(flag[late] for flag in flags))
+    answers = Answers(queries[late], nearest[late, 0], distance[late], *(flag[late] for flag in flags))
     return score_answers(source, result, answers, seed=seed)
 
 

@@ -44,3 +44,7 @@ class Result:
     """Recall@N by N, where the protocol has it."""
     decisions: np.ndarray | None = None
     """(n,) int8: a `Decision` for every frame. None for pairs and across sessions."""
+    answers: np.ndarray | None = None
+    """(n,) int64: the frame that each query was answered with, -1 elsewhere. None where answers meet no threshold."""
+    answer_distances: np.ndarray | None = None
+    """(n,) float64: the descriptor distances of `answers`, infinite where there is none."""

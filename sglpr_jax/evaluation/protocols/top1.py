@@ -18,6 +18,8 @@ class Answers:
 
     queries: np.ndarray
     """(q,) int64."""
+    nearest: np.ndarray
+    """(q,) int64: the frame answered with; -1 where there is none."""
     distance: np.ndarray
     """(q,) float64: of the descriptors; infinite where there is no answer."""
     right: np.ndarray
@@ -41,7 +43,7 @@ def score_top1_by_distance(
     apart = np.linalg.norm(positions[queries] - positions[nearest[:, 0]], axis=1)
     answered = nearest[:, 0] >= 0
     revisited = has_near(positions[queries], positions, ends[queries], right)
-    answers = Answers(queries, distance, right(apart) & answered, wrong(apart) & answered, revisited)
+    answers = Answers(queries, nearest[:, 0], distance, right(apart) & answered, wrong(apart) & answered, revisited)
     return score_answers(source, result, answers, seed=seed)
 
 
@@ -56,7 +58,7 @@ def score_answers(source: Source, result: Result, answers: Answers, *, seed: int
     decisions = np.full(len(source), Decision.NOT_A_QUERY, dtype=np.int8)
     decisions[queries] = Decision.TRUE_NEGATIVE
     counts = {"queries": len(queries), "revisits": int(revisited.sum())}
-    result = replace(result, counts=counts, decisions=decisions)
+    result = replace(result, counts=counts, decisions=decisions, **_whole_sequence(len(source), answers))
     if not revisited.any():
         return result
     flags = {
@@ -72,6 +74,13 @@ def score_answers(source: Source, result: Result, answers: Answers, *, seed: int
     decisions[queries] = _decide(-answers.distance >= curve.thresholds[curve.best], answers)
     interval = f1_max_interval(-answers.distance, **flags, query=queries, seed=seed)
     return replace(result, score=curve.f1_max, curve=curve, interval=interval)
+
+
+def _whole_sequence(n: int, answers: Answers) -> dict[str, np.ndarray]:
+    """Return the answers and their distances for every frame, as `Result` has them."""
+    nearest, distance = np.full(n, -1, dtype=np.int64), np.full(n, np.inf)
+    nearest[answers.queries], distance[answers.queries] = answers.nearest, answers.distance
+    return {"answers": nearest, "answer_distances": distance}
 
 
 def older_by(n: int, frames: int) -> Int[np.ndarray, " {n}"]:

@@ -1,0 +1,52 @@
+"""Plain .npy files: one row of numbers per frame, from any program."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Num
+
+from sglpr_jax.data.trajectory import Trajectory
+from sglpr_jax.evaluation.inputs.positions import needed
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+
+def read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str) -> DescriptorFile:
+    """Read descriptors (n, d) of any real type, row i the frame of pose i; they become float32.
+
+    Raises ValueError naming the file where it is no such array, a row is not finite, or poses are another number.
+    """
+    rows = _load(path)
+    trajectory = needed(path, trajectory, rows=len(rows))
+    try:
+        return DescriptorFile(
+            sequence=sequence,
+            ids=tuple(f"{row:06d}" for row in range(len(rows))),
+            positions=trajectory.positions,
+            times=trajectory.times,
+            descriptors=_as_float32(rows),
+            pose_source=trajectory.source,
+            config={"method": path.stem},
+            weights_hash="",
+            distance=distance,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _load(path: Path) -> Num[np.ndarray, "n d"]:
+    """Return the array of a file; what pickle would have to read is refused."""
+    expected = f"{path}: expected descriptors (n, d) as numbers"
+    try:
+        with path.open("rb") as stream:
+            rows = np.lib.format.read_array(stream, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{expected}, found no such .npy ({error})") from error
+    if rows.ndim != 2 or rows.dtype.kind not in "fiub" or rows.size == 0:
+        raise ValueError(f"{expected}, found {rows.dtype} {rows.shape}")
+    return rows
+
+
+def _as_float32(rows: Num[np.ndarray, "n d"]) -> Num[np.ndarray, "n d"]:
+    # A number too large for float32 becomes infinite, which the descriptor file refuses; no need to warn as well.
+    with np.errstate(over="ignore"):
+        return np.array(rows, dtype=np.float32)

@@ -1,0 +1,50 @@
+"""Lists of scored pairs: `i j score` or `i j score label` on every line, label 1 for one place and 0 for two."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sglpr_jax.data.trajectory import Trajectory
+from sglpr_jax.evaluation.inputs.positions import needed
+from sglpr_jax.evaluation.inputs.text_list import as_frame, as_score, check_rows, read_lines
+from sglpr_jax.evaluation.protocols import ScoredPairs
+
+LABELS = {"0": False, "1": True}
+
+
+def read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
+    """Read pairs of frames, the query first; a higher score is closer. Without labels the positions tell.
+
+    Raises ValueError naming the line that is malformed or names a frame without a pose, or the file where it is empty
+    or needs positions and has none.
+    """
+    where, rows = _read(path)
+    pairs = np.array([[as_frame(word, place) for word in row[:2]] for place, row in zip(where, rows, strict=True)])
+    scores = np.array([as_score(row[2], place) for place, row in zip(where, rows, strict=True)])
+    labels = np.array([_label(row[3], place) for place, row in zip(where, rows, strict=True) if len(row) == 4])
+    trajectory = trajectory if labels.size else needed(path, trajectory)
+    if trajectory is None:
+        return ScoredPairs(pairs, scores, labels)
+    check_rows(where, pairs, len(trajectory.positions), trajectory.source)
+    return ScoredPairs(pairs, scores, labels if labels.size else None, trajectory.positions, trajectory.source)
+
+
+def _read(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Return the places and the words of all lines: 3 on each, or 4 on each."""
+    lines = [(where, line.split()) for where, line in read_lines(path)]
+    if not lines:
+        raise ValueError(f"{path}: expected lines `i j score [label]` or `query: frame frame ...`, found none")
+    columns = len(lines[0][1])
+    for where, words in lines:
+        if len(words) != columns or columns not in (3, 4):
+            expected = columns if columns in (3, 4) else "3 or 4"
+            raise ValueError(
+                f"{where}: expected {expected} numbers `i j score [label]`, found {' '.join(words)[:80]!r}"
+            )
+    return [where for where, _ in lines], [words for _, words in lines]
+
+
+def _label(word: str, where: str) -> bool:
+    if word not in LABELS:
+        raise ValueError(f"{where}: expected a label 0 or 1, found {word!r}")
+    return LABELS[word]

@@ -1,0 +1,46 @@
+"""Text files with one item a line; empty lines and lines that start with # say nothing."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def read_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield every line that says something, with its place for error messages."""
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
+        if line.strip() and not line.startswith("#"):
+            yield f"{path}, line {number}", line
+
+
+def as_frame(word: str, where: str) -> int:
+    """Return the number of a frame; ValueError, which begins with `where`, for anything else."""
+    if not (word.isascii() and word.isdigit() and len(word) < 10):
+        raise ValueError(f"{where}: expected a frame number, found {word!r}")
+    return int(word)
+
+
+def as_score(word: str, where: str) -> float:
+    """Return a finite number; ValueError, which begins with `where`, for anything else."""
+    try:
+        score = float(word)
+    except ValueError as error:
+        raise ValueError(f"{where}: expected a score, found {word!r}") from error
+    if not np.isfinite(score):
+        raise ValueError(f"{where}: expected a finite score, found {word!r}")
+    return score
+
+
+def check_rows(where: list[str], frames: Int[np.ndarray, "rows _"], n: int, source: str) -> None:
+    """Raise ValueError naming the first line with a frame that is not one of the n of `source`."""
+    outside = np.argwhere(frames >= n)
+    if outside.size:
+        row, column = outside[0]
+        raise ValueError(f"{where[row]}: expected frames from 0 to {n - 1} ({source}), found {frames[row, column]}")
+
+
+def padded(rows: Sequence[Sequence[int | float]], fill: int | float) -> Float[np.ndarray, "rows columns"]:
+    """Return rows of unequal length as one array, with at least one column."""
+    columns = max([1, *map(len, rows)])
+    return np.array([[*row, *[fill] * (columns - len(row))] for row in rows], dtype=np.float64)

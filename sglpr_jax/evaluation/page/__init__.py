@@ -1,0 +1,39 @@
+"""An evaluation as one HTML page that stands alone."""
+
+from sglpr_jax.evaluation.page import sections
+from sglpr_jax.evaluation.page.document import document
+from sglpr_jax.evaluation.page.evaluation import Evaluation
+from sglpr_jax.evaluation.page.pictures import HeatPicture, Pictures, SemanticPicture
+from sglpr_jax.evaluation.page.plots import Plots, can_draw, draw_curves, draw_trajectory
+
+
+def page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictures) -> str:
+    """Return the page as HTML.
+
+    Where a section has not what it needs, one line says which option of the command line would add it.
+    """
+    drawn = can_draw()
+    parts = [sections.results_section(found.results)]
+    if len(found.methods) > 1:
+        parts.append(sections.comparison_section(found.methods))
+    parts += [
+        sections.curves_section(curves, drawn=drawn),
+        sections.trajectory_section(trajectory, drawn=drawn),
+        sections.false_positives_section(found.judged, found.worst, pictures.images),
+        sections.semantic_section(pictures.semantic if drawn else sections.NO_MATPLOTLIB),
+        sections.heat_section(pictures.heat if drawn else sections.NO_MATPLOTLIB),
+    ]
+    return document(found.title, found.about, parts)
+
+
+__all__ = [
+    "Evaluation",
+    "HeatPicture",
+    "Pictures",
+    "Plots",
+    "SemanticPicture",
+    "can_draw",
+    "draw_curves",
+    "draw_trajectory",
+    "page",
+]

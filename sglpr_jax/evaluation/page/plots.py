@@ -1,0 +1,40 @@
+"""The plots of an evaluation, by the name of the file that each is written to."""
+
+import importlib.util
+from typing import TYPE_CHECKING
+
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.page.evaluation import Evaluation
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+Plots = dict[str, "matplotlib.figure.Figure"]
+
+
+def can_draw() -> bool:
+    """Whether matplotlib is there."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+def draw_curves(found: Evaluation) -> Plots:
+    """Draw the curves of one method in one plot; of several methods one plot for each protocol, a line for each."""
+    if len(found.methods) == 1:
+        curves = {result.name: result.curve for result in found.results if result.curve is not None}
+        return {"precision-recall.png": figures.precision_recall(curves, title=found.title)} if curves else {}
+    plots = {}
+    for of_one in zip(*found.methods.values(), strict=True):
+        pairs = zip(found.methods, of_one, strict=True)
+        curves = {method: result.curve for method, result in pairs if result.curve is not None}
+        if curves:
+            name = of_one[0].name.lower().replace(" ", "-").replace(":", "-")
+            plots[f"precision-recall-{name}.png"] = figures.precision_recall(curves, title=of_one[0].name)
+    return plots
+
+
+def draw_trajectory(found: Evaluation) -> Plots:
+    """Draw the decisions of the first protocol that has any."""
+    for result in found.results:
+        if found.positions is not None and result.decisions is not None:
+            return {"trajectory.png": figures.trajectory(found.positions, result.decisions, title=result.name)}
+    return {}

@@ -1,0 +1,77 @@
+"""Pose files of every format: what they give, and one error for each way to be wrong."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.trajectory import read_trajectory
+
+KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(name, text):
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return write
+
+
+def test_the_camera_looks_along_z_and_the_lidar_along_x(write):
+    path = write("poses.txt", KITTI * 2)
+    camera, lidar = read_trajectory(path, format="kitti"), read_trajectory(path, format="lidar")
+    np.testing.assert_array_equal(camera.positions, [[7, -5, -6]] * 2)
+    np.testing.assert_array_equal(lidar.positions, [[5, 6, 7]] * 2)
+    assert camera.source.endswith("poses.txt (camera)") and lidar.source.endswith("poses.txt (z up)")
+    assert camera.times is None
+
+
+def test_twelve_numbers_do_not_tell_their_frame(write):
+    with pytest.raises(ValueError, match=r"poses\.txt: expected --pose-format kitti .* or lidar .*found neither"):
+        read_trajectory(write("poses.txt", KITTI))
+
+
+def test_tum_has_times(write):
+    path = write("tum.txt", "# t x y z qx qy qz qw\n0.5 1 2 3 0 0 0 1\n0.75 4 5 6 0 0 0 1\n")
+    found = read_trajectory(path)
+    np.testing.assert_array_equal(found.positions, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(found.times, [0.5, 0.75])
+
+
+def test_csv_is_read_by_its_header(write):
+    found = read_trajectory(write("a.csv", "Z, x,name_id,y,t\n3,1,9,2,0\n6,4,9,5,1.5\n"))
+    np.testing.assert_array_equal(found.positions, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(found.times, [0, 1.5])
+    assert read_trajectory(write("b.csv", "x,y,z\n1,2,3\n")).times is None
+
+
+def test_a_file_of_times_replaces_those_of_the_poses(write):
+    path, times = write("a.csv", "x,y,z,t\n1,2,3,0\n4,5,6,1\n"), write("times.txt", "7\n9\n")
+    np.testing.assert_array_equal(read_trajectory(path, times=times).times, [7, 9])
+    with pytest.raises(ValueError, match=r"short\.txt: expected 2 times, as many as poses, found 1"):
+        read_trajectory(path, times=write("short.txt", "7\n"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "error"),
+    [
+        ("five.txt", "1 2 3 4 5\n", "expected 12 numbers a line .*8 .tum. or a .csv, found 5"),
+        ("empty.txt", "", "found 0"),
+        ("empty.csv", "x,y,z\n", "expected at least one pose, found none"),
+        ("bare.csv", "1,2,3\n", "expected a header with x, y and z, found '1,2,3'"),
+        ("words.csv", "x,y,z\n1,2,here\n", "line 2: expected numbers, found '1 2 here'"),
+        ("nan.csv", "x,y,z\n1,2,nan\n", "line 2: expected finite numbers"),
+        ("short.csv", "x,y,z\n1,2,3\n1,2\n", "line 3: expected 3 numbers, found 2"),
+        ("back.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", r"expected a time >= 1\.0, found 0\.0"),
+        ("half.txt", "1 0 0 0 0 0 0 1\n0 0 0\n", "line 2: expected 8 numbers, found 3"),
+    ],
+)
+def test_a_malformed_file_is_named(write, name, text, error):
+    with pytest.raises(ValueError, match=rf"{name}.*{error}"):
+        read_trajectory(write(name, text))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    for name in ("none.txt", "none.csv"):
+        with pytest.raises(FileNotFoundError, match=f"{name}: expected a pose file, found none"):
+            read_trajectory(tmp_path / name)

@@ -1,0 +1,155 @@
+"""Files of any method: what is read from them, which protocols fit, and one error for each way to be wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.trajectory import Trajectory
+from sglpr_jax.evaluation.inputs import read_input
+from sglpr_jax.evaluation.inputs.choice import check_names, chosen_protocols
+from sglpr_jax.evaluation.protocols import HEADLINES, PROTOCOLS, ScoredPairs, TopK, top1_f1max
+
+
+@pytest.fixture
+def poses(two_laps) -> Trajectory:
+    return Trajectory(two_laps, np.arange(800) * 0.5, "laps.csv (csv)")
+
+
+@pytest.fixture
+def read(tmp_path, poses):
+    """Read what a file of this name and content gives; bytes and arrays are written as they are."""
+
+    def read(name, content, *, trajectory=poses, **options):
+        path = tmp_path / name
+        if isinstance(content, np.ndarray):
+            np.save(path, content)
+        else:
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_input(path, trajectory, sequence="town", **options)
+
+    return read
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.uint8])
+def test_a_matrix_is_scored_as_the_file_it_would_make(read, make_file, two_laps, dtype):
+    rows = np.abs(two_laps).astype(dtype)
+    found = read("mine.npy", rows)
+    assert (found.sequence, found.distance, found.pose_source) == ("town", "l2", "laps.csv (csv)")
+    assert found.config == {"method": "mine"} and found.ids[:2] == ("000000", "000001")
+    times = np.arange(800) * 0.5
+    assert top1_f1max(found).score == top1_f1max(make_file(two_laps, rows, times=times)).score
+    assert read("mine.npy", rows, distance="cosine").distance == "cosine"
+
+
+def test_own_files_keep_what_nothing_replaces(tmp_path, make_file, two_laps, poses):
+    file = dataclasses.replace(make_file(two_laps + 1, two_laps), distance="cosine")
+    file.save(tmp_path / "own.npz")
+    same = read_input(tmp_path / "own.npz", None, sequence="x")
+    assert (same.sequence, same.distance, same.pose_source) == ("town", "cosine", "made up")
+    other = read_input(tmp_path / "own.npz", poses, sequence="x")
+    assert (other.distance, other.pose_source) == ("cosine", "laps.csv (csv)")
+    np.testing.assert_array_equal(other.positions, poses.positions)
+
+
+def test_a_top_k_list_with_scores(read):
+    found = read("list.txt", "# query: answers\n400: 0=.9 7=-.5\n\n401:\n402: 2=0.25\n")
+    assert isinstance(found, TopK)
+    np.testing.assert_array_equal(found.queries, [400, 401, 402])
+    np.testing.assert_array_equal(found.nearest, [[0, 7], [-1, -1], [2, -1]])
+    np.testing.assert_array_equal(found.scores, [[0.9, -0.5], [0, 0], [0.25, 0]])
+    assert top1_f1max(found).counts["queries"] > 0
+
+
+def test_a_top_k_list_without_scores(read):
+    found = read("list.txt", "400: 0 7\n401: 1\n")
+    np.testing.assert_array_equal(found.nearest, [[0, 7], [1, -1]])
+    assert found.scores is None
+
+
+def test_scored_pairs(read):
+    found = read("pairs.txt", "000400 000000 0.5 1\n100 0 -1e-3 0\n")
+    assert isinstance(found, ScoredPairs)
+    np.testing.assert_array_equal(found.pairs, [[400, 0], [100, 0]])
+    np.testing.assert_array_equal(found.scores, [0.5, -1e-3])
+    np.testing.assert_array_equal(found.labels, [True, False])
+    assert read("pairs.txt", "400 0 0.5\n").labels is None
+    assert read("pairs.txt", "9999 0 0.5 1\n", trajectory=None).positions is None
+
+
+NAN = np.ones((800, 4))
+NAN[17, 2] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error"),
+    [
+        ("few.npy", np.ones((700, 4)), "expected 800 descriptors, as many as laps.csv .csv. has poses, found 700"),
+        ("nan.npy", NAN, "expected finite descriptors, found others in 1 rows, the first in row 17"),
+        ("large.npy", np.full((800, 4), 1e300), "expected finite descriptors"),
+        ("flat.npy", np.ones(800), r"expected descriptors \(n, d\) as numbers, found float64 \(800,\)"),
+        ("cube.npy", np.ones((800, 2, 2)), r"found float64 \(800, 2, 2\)"),
+        ("none.npy", np.ones((0, 4)), r"found float64 \(0, 4\)"),
+        ("words.npy", np.full((800, 2), "x"), r"found <U1 \(800, 2\)"),
+        ("pickle.npy", np.full((800, 2), None), "found no such .npy .*allow_pickle=False"),
+        ("empty.npy", b"", "found no such .npy"),
+        ("text.npy", b"1 2 3\n", "found no such .npy"),
+        ("empty.txt", "", "expected lines `i j score .label.` or `query: frame frame ...`, found none"),
+        ("pairs.txt", "5 0 .5\n5 800 .5\n", r"line 2: expected frames from 0 to 799 \(laps.csv .csv.\), found 800"),
+        ("pairs.txt", "5 -1 .5\n", "line 1: expected a frame number, found '-1'"),
+        ("pairs.txt", "5 0 high\n", "line 1: expected a score, found 'high'"),
+        ("pairs.txt", "5 0 nan\n", "line 1: expected a finite score, found 'nan'"),
+        ("pairs.txt", "5 0 .5 2\n", "line 1: expected a label 0 or 1, found '2'"),
+        ("pairs.txt", "5 0 .5 1\n6 0 .5\n", "line 2: expected 4 numbers `i j score .label.`, found '6 0 .5'"),
+        ("pairs.txt", "these are words\n", "line 1: expected a frame number, found 'these'"),
+        ("binary.txt", b"\x00\xff\xfe\x93", "line 1: expected 3 or 4 numbers"),
+        ("list.txt", "5: 0\n800: 3\n", "line 2: expected frames from 0 to 799 .*found 800"),
+        ("list.txt", "5: 0 123456789012345678901\n", "line 1: expected a frame number, found '1234"),
+        ("list.txt", "5: 0\n6 3\n", "line 2: expected `query: frame frame ...`, found '6 3'"),
+        ("list.txt", "5: 0=x\n", "line 1: expected a score, found 'x'"),
+        ("list.txt", "5: 0=.5 3\n", "expected a score for every retrieved frame or for none, found 1 without"),
+        ("list.txt", "5: 0\n5: 1\n", "expected every query once"),
+    ],
+)
+def test_bad_input_is_one_error_that_names_the_file(read, monkeypatch, name, content, error):
+    monkeypatch.setattr("pickle.load", lambda *_, **__: pytest.fail("a pickle was read"))
+    with pytest.raises(ValueError, match=rf"{name}.*{error}"):
+        read(name, content)
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.npy", np.ones((3, 2))), ("a.txt", "1 0 .5\n"), ("b.txt", "1: 0\n")])
+def test_positions_are_needed(read, name, content):
+    with pytest.raises(ValueError, match=rf"{name}: expected positions to score against \(--poses, .*found none"):
+        read(name, content, trajectory=None)
+
+
+def test_a_distance_is_for_descriptors(read, tmp_path):
+    for name in ("list.txt", "own.npz"):
+        with pytest.raises(ValueError, match=rf"{name}: expected a \.npy beside --distance"):
+            read(name, "5: 0\n", distance="l2")
+    with pytest.raises(ValueError, match="did you mean cosine"):
+        read("mine.npy", np.ones((800, 2)), distance="cosin")
+    with pytest.raises(FileNotFoundError, match=r"no\.npy: expected .*found none"):
+        read_input(tmp_path / "no.npy", None, sequence="x")
+
+
+def test_protocols_fit_the_input(read):
+    matrix, pairs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n")
+    bare, scored = read("b.txt", "5: 0\n"), read("s.txt", "5: 0=.5\n")
+    assert chosen_protocols(matrix, ()) == list(HEADLINES)
+    assert chosen_protocols(matrix, ["all"]) == list(PROTOCOLS)
+    assert chosen_protocols(scored, ()) == ["top1-f1max", "bevplace-recall-at-1"]
+    assert chosen_protocols(bare, ()) == ["bevplace-recall-at-1"]
+    assert chosen_protocols(bare, ["all"]) == ["bevplace-recall-at-1", "ssc-recall", "bevplace-v1-recall"]
+    assert chosen_protocols(pairs, ()) == chosen_protocols(pairs, ["all"]) == ["listed-pairs-f1max"]
+    assert chosen_protocols(matrix, ["ssc-recall", "ssc-recall"]) == ["ssc-recall"]
+    with pytest.raises(ValueError, match=r"for a top-k list without scores, which are .*; found top1-f1max"):
+        chosen_protocols(bare, ["top1-f1max"])
+    with pytest.raises(ValueError, match=r"for descriptors, which are .*; found listed-pairs-f1max"):
+        chosen_protocols(matrix, ["listed-pairs-f1max"])
+
+
+def test_an_unknown_name_is_answered_with_the_nearest():
+    check_names(["all", "ssc-recall", "listed-pairs-f1max"])
+    with pytest.raises(ValueError, match="no protocol 'top1'; did you mean 'top1-f1max'"):
+        check_names(["top1"])
