@@ -15,6 +15,7 @@ _SMALL = load_preset("small")
 CONFIG = dataclasses.replace(
     _SMALL,
     model=model_preset("demo"),
+    sampling=dataclasses.replace(_SMALL.sampling, cluster=4),  # two drives are few: neighbours are the hard negatives
     loss=dataclasses.replace(_SMALL.loss, segment_every=4),
     optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=20, decay_rate=0.5, decay_steps=100, clip_norm=1.0),
     steps=500,

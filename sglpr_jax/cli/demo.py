@@ -16,13 +16,14 @@ from sglpr_jax.cli.train import TrainCommand, train_and_test
 
 SCANS = 300
 AZIMUTH_STEPS = 450
+TESTED = "00"
 
 
 @dataclasses.dataclass(frozen=True)
 class DemoCommand:
     """Train a small model on two simulated drives and find the loop closures of a third, never seen.
 
-    The third, 08, comes back to its places in the opposite direction.
+    The third is 00, which comes back to its places in the same direction.
     """
 
     out: Path = Path("runs/demo")
@@ -41,11 +42,13 @@ def demo(command: DemoCommand) -> Path:
         shutil.rmtree(trained)
     config = load_preset("demo")
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
-    train_and_test(TrainCommand(seq="08", data=town, preset="demo", out=trained, config=config))
+    train_and_test(TrainCommand(seq=TESTED, data=town, preset="demo", out=trained, config=config))
     print("\nthe same by hand: bin/embed, then bin/evaluate", file=sys.stderr)
-    descriptors = embed_sequence(EmbedCommand(data=town, seq="08", weights=trained, out=command.out / "08.npz"))
+    descriptors = embed_sequence(
+        EmbedCommand(data=town, seq=TESTED, weights=trained, out=command.out / f"{TESTED}.npz")
+    )
     evaluate_file(EvaluateCommand(descriptors))
-    pictures = sorted([*trained.glob("test/*.png"), *(command.out / "08").glob("*.png")])
+    pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])
     print("pictures:", *pictures, sep="\n  ")
     return command.out
 
