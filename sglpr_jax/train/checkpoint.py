@@ -20,7 +20,8 @@ class Checkpoints:
     def __init__(self, folder: Path):
         policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=lambda m: m["score"], n=1)])
         options = ocp.CheckpointManagerOptions(preservation_policy=policy, cleanup_tmp_directories=True)
-        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+        handlers = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
+        self._manager = ocp.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
 
     def save(self, state: TrainState, *, score: float | None = None) -> None:
         """Write the state under its step, with its score if it has one. A step already there is left as it is."""
@@ -38,21 +39,31 @@ class Checkpoints:
 
     def restore(self, config: TrainConfig) -> TrainState:
         """The newest state. Raises ValueError when there is none or it belongs to another model."""
+        self._manager.wait_until_finished()
         step = self.latest_step()
         if step is None:
             raise ValueError(f"{self._manager.directory}: expected a checkpoint to resume from, found none")
         like = jax.eval_shape(lambda: new_state(config))
+        # Before any array is read: where reading one fails, orbax drops the others half-way.
+        there, expected = _shapes(self._manager.item_metadata(step).weights), _shapes(like.params.weights)
+        if there != expected:
+            name = min(dict(set(there.items()) ^ set(expected.items())))
+            raise ValueError(
+                f"{self._manager.directory}/{step}: not a checkpoint of this configuration: expected {name} of shape "
+                f"{expected.get(name, 'none (no such weight)')}, found {there.get(name, 'none (missing)')}"
+            )
         items = ocp.args.Composite(
             weights=ocp.args.StandardRestore(like.params.weights), optimizer=ocp.args.StandardRestore(like.optimizer)
         )
-        try:
-            found: Any = self._manager.restore(step, args=items)
-        except ValueError as error:
-            raise ValueError(
-                f"{self._manager.directory}/{step}: not a checkpoint of this configuration: {error}"
-            ) from error
+        found: Any = self._manager.restore(step, args=items)
         return TrainState(jax.numpy.asarray(step, "int32"), Params(found.weights, config.model), found.optimizer)
 
     def close(self) -> None:
         """Wait until everything is written."""
         self._manager.close()
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    """The shape of every array by its path."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(leaf.shape) for path, leaf in leaves}

@@ -65,6 +65,9 @@ def test_the_checkpoint_of_another_model_is_refused(checkpoints, state, config, 
     other = dataclasses.replace(config, model=dataclasses.replace(config.model, **change))
     with pytest.raises(ValueError, match=rf"{tmp_path}/checkpoints/17: not a checkpoint of this configuration"):
         checkpoints.restore(other)
+    checkpoints.close()
+    with pytest.raises(ValueError, match=r"expected backbone/.* of shape .*, found "):
+        Checkpoints(tmp_path / "checkpoints").restore(other)
 
 
 def test_nothing_to_resume_from_is_an_error(checkpoints, config, tmp_path):
