@@ -9,7 +9,7 @@ import tyro
 
 from sglpr_jax.cli.datasets import simulate
 from sglpr_jax.cli.embed import EmbedCommand, embed_sequence
-from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
+from sglpr_jax.cli.evaluate import PAGE, EvaluateCommand, evaluate_file
 from sglpr_jax.cli.presets import load_preset
 from sglpr_jax.cli.runtime import run
 from sglpr_jax.cli.train import TrainCommand, train_and_test
@@ -47,9 +47,10 @@ def demo(command: DemoCommand) -> Path:
     descriptors = embed_sequence(
         EmbedCommand(data=town, seq=TESTED, weights=trained, out=command.out / f"{TESTED}.npz")
     )
-    evaluate_file(EvaluateCommand(descriptors))
+    evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=trained))
     pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])
     print("pictures:", *pictures, sep="\n  ")
+    print(f"all on one page: {command.out / TESTED / PAGE}")
     return command.out
 
 

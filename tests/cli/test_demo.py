@@ -32,6 +32,8 @@ def test_the_demo_ends_with_a_table_and_its_pictures_and_can_be_run_again(comman
     methods = ("top-1 F1max", "polar-fft", "untrained", "rotated")
     for words in (*methods, "segmentation of 40 scans", "sequence 00, 40 scans"):
         assert words in table
+    pictures, page = pictures.split("all on one page: ")
+    assert Path(page.strip()).stat().st_size > 100_000
     paths = [Path(line.strip()) for line in pictures.splitlines()]
     assert {path.name for path in paths} >= {"segmentation.png", "trajectory.png", "trajectory-raw.png"}
     assert all(path.stat().st_size > 5000 for path in paths)
