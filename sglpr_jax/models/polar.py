@@ -38,8 +38,8 @@ def to_polar(
 def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {grid.height} {grid.width} c"]:
     """The polar image read at every cell of the grid; zero beyond the circle.
 
-    Differentiable in reverse mode only: its gradient is written as a reading too, because with the scatter that JAX makes
-    of a gather's gradient, forward and backward took six times as long on a CPU.
+    Differentiable in reverse mode only: its gradient is written as a reading too, because with the scatter that JAX
+    makes of a gather's gradient, forward and backward took six times as long on a CPU.
     """
     rings, sectors = polar.shape[1:3]
     down, right = np.mgrid[: grid.height, : grid.width]
