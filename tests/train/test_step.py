@@ -125,6 +125,40 @@ def test_unlabelled_cells_can_be_left_out_of_the_segmentation_losses(config, par
     np.testing.assert_allclose(metrics["dice"], np.mean(1 - (overlap + 1e-5) / (total + 1e-5)), rtol=1e-4)
 
 
+@pytest.mark.parametrize(("left_out", "weight"), [("cross_entropy", "ce_weight"), ("dice", "dice_weight")])
+def test_a_term_without_weight_is_not_computed(config, params, make_batch, whole, left_out, weight):
+    loss = dataclasses.replace(config.loss, **{weight: 0.0})
+    _, metrics = gradients_of(params, make_batch(0), dataclasses.replace(config, loss=loss))
+    (kept,) = {"cross_entropy", "dice"} - {left_out}
+    assert set(metrics) == {"loss", "triplet", "violations", kept}
+    np.testing.assert_allclose(metrics[kept], whole[1][kept], rtol=1e-5)
+    share = {"cross_entropy": 0.4, "dice": 0.6}[kept]
+    np.testing.assert_allclose(metrics["loss"], metrics["triplet"] + share * metrics[kept], rtol=1e-6)
+
+
+def test_where_nothing_reads_labels_there_are_no_categories(config):
+    no_terms = dataclasses.replace(config.loss, ce_weight=0.0, dice_weight=0.0)
+    assert config.model.categories == 20
+    assert dataclasses.replace(config, loss=no_terms).model.categories == 0
+    reads = {what: dataclasses.replace(config.model.head, input=what) for what in ("counts", "labels")}
+    for what, categories in (("counts", 0), ("labels", 20)):
+        model = dataclasses.replace(config.model, head=reads[what])
+        assert dataclasses.replace(config, model=model, loss=no_terms).model.categories == categories
+
+
+def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, random_params, make_batch):
+    head = dataclasses.replace(config.model.head, input="counts+labels")
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
+    params, batch = random_params(config.model), make_batch(0)
+    gradient, metrics = gradients_of(params, batch, config)
+    assert set(metrics) == {"loss", "triplet", "violations"} and set(gradient) == {"place_head"}
+    assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
+    relabelled = batch.replace(classes=(batch.classes + 1) % 20)
+    assert gradients_of(params, relabelled, config)[1]["triplet"] != metrics["triplet"]
+    with pytest.raises(ValueError, match="expected maps of classes"):
+        gradients_of(params, batch.replace(classes=None), config)
+
+
 def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_batch, whole):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
     config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(config.model, drop_path=0.5))
