@@ -76,9 +76,7 @@ class ModelConfig:
             raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
         if self.polar and self.field != "circle":
             raise ValueError(f"a polar image covers a circle: expected field 'circle', found {self.field!r}")
-        if self.categories:
-            label_map(self.categories)
-        elif self.head.reads_labels:
+        if self.head.reads_labels and not self.categories:
             raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
         step = self.patch * 2 ** (len(self.depths) - 1)
         for size in self.image_size:

@@ -116,7 +116,7 @@ def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
 def describe(
     params: Params,
     bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
-    labels: Int[Array, "*b h w"] | None = None,
+    labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
     """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
 
@@ -138,7 +138,7 @@ def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) 
 def forward(
     params: Params,
     bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
-    labels: Int[Array, "*b h w"] | None = None,
+    labels: Int[Array, "... h w"] | None = None,
     *,
     key: Array | None = None,
     segment: int = 1,

@@ -84,6 +84,14 @@ def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
     assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)
 
 
+def test_a_segmentation_panel_has_the_names_and_colours_of_its_categories(tmp_path):
+    moving = label_map(25).names.index("moving")
+    found = np.full((8, 8), moving)
+    figure = figures.segmentation_panel(found, None, found, resolution_m=1.0, categories=25)
+    assert legend(figure) == ["moving"]
+    assert shows(pixels(figure, tmp_path / "moving.png"), label_map(25).colors[moving])
+
+
 def test_an_empty_image_can_be_drawn(tmp_path):
     nothing = np.zeros((8, 8), np.int32)
     pixels(figures.segmentation_panel(nothing, nothing, nothing, resolution_m=1.0), tmp_path / "empty.png")

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import Grid, rasterize, rotate_image, rotate_points
+from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed, embed_scans
 
@@ -167,6 +168,30 @@ def test_a_source_without_poses_can_be_embedded(scans):
     bare = dataclasses.replace(scans, positions=None, times=None, pose_source=None)
     found = embed(flatten, bare, GRID, config={})
     assert found.positions is None and found.times is None and len(found) == SCANS
+
+
+def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(scans, pictures, tmp_path):
+    raw = [np.resize(np.array([10, 50, 252], "<u4"), len(cloud)) for cloud in clouds()]
+    paths = tuple(tmp_path / f"{i}.label" for i in range(SCANS))
+    for path, ids in zip(paths, raw, strict=True):
+        ids.tofile(path)
+    labelled = dataclasses.replace(scans, label_paths=paths)
+
+    def maps(images, labels):
+        assert images.shape == labels.shape == (3, GRID.height, GRID.width)
+        return flatten(labels)
+
+    found = embed(maps, labelled, GRID, config={}, categories=25, rotation_seed=3, batch=3)
+    for cloud, ids, angle, descriptor in zip(clouds(), raw, drawn_angles(3), found.descriptors, strict=True):
+        turned = rotate_points(jnp.asarray(cloud), jnp.float32(angle))
+        classes = jnp.asarray(to_classes(ids.astype(np.int32), categories=25))
+        expected = rasterize_labels(turned, classes, grid=GRID)
+        assert expected.max() == 25  # the moving car
+        np.testing.assert_array_equal(descriptor, np.asarray(expected).reshape(-1))
+    with pytest.raises(ValueError, match="scan 000000 of sequence 08: expected labels, found none"):
+        embed(maps, scans, GRID, config={}, categories=25)
+    with pytest.raises(ValueError, match="sequence 06: expected scans with labels, found ready-made images"):
+        embed(maps, pictures, GRID, config={}, categories=25)
 
 
 def test_points_are_described_scan_by_scan(scans):
