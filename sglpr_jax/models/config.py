@@ -72,12 +72,12 @@ class ModelConfig:
     head: HeadConfig = HeadConfig()
 
     def __post_init__(self):
+        if self.head.reads_labels and not self.categories:
+            raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
         if len(self.depths) != len(self.heads):
             raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
         if self.polar and self.field != "circle":
             raise ValueError(f"a polar image covers a circle: expected field 'circle', found {self.field!r}")
-        if self.head.reads_labels and not self.categories:
-            raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
         step = self.patch * 2 ** (len(self.depths) - 1)
         for size in self.image_size:
             if size % step:
