@@ -1,12 +1,11 @@
 """The place head: from the backbone's feature map to a descriptor (section 4.1.2)."""
 
 import flax.linen as nn
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.cbam import CBAM
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.layers import LayerNorm, l2_normalize
+from sglpr_jax.models.layers import LayerNorm, convolution, l2_normalize
 from sglpr_jax.models.netvlad import NetVLAD
 
 
@@ -26,17 +25,8 @@ class PlaceHead(nn.Module):
         seen = {"cbam": x}
         shapes = zip(self.config.channels, self.config.kernels, self.config.strides, strict=True)
         for i, (channels, kernel, stride) in enumerate(shapes):
-            x = self._convolution(x, channels, kernel, stride, name=f"convolution_{i}")
+            x = convolution(x, channels, kernel, stride, circular=self.circular, name=f"convolution_{i}")
             x = seen[f"head_convolution{i}"] = nn.relu(LayerNorm(name=f"norm_{i}")(x))
         locals_ = x.reshape(len(x), -1, x.shape[-1])
         vector = NetVLAD(self.config.clusters, self.config.descriptor_size, name="netvlad")(locals_)
         return l2_normalize(vector), seen
-
-    def _convolution(self, x: Array, channels: int, kernel: int, stride: int, *, name: str) -> Array:
-        """He-initialised. Patches side by side (kernel = stride) need no border, others PyTorch's of kernel // 2."""
-        border = 0 if kernel == stride else kernel // 2
-        if self.circular:
-            x = jnp.pad(x, ((0, 0), (0, 0), (border, border), (0, 0)), mode="wrap")
-        padding = [(border, border), (0, 0) if self.circular else (border, border)]
-        init = nn.initializers.he_normal()
-        return nn.Conv(channels, (kernel, kernel), stride, padding, kernel_init=init, name=name)(x)
