@@ -9,7 +9,7 @@ Everything below is a pure function or a frozen value; the rest of the package i
 
 from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data import open_sequence, read_scan, sequence_names
-from sglpr_jax.labels import CATEGORIES, to_classes
+from sglpr_jax.labels import CATEGORIES, label_map, to_classes
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import load, save
 from sglpr_jax.models.presets import MODELS, model_preset
@@ -33,6 +33,7 @@ __all__ = [
     "embed",
     "forward",
     "init",
+    "label_map",
     "load",
     "model_preset",
     "open_sequence",

@@ -1,93 +1,187 @@
-"""SemanticKITTI's raw label ids and the 20 classes that SG-LPR and RINet learn (the dataset's `learning_map`)."""
+"""SemanticKITTI's raw label ids, and figure 9's ways to sort them into categories: the table is in docs/labels.md."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Int, Int32
+from jaxtyping import Int, Int32, UInt8
 
-CATEGORIES = (
-    "unlabeled",
-    "car",
-    "bicycle",
-    "motorcycle",
-    "truck",
-    "other-vehicle",
-    "person",
-    "bicyclist",
-    "motorcyclist",
-    "road",
-    "parking",
-    "sidewalk",
-    "other-ground",
-    "building",
-    "fence",
-    "vegetation",
-    "trunk",
-    "terrain",
-    "pole",
-    "traffic-sign",
-)
-"""The names of the classes, by class id. Class 0 stands for no label and is left out of scores."""
+Categories = Literal[0, 6, 15, 20, 25, 34]
+"""The settings of figure 9 by their number; 0 means no semantics at all."""
 
 UNLABELLED = 0
+"""The class that stands for no label, whatever the categories; it is left out of scores."""
 
-COLORS = np.array(
-    [
-        (0, 0, 0),
-        (100, 150, 245),
-        (100, 230, 245),
-        (30, 60, 150),
-        (80, 30, 180),
-        (0, 0, 255),
-        (255, 30, 30),
-        (255, 40, 200),
-        (150, 30, 90),
-        (255, 0, 255),
-        (255, 150, 255),
-        (75, 0, 75),
-        (175, 0, 75),
-        (255, 200, 0),
-        (255, 120, 50),
-        (0, 175, 0),
-        (135, 60, 0),
-        (150, 240, 80),
-        (255, 240, 150),
-        (255, 0, 0),
-    ],
-    dtype=np.uint8,
-)
-"""Red, green and blue (20, 3) of each class in pictures: SemanticKITTI's own colours."""
+RAW_NAMES = {
+    0: "unlabeled",
+    1: "outlier",
+    10: "car",
+    11: "bicycle",
+    13: "bus",
+    15: "motorcycle",
+    16: "on-rails",
+    18: "truck",
+    20: "other-vehicle",
+    30: "person",
+    31: "bicyclist",
+    32: "motorcyclist",
+    40: "road",
+    44: "parking",
+    48: "sidewalk",
+    49: "other-ground",
+    50: "building",
+    51: "fence",
+    52: "other-structure",
+    60: "lane-marking",
+    70: "vegetation",
+    71: "trunk",
+    72: "terrain",
+    80: "pole",
+    81: "traffic-sign",
+    99: "other-object",
+    252: "moving-car",
+    253: "moving-bicyclist",
+    254: "moving-person",
+    255: "moving-motorcyclist",
+    256: "moving-on-rails",
+    257: "moving-bus",
+    258: "moving-truck",
+    259: "moving-other-vehicle",
+}
+"""The 34 raw ids. 252 to 259 are the moving twins of things that also stand still."""
 
-# class: the raw ids that become it; 252 to 259 are the moving twins of classes that also stand still
-_RAW_IDS = {
-    "unlabeled": (0, 1, 52, 99),
-    "car": (10, 252),
-    "bicycle": (11,),
-    "motorcycle": (15,),
-    "truck": (18, 258),
-    "other-vehicle": (13, 16, 20, 256, 257, 259),
-    "person": (30, 254),
-    "bicyclist": (31, 253),
-    "motorcyclist": (32, 255),
-    "road": (40, 60),
-    "parking": (44,),
-    "sidewalk": (48,),
-    "other-ground": (49,),
-    "building": (50,),
-    "fence": (51,),
-    "vegetation": (70,),
-    "trunk": (71,),
-    "terrain": (72,),
-    "pole": (80,),
-    "traffic-sign": (81,),
+_NOTHING = (0, 1)
+_MOVING = range(252, 260)
+_MOVABLE = (10, 11, 13, 15, 16, 18, 20, 30, 31, 32, *_MOVING)
+_STILL = tuple(raw for raw in RAW_NAMES if raw not in (*_NOTHING, *_MOVING))
+_SCENE = tuple(raw for raw in _STILL if raw not in _MOVABLE)
+
+
+def _named(raw_ids: Iterable[int]) -> dict[str, tuple[int, ...]]:
+    """A class of its own for each of these ids."""
+    return {RAW_NAMES[raw]: (raw,) for raw in raw_ids}
+
+
+# categories: for each class, in order, the raw ids that become it; the first of them lends it its colour
+_RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
+    # Six groups of SemanticKITTI's paper: what has similar attributes.
+    6: {
+        "unlabeled": _NOTHING,
+        "ground": (40, 44, 48, 49, 60),
+        "structure": (50, 51, 52),
+        "vehicle": (10, 11, 13, 15, 16, 18, 20, 252, 256, 257, 258, 259),
+        "nature": (70, 71, 72),
+        "human": (30, 31, 32, 253, 254, 255),
+        "object": (80, 81, 99),
+    },
+    # All that can move, whether it does or not, is as if not annotated.
+    15: {"unlabeled": (*_NOTHING, *_MOVABLE), **_named(_SCENE)},
+    # RINet's, which is the dataset's own `learning_map`: a thing that moves is what it is when it stands.
+    20: {
+        "unlabeled": (0, 1, 52, 99),
+        "car": (10, 252),
+        "bicycle": (11,),
+        "motorcycle": (15,),
+        "truck": (18, 258),
+        "other-vehicle": (20, 13, 16, 256, 257, 259),
+        "person": (30, 254),
+        "bicyclist": (31, 253),
+        "motorcyclist": (32, 255),
+        "road": (40, 60),
+        "parking": (44,),
+        "sidewalk": (48,),
+        "other-ground": (49,),
+        "building": (50,),
+        "fence": (51,),
+        "vegetation": (70,),
+        "trunk": (71,),
+        "terrain": (72,),
+        "pole": (80,),
+        "traffic-sign": (81,),
+    },
+    # All that moves is one thing.
+    25: {"unlabeled": _NOTHING, **_named(_STILL), "moving": tuple(_MOVING)},
+    34: _named(RAW_NAMES),
 }
 
-_CLASS_OF = np.full(260, -1, dtype=np.int32)
-for _class_id, _category in enumerate(CATEGORIES):
-    _CLASS_OF[list(_RAW_IDS[_category])] = _class_id
+# Red, green and blue of each raw id: SemanticKITTI's own, but for outlier, on-rails and all that moves, which it draws
+# in the colours of others.
+_COLORS = {
+    0: (0, 0, 0),
+    1: (110, 110, 110),
+    10: (100, 150, 245),
+    11: (100, 230, 245),
+    13: (100, 80, 250),
+    15: (30, 60, 150),
+    16: (0, 110, 170),
+    18: (80, 30, 180),
+    20: (0, 0, 255),
+    30: (255, 30, 30),
+    31: (255, 40, 200),
+    32: (150, 30, 90),
+    40: (255, 0, 255),
+    44: (255, 150, 255),
+    48: (75, 0, 75),
+    49: (175, 0, 75),
+    50: (255, 200, 0),
+    51: (255, 120, 50),
+    52: (255, 150, 0),
+    60: (150, 255, 170),
+    70: (0, 175, 0),
+    71: (135, 60, 0),
+    72: (150, 240, 80),
+    80: (255, 240, 150),
+    81: (255, 0, 0),
+    99: (50, 255, 255),
+}
+_STANDING_TWIN = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
 
 
-def to_classes(raw: Int[np.ndarray, "*shape"]) -> Int32[np.ndarray, "*shape"]:
-    """Return the class id (0..19) of each raw SemanticKITTI id. Raises ValueError naming ids that do not exist."""
-    classes = np.where((raw >= 0) & (raw < len(_CLASS_OF)), _CLASS_OF[np.clip(raw, 0, len(_CLASS_OF) - 1)], -1)
+def _color(raw: int) -> tuple[int, ...]:
+    """What moves is its standing twin half-way to white."""
+    if raw in _COLORS:
+        return _COLORS[raw]
+    return tuple((channel + 255) // 2 for channel in _COLORS[_STANDING_TWIN[raw]])
+
+
+@dataclass(frozen=True, eq=False)
+class LabelMap:
+    """One way to sort raw ids into classes 0 to k - 1. Class 0 is `UNLABELLED`."""
+
+    names: tuple[str, ...]
+    colors: UInt8[np.ndarray, "k 3"]
+    """Red, green and blue of each class in pictures."""
+    class_of: Int32[np.ndarray, " 260"]
+    """The class of each raw id; -1 for ids that do not exist."""
+
+
+def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> LabelMap:
+    class_of = np.full(max(RAW_NAMES) + 1, -1, dtype=np.int32)
+    for class_id, members in enumerate(raw_ids.values()):
+        class_of[list(members)] = class_id
+    colors = np.array([_color(members[0]) for members in raw_ids.values()], dtype=np.uint8)
+    return LabelMap(tuple(raw_ids), colors, class_of)
+
+
+_LABEL_MAPS = {categories: _label_map(raw_ids) for categories, raw_ids in _RAW_IDS.items()}
+
+
+def label_map(categories: int = 20) -> LabelMap:
+    """The classes of one setting of figure 9. Raises ValueError with the settings there are."""
+    if categories not in _LABEL_MAPS:
+        raise ValueError(f"no label map of {categories!r} categories; there are {', '.join(map(str, _LABEL_MAPS))}")
+    return _LABEL_MAPS[categories]
+
+
+CATEGORIES = label_map(20).names
+"""The names of the 20 classes of SG-LPR and RINet, by class id."""
+
+
+def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
+    """Return the class of each raw SemanticKITTI id. Raises ValueError naming ids that do not exist."""
+    class_of = label_map(categories).class_of
+    classes = np.where((raw >= 0) & (raw < len(class_of)), class_of[np.clip(raw, 0, len(class_of) - 1)], -1)
     if np.any(classes < 0):
         raise ValueError(f"expected raw SemanticKITTI ids, found {np.unique(raw[classes < 0])[:5].tolist()}")
     return classes

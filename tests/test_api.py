@@ -13,7 +13,12 @@ import sglpr_jax
 PUBLIC = [(name, getattr(sglpr_jax, name)) for name in sglpr_jax.__all__]
 CALLABLES = [(name, member) for name, member in PUBLIC if callable(member)]
 FUNCTIONS = [(name, inspect.signature(member)) for name, member in CALLABLES if not inspect.isclass(member)]
-NAMES_NOT_OPTIONS = {("open_sequence", "name")}
+INPUTS_NOT_OPTIONS = {
+    ("open_sequence", "name"),
+    ("describe", "labels"),
+    ("forward", "labels"),
+    ("label_map", "categories"),
+}
 
 
 def test_all_is_sorted_out_and_complete():
@@ -34,7 +39,7 @@ def test_key_comes_first_and_options_are_named(name, signature):
     for position, parameter in enumerate(parameters):
         if parameter.name == "key" and parameter.default is parameter.empty:
             assert position == 0
-        elif parameter.default is not parameter.empty and (name, parameter.name) not in NAMES_NOT_OPTIONS:
+        elif parameter.default is not parameter.empty and (name, parameter.name) not in INPUTS_NOT_OPTIONS:
             assert parameter.kind is parameter.KEYWORD_ONLY, parameter.name
 
 

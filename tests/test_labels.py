@@ -1,22 +1,42 @@
-"""Raw SemanticKITTI ids become the classes of the dataset's own map."""
+"""Raw SemanticKITTI ids become the classes of each setting of figure 9, as docs/labels.md says."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sglpr_jax.labels import CATEGORIES, COLORS, to_classes
+from sglpr_jax.labels import CATEGORIES, RAW_NAMES, label_map, to_classes
+
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "labels.md"
+SETTINGS = (6, 15, 20, 25, 34)
 
 
 def test_some_known_ids():
     raw = np.array([[0, 10, 252], [40, 60, 81]])
     np.testing.assert_array_equal(to_classes(raw), [[0, 1, 1], [9, 9, 19]])
     assert to_classes(raw).dtype == np.int32
+    assert [label_map(6).names[c] for c in to_classes(np.array([30, 254, 31, 253]), categories=6)] == ["human"] * 4
 
 
-def test_every_class_has_a_name_and_a_colour_of_its_own():
-    assert len(set(CATEGORIES)) == 20
-    assert len(np.unique(COLORS, axis=0)) == 20
+@pytest.mark.parametrize("categories", SETTINGS)
+def test_every_raw_id_has_a_class_with_a_name_and_a_colour_of_its_own(categories):
+    found = label_map(categories)
+    k = len(found.names)
+    assert k - categories == (1 if categories in (6, 25) else 0)  # where the unlabelled class comes on top
+    assert found.names[0] == "unlabeled" and len(set(found.names)) == k
+    assert found.colors.shape == (k, 3) and len(np.unique(found.colors, axis=0)) == k
+    classes = to_classes(np.array(list(RAW_NAMES)), categories=categories)
+    assert classes[0] == 0 and set(classes.tolist()) == set(range(k))
+
+
+def test_dynamic_things_are_sorted_as_the_paper_says():
+    moving, movable = np.arange(252, 260), np.array([10, 11, 13, 15, 16, 18, 20, 30, 31, 32])
+    twins = np.array([10, 31, 30, 32, 16, 13, 18, 20])
+    np.testing.assert_array_equal(to_classes(moving), to_classes(twins))
+    assert {label_map(25).names[c] for c in to_classes(moving, categories=25)} == {"moving"}
+    assert "moving" not in {label_map(25).names[c] for c in to_classes(movable, categories=25)}
+    assert not to_classes(np.append(moving, movable), categories=15).any()
 
 
 @pytest.mark.parametrize("unknown", [-1, 2, 26, 260, 65535])
@@ -25,8 +45,25 @@ def test_an_unknown_id_is_named(unknown):
         to_classes(np.array([10, unknown]))
 
 
+@pytest.mark.parametrize("categories", [0, 19])
+def test_an_unknown_setting_lists_those_there_are(categories):
+    with pytest.raises(ValueError, match=rf"no label map of {categories} categories; there are 6, 15, 20, 25, 34"):
+        label_map(categories)
+
+
+def test_the_documented_table_is_the_code():
+    """A failure shows the table as it should be."""
+    lines = ["| raw id | name | " + " | ".join(map(str, SETTINGS)) + " |", "|---" * (2 + len(SETTINGS)) + "|"]
+    for raw, name in RAW_NAMES.items():
+        classes = [(to_classes(np.array(raw), categories=n).item(), label_map(n).names) for n in SETTINGS]
+        lines.append(f"| {raw} | {name} | " + " | ".join(f"{c} {names[c]}" for c, names in classes) + " |")
+    found = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("|")]
+    assert found == lines, "\n".join(lines)
+
+
 def test_the_map_names_and_colours_are_those_of_semantic_kitti(shared):
     sections = _sections((shared / "data/kitti_odometry/semantic-kitti.yaml").read_text())
+    assert {int(raw): name.strip('"') for raw, name in sections["labels"].items()} == RAW_NAMES
     learning_map = {int(raw): int(value) for raw, value in sections["learning_map"].items()}
     assert len(learning_map) == 34
     raw = np.array(list(learning_map))
@@ -34,7 +71,7 @@ def test_the_map_names_and_colours_are_those_of_semantic_kitti(shared):
     for class_id, raw_id in sections["learning_map_inv"].items():
         assert CATEGORIES[int(class_id)] == sections["labels"][raw_id].strip('"')
         blue_green_red = [int(channel) for channel in re.findall(r"\d+", sections["color_map"][raw_id])]
-        assert COLORS[int(class_id)].tolist() == blue_green_red[::-1]
+        assert label_map().colors[int(class_id)].tolist() == blue_green_red[::-1]
 
 
 def test_real_labels_have_classes(shared):

@@ -35,7 +35,7 @@ def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> N
         _print(results, f"sequence {sequence.name}, {title}")
         if importlib.util.find_spec("matplotlib"):
             _draw(results, sequence, folder, title)
-    if isinstance(sequence, ScanSequence) and sequence.has_labels:
+    if params.config.segments and isinstance(sequence, ScanSequence) and sequence.has_labels:
         report["segmentation"] = score_semantics(params, sequence, folder)
     write_json(folder / "results.json", report)
     console().print(f"written to {folder}")

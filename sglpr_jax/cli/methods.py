@@ -20,17 +20,29 @@ BEV_IMAGE_RADIUS = 62.0
 
 @dataclasses.dataclass(frozen=True)
 class ImageMethod:
-    """A way to describe images: the function, the window it wants (None: images whole), and what to write about it."""
+    """A way to describe images: the function, the window it wants (None: images whole), and what to write about it.
+
+    With `categories` the function wants maps of so many classes too.
+    """
 
     describe: DescribeFn
     grid: Grid | None
     about: dict[str, Any]
     weights_hash: str = ""
+    categories: int = 0
 
     def embed(self, sequence: Drive, **options: Any) -> DescriptorFile:
-        """Describe a whole sequence; options are those of `retrieval.embed.embed`."""
-        about = {"data": sequence.name, **self.about}
-        return embed(self.describe, sequence, self.grid, config=about, weights_hash=self.weights_hash, **options)
+        """Describe a whole sequence; options are those of `retrieval.embed.embed`.
+
+        Raises ValueError where the sequence has not the labels that the method needs.
+        """
+        if self.categories and not sequence.has_labels:
+            raise ValueError(
+                f"this model describes a place from its labels too (model.head.input): expected labels beside the "
+                f"scans, found none in sequence {sequence.name}"
+            )
+        options |= {"config": {"data": sequence.name, **self.about}, "weights_hash": self.weights_hash}
+        return embed(self.describe, sequence, self.grid, categories=self.categories, **options)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +74,10 @@ Method = ImageMethod | ScanMethod
 
 def network(params: Params) -> ImageMethod:
     """The descriptors of `params`."""
-    about = {"method": "sglpr", "model": dataclasses.asdict(params.config)}
-    return ImageMethod(functools.partial(describe, params), params.config.grid, about, weights_hash(params))
+    config = params.config
+    about = {"method": "sglpr", "model": dataclasses.asdict(config)}
+    describe_views = functools.partial(describe, params)
+    return ImageMethod(describe_views, config.grid, about, weights_hash(params), config.categories_read)
 
 
 def reference(name: str, sequence: Drive, grid: Grid) -> Method:

@@ -13,7 +13,7 @@ from sglpr_jax.labels import to_classes
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import read_image
+from sglpr_jax.retrieval.embed import read_image, read_views
 from sglpr_jax.retrieval.heat_maps import heat_maps
 from sglpr_jax.retrieval.semantic_maps import semantic_map
 
@@ -34,6 +34,8 @@ def take_pictures(sequence: Drive, params: Params | None, source: Input, worst: 
         return Pictures(images, f"Semantic {needs}", f"Feature heat {needs}")
     shown = sorted({int(part * len(sequence)) for part in SHOWN})
     heat = {sequence.ids[row]: _heat(sequence, params, row) for row in shown}
+    if not params.config.segments:
+        return Pictures(images, "Semantic maps: add --weights that have a segmentation head; these have none.", heat)
     if not isinstance(sequence, ScanSequence):
         return Pictures(
             images, "Semantic maps: add --data with scans; ready-made images have no points to label.", heat
@@ -61,12 +63,13 @@ def _image(sequence: Drive, row: int, grid: Grid) -> np.ndarray:
 
 
 def _heat(sequence: Drive, params: Params, row: int) -> HeatPicture:
-    image = np.asarray(read_image(sequence, row, params.config.grid))
-    return HeatPicture(image, heat_maps(params, image))
+    views = read_views(sequence, row, params.config.grid, categories=params.config.categories_read)
+    return HeatPicture(np.asarray(views[0]), heat_maps(params, *views))
 
 
 def _semantic(sequence: ScanSequence, params: Params, row: int) -> SemanticPicture:
-    labels = sequence.labels(row)
-    found = semantic_map(params, sequence.points(row), None if labels is None else to_classes(labels))
+    labels, config = sequence.labels(row), params.config
+    classes = None if labels is None else to_classes(labels, categories=config.categories)
+    found = semantic_map(params, sequence.points(row), classes)
     truth = None if labels is None else found.truth
-    return SemanticPicture(found.counts, truth, found.predicted, params.config.grid.resolution_m)
+    return SemanticPicture(found.counts, truth, found.predicted, config.grid.resolution_m, config.categories)

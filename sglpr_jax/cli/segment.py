@@ -17,7 +17,8 @@ from sglpr_jax.data import ScanSequence, open_sequence
 from sglpr_jax.data.scan_files import ScanFormat
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.segmentation import SegmentationResult, confusion_matrix, score_confusion
-from sglpr_jax.labels import CATEGORIES, to_classes
+from sglpr_jax.labels import label_map, to_classes
+from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import load
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.retrieval.semantic_maps import SemanticMap, semantic_map
@@ -27,7 +28,7 @@ RESULT_FILE = "segmentation.json"
 
 @dataclasses.dataclass(frozen=True)
 class SegmentCommand:
-    """Write each scan's semantic map as seen from above, one PNG of class ids (0 to 19) per scan.
+    """Write each scan's semantic map as seen from above, one PNG of class ids (docs/labels.md) per scan.
 
     With labels beside the scans, also the intersection over union of every class and a picture of one scan (figure 7).
 
@@ -52,6 +53,8 @@ def segment_sequence(command: SegmentCommand) -> Path:
     if not isinstance(sequence, ScanSequence):
         raise ValueError(f"{command.data}: expected scans, found ready-made images, which have no points to label")
     params = load(command.weights)
+    if not params.config.segments:
+        raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none in them")
     command.out.mkdir(parents=True, exist_ok=True)
     for row, found in _maps(params, sequence, range(len(sequence))):
         _write_png(command.out / f"{sequence.ids[row]}.png", found.predicted)
@@ -64,51 +67,53 @@ def segment_sequence(command: SegmentCommand) -> Path:
 def score_semantics(params: Params, sequence: ScanSequence, folder: Path) -> dict[str, Any]:
     """Score the segmentation head on every labelled scan; print, and draw input, truth and prediction of one."""
     rows = [row for row, path in enumerate(sequence.label_paths) if path is not None]
-    classes = params.config.classes
+    classes, names = params.config.classes, label_map(params.config.categories).names
     confusion = np.zeros((classes, classes), np.int64)
     for row, found in _maps(params, sequence, rows):
         confusion += confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
         if row == rows[len(rows) // 2]:
-            _draw(found, params.config.grid.resolution_m, folder)
+            _draw(found, params.config, folder)
     result = score_confusion(confusion)
-    console().print(_table(result, f"segmentation of {len(rows)} scans of {sequence.name}"))
-    return _as_json(result)
+    console().print(_table(result, names, f"segmentation of {len(rows)} scans of {sequence.name}"))
+    return _as_json(result, names)
 
 
 def _maps(params: Params, sequence: ScanSequence, rows: range | list[int]) -> Iterator[tuple[int, SemanticMap]]:
     with progress_bar(f"segment {sequence.name}", len(rows)) as show:
         for done, row in enumerate(rows):
             labels = sequence.labels(row)
-            yield row, semantic_map(params, sequence.points(row), None if labels is None else to_classes(labels))
+            classes = None if labels is None else to_classes(labels, categories=params.config.categories)
+            yield row, semantic_map(params, sequence.points(row), classes)
             show(done + 1)
 
 
-def _draw(found: SemanticMap, resolution_m: float, folder: Path) -> None:
+def _draw(found: SemanticMap, config: ModelConfig, folder: Path) -> None:
     if importlib.util.find_spec("matplotlib"):
-        panel = figures.segmentation_panel(found.counts, found.truth, found.predicted, resolution_m=resolution_m)
+        about = {"resolution_m": config.grid.resolution_m, "categories": config.categories}
+        panel = figures.segmentation_panel(found.counts, found.truth, found.predicted, **about)
         figures.save(panel, folder / "segmentation.png")
 
 
-def _table(result: SegmentationResult, title: str) -> Table:
+def _table(result: SegmentationResult, names: tuple[str, ...], title: str) -> Table:
     table = Table(title=title, caption=f"{result.cells} cells with points and a label")
     for column in ("class", "share of the cells", "IoU"):
         table.add_column(column, justify="left" if column == "class" else "right")
-    for name, share, iou in zip(CATEGORIES, result.shares, result.iou, strict=True):
+    for name, share, iou in zip(names, result.shares, result.iou, strict=True):
         if share:
             table.add_row(name, f"{share:.2%}", f"{iou:.3f}")
     table.add_section()
     table.add_row(f"mean of {result.present} classes", "", f"{result.mean_iou:.3f}")
-    table.add_row(f"{CATEGORIES[result.majority]} everywhere", "", f"{result.majority_mean_iou:.3f}")
+    table.add_row(f"{names[result.majority]} everywhere", "", f"{result.majority_mean_iou:.3f}")
     return table
 
 
-def _as_json(result: SegmentationResult) -> dict[str, Any]:
+def _as_json(result: SegmentationResult, names: tuple[str, ...]) -> dict[str, Any]:
     def by_name(values: np.ndarray) -> dict[str, float | None]:
-        return {name: None if np.isnan(x) else float(x) for name, x in zip(CATEGORIES, values, strict=True)}
+        return {name: None if np.isnan(x) else float(x) for name, x in zip(names, values, strict=True)}
 
     return {
         "mean_iou": result.mean_iou,
-        "majority": CATEGORIES[result.majority],
+        "majority": names[result.majority],
         "majority_mean_iou": result.majority_mean_iou,
         "cells": result.cells,
         "iou": by_name(result.iou),

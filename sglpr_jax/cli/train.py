@@ -16,7 +16,7 @@ from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.presets import load_preset, preset_asked_for, preset_names
 from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
 from sglpr_jax.cli.training_recall import training_recall
-from sglpr_jax.data import Drive
+from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.data.batch import Batch, read_batch
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
@@ -39,6 +39,7 @@ class TrainCommand:
       bin/train --seq 08 --data KITTI --preset paper
       bin/train --seq 08 --data KITTI --resume            goes on where the run was stopped
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
+      bin/train --seq 08 --model.head.cbam False          an ablation; docs/ablations.md has all
     """
 
     seq: str = "08"
@@ -55,7 +56,9 @@ class TrainCommand:
     """The drives to train on. Empty: all but the one tested."""
     poses: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=TrainConfig)
+    config: Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = dataclasses.field(
+        default_factory=TrainConfig
+    )
 
 
 def parse(arguments: list[str] | None = None) -> TrainCommand:
@@ -84,6 +87,9 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
     root = dataset_root(command.data)
     drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
     config = command.config
+    if config.model.categories_read:
+        for drive in (*drives, test):
+            _require_labels(drive)
     pool, make_batch = batches(drives, config)
     _claim(folder, command, resume=command.resume)
     with stop_on_signal() as stopped:
@@ -103,7 +109,14 @@ def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Ca
 
     def make_batch(step: int) -> Batch:
         frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
-        return read_batch(drives, pool, frames, max_points=config.max_points, share_negatives=config.share_negatives)
+        return read_batch(
+            drives,
+            pool,
+            frames,
+            max_points=config.max_points,
+            share_negatives=config.share_negatives,
+            categories=config.model.categories,
+        )
 
     return pool, make_batch
 
@@ -154,6 +167,15 @@ def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         return set() if a == b else {prefix.removesuffix(".")}
     return {name for key in a.keys() | b.keys() for name in _differences(a.get(key), b.get(key), f"{prefix}{key}.")}
+
+
+def _require_labels(drive: Drive) -> None:
+    labelled = sum(path is not None for path in drive.label_paths) if isinstance(drive, ScanSequence) else 0
+    if labelled < len(drive):
+        raise ValueError(
+            f"model.head.input reads labels: expected labels beside every scan of sequence {drive.name}, "
+            f"found {labelled} of {len(drive)}"
+        )
 
 
 def _positions(drive) -> np.ndarray:

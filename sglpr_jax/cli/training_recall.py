@@ -33,12 +33,19 @@ def training_recall(drives: Many[Drive], pool: TuplePool, config: TrainConfig) -
 
     @jax.jit
     def describe_chunk(params: Params, batch, angles):
-        return describe(params, views(batch, angles, params.config.grid)[0])
+        return describe(params, *views(batch, angles, params.config.grid))
 
     def score(params: Params) -> dict[str, float]:
         described = []
         for rows in np.split(np.arange(PLACES), PLACES // (CHUNK // 2)):
-            batch = read_batch(drives, pool, frames[rows], max_points=config.max_points, share_negatives=True)
+            batch = read_batch(
+                drives,
+                pool,
+                frames[rows],
+                max_points=config.max_points,
+                share_negatives=True,
+                categories=config.model.categories_read,
+            )
             turned = jnp.asarray(angles[rows].reshape(-1)) * config.rotate
             described.append(np.asarray(describe_chunk(params, batch, turned)))
         anchors, positives = np.concatenate(described).reshape(PLACES, 2, -1).transpose(1, 0, 2)

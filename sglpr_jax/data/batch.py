@@ -39,11 +39,13 @@ def read_batch(
     *,
     max_points: int,
     share_negatives: bool,
+    categories: int = 20,
 ) -> Batch:
     """Read the frames of some tuples.
 
     With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
-    of its own tuple. Clouds of more than `max_points` points are thinned evenly.
+    of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
+    sorted into classes; with 0 they are not read.
     """
     flat = frames.reshape(-1)
     places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in flat]
@@ -53,8 +55,8 @@ def read_batch(
     if isinstance(drives[0], ImageSequence):
         images = np.stack([_read_image(*place) for place in places])
         return Batch(np.zeros(len(flat), bool), far, pool.config.positives, images=images)
-    points, count, classes, labelled = _padded([_read_scan(*place) for place in places], max_points)
-    has_labels = any(drive.has_labels for drive in drives)
+    points, count, classes, labelled = _padded([_read_scan(*place, categories) for place in places], max_points)
+    has_labels = categories > 0 and any(drive.has_labels for drive in drives)
     return Batch(
         labelled, far, pool.config.positives, points=points, count=count, classes=classes if has_labels else None
     )
@@ -88,11 +90,11 @@ def _read_image(drive: Drive, frame: int) -> np.ndarray:
     return drive.image(frame)
 
 
-def _read_scan(drive: Drive, frame: int) -> tuple[np.ndarray, np.ndarray | None]:
+def _read_scan(drive: Drive, frame: int, categories: int) -> tuple[np.ndarray, np.ndarray | None]:
     if not isinstance(drive, ScanSequence):
         raise ValueError(f"expected all drives of a batch to be scans, found images in {drive.name}")
-    labels = drive.labels(frame)
-    return drive.points(frame), None if labels is None else to_classes(labels)
+    labels = drive.labels(frame) if categories else None
+    return drive.points(frame), None if labels is None else to_classes(labels, categories=categories)
 
 
 def _padded(scans: list[tuple[np.ndarray, np.ndarray | None]], max_points: int) -> tuple[np.ndarray, ...]:

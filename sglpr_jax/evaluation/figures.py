@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.evaluation.protocols import Decision
-from sglpr_jax.labels import CATEGORIES, COLORS
+from sglpr_jax.labels import LabelMap, label_map
 from sglpr_jax.metrics import PrecisionRecallCurve
 
 if TYPE_CHECKING:
@@ -106,16 +106,18 @@ def segmentation_panel(
     prediction: Int[np.ndarray, "h w"],
     *,
     resolution_m: float,
+    categories: int = 20,
     title: str = "",
 ) -> "matplotlib.figure.Figure":
     """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7).
 
-    Without a truth it has no panel.
+    Without a truth it has no panel. `categories` says which classes they are.
     """
+    labels = label_map(categories)
     pictures = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
     if truth is not None:
-        pictures["true classes"] = COLORS[truth]
-    pictures["predicted classes"] = COLORS[prediction]
+        pictures["true classes"] = labels.colors[truth]
+    pictures["predicted classes"] = labels.colors[prediction]
     figure = _figure(3.7 * len(pictures), 5.2)
     figure.suptitle(title)
     height, width = np.array(bev.shape) * resolution_m / 2
@@ -123,7 +125,7 @@ def segmentation_panel(
         axes.imshow(picture, extent=(-width, width, -height, height), interpolation="nearest")
         axes.set(title=name, xlabel="x [m]")
     figure.axes[0].set_ylabel("y [m]")
-    _add_class_legend(figure, np.unique(prediction) if truth is None else np.union1d(truth, prediction))
+    _add_class_legend(figure, labels, np.unique(prediction) if truth is None else np.union1d(truth, prediction))
     return figure
 
 
@@ -166,9 +168,9 @@ def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:
         axes.text(f1, f1, f"F1 = {f1}", color="0.6", fontsize=7, ha="center", backgroundcolor="white", zorder=0)
 
 
-def _add_class_legend(figure: "matplotlib.figure.Figure", classes: Int[np.ndarray, " k"]) -> None:
+def _add_class_legend(figure: "matplotlib.figure.Figure", labels: LabelMap, classes: Int[np.ndarray, " k"]) -> None:
     """Name the colour of each of these classes under the pictures."""
     from matplotlib.patches import Patch
 
-    patches = [Patch(facecolor=tuple(COLORS[c] / 255), edgecolor="0.6", label=CATEGORIES[c]) for c in classes]
+    patches = [Patch(facecolor=tuple(labels.colors[c] / 255), edgecolor="0.6", label=labels.names[c]) for c in classes]
     figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 8), frameon=False)

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Literal
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.labels import Categories, label_map
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,12 +14,18 @@ class HeadConfig:
     The paper names no kernels, strides or channels; candidates A to D are compared in docs/decisions.md.
     """
 
+    input: Literal["features", "counts", "labels", "counts+labels"] = "features"
+    """What it reads (table 6): the backbone's features (HS), the image of point counts (RB), its true semantic map
+    (RS), or both (RB+RS). Only `features` needs a backbone; the others have none, and no segmentation head."""
     tap: Literal["pixels", "tokens"] = "pixels"
     """`pixels`: the x4-expanded map before the last linear layer. `tokens`: the patch map it is expanded from."""
     channels: tuple[int, ...] = (128, 256, 512)
     kernels: tuple[int, ...] = (3, 3, 3)
     strides: tuple[int, ...] = (2, 2, 2)
+    cbam: bool = True
     cbam_reduction: int = 16
+    pooling: Literal["netvlad", "mean"] = "netvlad"
+    """`mean`: the mean over the map and a linear layer stand in for NetVLAD (table 4)."""
     clusters: int = 64
     descriptor_size: int = 256
 
@@ -28,6 +35,11 @@ class HeadConfig:
                 "the head needs as many kernels and strides as channels, found "
                 f"channels {self.channels}, kernels {self.kernels}, strides {self.strides}"
             )
+
+    @property
+    def reads_labels(self) -> bool:
+        """Whether a descriptor needs the semantic map too."""
+        return "labels" in self.input
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +68,8 @@ class ModelConfig:
     window: int = 7
     mlp_ratio: int = 4
     drop_path: float = 0.2
-    classes: int = 20
+    categories: Categories = 20
+    """Into how many categories labels are sorted (figure 9, docs/labels.md); 0: no segmentation head."""
     detail: int = 0
     """Width of a layer that shows the segmentation head the image beside the features. 0: none, as in the paper."""
     head: HeadConfig = HeadConfig()
@@ -71,10 +84,29 @@ class ModelConfig:
                 f"a stem of {len(self.stem)} widths makes pixels of {2 ** (len(self.stem) - 1)} cells, of which a "
                 f"patch must be made, found patch {self.patch}"
             )
+        if self.categories:
+            label_map(self.categories)
+        elif self.head.reads_labels:
+            raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
         step = self.patch * 2 ** (len(self.depths) - 1)
         for size in self.image_size:
             if size % step:
                 raise ValueError(f"the backbone's image must be a multiple of {step} cells, found {self.image_size}")
+
+    @property
+    def classes(self) -> int:
+        """Classes of a semantic map, the unlabelled one included."""
+        return len(label_map(self.categories).names) if self.categories else 0
+
+    @property
+    def categories_read(self) -> int:
+        """The categories of the semantic maps that a descriptor needs; 0 where it needs none."""
+        return self.categories if self.head.reads_labels else 0
+
+    @property
+    def segments(self) -> bool:
+        """Whether there is a segmentation head."""
+        return self.head.input == "features" and self.categories > 0
 
     @property
     def channels(self) -> int:

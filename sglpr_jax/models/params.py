@@ -62,7 +62,11 @@ def load(folder: Path | str) -> Params:
 
 
 def config_from_dict(values: dict[str, Any], *, source: Path | str) -> ModelConfig:
-    """The model configuration that `dataclasses.asdict` made, tuples restored. Errors name `source`."""
+    """The model configuration that `dataclasses.asdict` made, tuples restored. Errors name `source`.
+
+    Weights of before there were several label maps say `classes`, always 20, for `categories`.
+    """
+    values = {"categories" if name == "classes" else name: value for name, value in values.items()}
     try:
         grid, head = Grid(**values["grid"]), HeadConfig(**_tuples(values["head"]))
         return ModelConfig(**_tuples({**values, "grid": grid, "head": head}))

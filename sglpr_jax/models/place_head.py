@@ -6,11 +6,12 @@ from jaxtyping import Array, Float
 from sglpr_jax.models.cbam import CBAM
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.layers import LayerNorm, convolution, l2_normalize
+from sglpr_jax.models.mean_pooling import MeanPooling
 from sglpr_jax.models.netvlad import NetVLAD
 
 
 class PlaceHead(nn.Module):
-    """CBAM, convolutions that shrink the map and widen its channels, NetVLAD, L2 normalisation."""
+    """CBAM, convolutions that shrink the map and widen its channels, NetVLAD, L2 normalisation (table 4: or less)."""
 
     config: HeadConfig
     circular: bool = False
@@ -21,12 +22,17 @@ class PlaceHead(nn.Module):
         self, features: Float[Array, "b h w c"]
     ) -> tuple[Float[Array, "b {self.config.descriptor_size}"], dict[str, Float[Array, "b _ _ _"]]]:
         """Descriptors of length 1, and the maps on the way by name."""
-        x = CBAM(self.config.cbam_reduction, name="cbam")(features)
-        seen = {"cbam": x}
+        x, seen = features, {}
+        if self.config.cbam:
+            x = seen["cbam"] = CBAM(self.config.cbam_reduction, name="cbam")(x)
         shapes = zip(self.config.channels, self.config.kernels, self.config.strides, strict=True)
         for i, (channels, kernel, stride) in enumerate(shapes):
             x = convolution(x, channels, kernel, stride, circular=self.circular, name=f"convolution_{i}")
             x = seen[f"head_convolution{i}"] = nn.relu(LayerNorm(name=f"norm_{i}")(x))
         locals_ = x.reshape(len(x), -1, x.shape[-1])
-        vector = NetVLAD(self.config.clusters, self.config.descriptor_size, name="netvlad")(locals_)
-        return l2_normalize(vector), seen
+        return l2_normalize(self._pooling()(locals_)), seen
+
+    def _pooling(self) -> nn.Module:
+        if self.config.pooling == "mean":
+            return MeanPooling(self.config.descriptor_size, name="mean_pooling")
+        return NetVLAD(self.config.clusters, self.config.descriptor_size, name="netvlad")

@@ -11,12 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.detail import Detail
 from sglpr_jax.models.layers import Linear, torch_uniform
 from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.polar import from_polar, to_polar
 from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.raw_place import RawPlace
 from sglpr_jax.models.stem import Stem, StemDecoder
 from sglpr_jax.models.swin import FinalPatchExpand
 from sglpr_jax.models.swin_unet import SwinUnet
@@ -122,24 +124,32 @@ def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
 
 
 @jax.jit
-def describe(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b d"]:
+def describe(
+    params: Params,
+    bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
+    labels: Int[Array, "*b h w"] | None = None,
+) -> Float[Array, "*b d"]:
     """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
 
     Any leading axes; works under jit, vmap and grad; computes nothing of the segmentation head. The distance between
-    two descriptors is the dissimilarity of their places (equation 2). Raises ValueError for images of another size
-    than `params.config.grid`.
+    two descriptors is the dissimilarity of their places (equation 2). A head that reads labels (`head.input`) needs the
+    maps of classes too. Raises ValueError for images of another size than `params.config.grid`, and for labels that are
+    missing or that nothing reads.
     """
-    return forward(params, bev, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
+    return forward(params, bev, labels, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
 
 
 def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
-    """The semantic logits of each image, from the head that training uses."""
+    """The semantic logits of each image, from the head that training uses. Raises ValueError where there is none."""
+    if not params.config.segments:
+        raise ValueError("expected a model with a segmentation head, found one without: it was made for places alone")
     return forward(params, bev).logits.reshape(*bev.shape, -1)
 
 
 def forward(
     params: Params,
     bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
+    labels: Int[Array, "*b h w"] | None = None,
     *,
     key: Array | None = None,
     segment: int = 1,
@@ -147,23 +157,46 @@ def forward(
     """Everything at once, for training and pictures: descriptors, logits and named maps, leading axes made one.
 
     With a `key` it is the training pass, in which stochastic depth drops residual branches. `segment` n gives the
-    logits of every n-th image; with 0 the segmentation head does not exist. Raises ValueError for images of another
-    size than `params.config.grid`.
+    logits of every n-th image; with 0 the segmentation head does not exist, and a model without one gives none. Raises
+    ValueError as `describe` does.
     """
-    grid = params.config.grid
+    config = params.config
+    grid = config.grid
     if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
         raise ValueError(f"expected images [..., H, W] of {grid.height} x {grid.width} cells, found shape {bev.shape}")
-    image = prepare(bev.reshape(-1, grid.height, grid.width), params.config)
+    _check_labels(labels, bev.shape, config)
+    image = prepare(bev.reshape(-1, grid.height, grid.width), config)
+    if labels is not None:
+        labels = jnp.where(field_of_view(config), labels.reshape(image.shape[:-1]), UNLABELLED)
+    variables = {"params": params.weights}
+    outputs: Any
+    if config.head.input != "features":
+        outputs = RawPlace(config).apply(variables, image, labels)
+        return Outputs(outputs[0], None, outputs[1])
     train, rngs = key is not None, None if key is None else {"drop_path": key}
-    outputs: Any = SGLPR(params.config).apply(
-        {"params": params.weights}, image, segment=segment, train=train, rngs=rngs
-    )
+    outputs = SGLPR(config).apply(variables, image, segment=config.segments and segment, train=train, rngs=rngs)
     return outputs
 
 
+def _check_labels(labels: Array | None, shape: tuple[int, ...], config: ModelConfig) -> None:
+    """Labels must be there exactly where the head reads them."""
+    found = "none" if labels is None else f"shape {labels.shape}"
+    if config.head.reads_labels and (labels is None or labels.shape != shape):
+        raise ValueError(
+            f"this model describes a place from {config.head.input}: expected maps of classes of shape {shape}, "
+            f"one for each image, found {found}"
+        )
+    if labels is not None and not config.head.reads_labels:
+        raise ValueError(f"this model describes a place from {config.head.input}: expected no labels, found {found}")
+
+
 def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None) -> Params:
-    """Fresh weights for a named preset, or for a `config` of your own."""
+    """Fresh weights for a named preset, or for a `config` of your own; only those that it needs."""
     config = model_preset(preset) if config is None else config
     image = jnp.zeros((1, config.grid.height, config.grid.width, config.channels))
-    weights = jax.jit(SGLPR(config).init, static_argnames="segment")(key, image, segment=True)["params"]
+    if config.head.input != "features":
+        weights = jax.jit(RawPlace(config).init)(key, image, jnp.zeros(image.shape[:-1], jnp.int32))["params"]
+    else:
+        make = jax.jit(SGLPR(config).init, static_argnames="segment")
+        weights = make(key, image, segment=config.segments)["params"]
     return Params(weights, config)

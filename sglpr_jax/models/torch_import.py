@@ -157,8 +157,10 @@ def torch_name(name: str) -> str:
 
 def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tuple[int, ...]]:
     """Shapes of all weights that a Swin-Unet shares with the model: all but the place head's."""
+    if config.head.input != "features":
+        raise ValueError(f"expected a model with a backbone, found one that describes a place from {config.head.input}")
     image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, input_channels), np.float32)
-    init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=True), jax.random.key(0), image)
+    init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=config.segments), jax.random.key(0), image)
     return {name: leaf.shape for name, leaf in _flatten(init["params"]).items() if not name.startswith("place_head/")}
 
 

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
 
-from sglpr_jax.bev import Grid, centre_crop, rasterize, rotate_image, rotate_points
+from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
-DescribeFn = Callable[[Float[Array, "b h w"]], Float[Any, "b d"]]
-"""Images of point counts in, one descriptor each out."""
+DescribeFn = Callable[..., Float[Any, "b d"]]
+"""Images of point counts (b, h, w) and, where asked for, maps of classes (b, h, w) in; one descriptor each out."""
 DescribeScanFn = Callable[[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None], Float32[np.ndarray, " d"]]
 """The points of one scan and, where asked for, their classes in; its descriptor out."""
 
@@ -32,6 +32,7 @@ def embed(
     *,
     config: dict[str, Any],
     weights_hash: str = "",
+    categories: int = 0,
     rotation_seed: int | None = None,
     batch: int = 16,
     on_bad_scan: OnBadScan | None = None,
@@ -39,25 +40,27 @@ def embed(
 ) -> DescriptorFile:
     """Describe the image of every scan of a sequence.
 
-    `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. With `rotation_seed`
+    `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. With `categories` the
+    labels beside the scans are read too, and `describe` gets each scan's map of so many classes. With `rotation_seed`
     every scan is first turned about z by its own random angle. A scan that cannot be read raises its error, or, given
     `on_bad_scan(id, error)`, is left out. `on_progress` is told how many scans are done.
     """
     angles = _angles(len(sequence), rotation_seed)
-    rows, images, descriptors = [], [], []
+    rows, views, descriptors = [], [], []
 
-    def read(row: int) -> Float[Array, "h w"]:
-        return read_image(sequence, row, grid, angle=None if angles is None else jnp.float32(angles[row]))
+    def read(row: int) -> tuple[Array, ...]:
+        angle = None if angles is None else jnp.float32(angles[row])
+        return read_views(sequence, row, grid, categories=categories, angle=angle)
 
-    for row, image in _readable(sequence, read, on_bad_scan):
+    for row, view in _readable(sequence, read, on_bad_scan):
         rows.append(row)
-        images.append(image)
-        if len(images) == batch:
-            descriptors.append(_describe_padded(describe, images, batch))
-            images = []
+        views.append(view)
+        if len(views) == batch:
+            descriptors.append(_describe_padded(describe, views, batch))
+            views = []
             on_progress(row + 1)
-    if images:
-        descriptors.append(_describe_padded(describe, images, batch))
+    if views:
+        descriptors.append(_describe_padded(describe, views, batch))
     on_progress(len(sequence))
     config = {**config, "rotation_seed": rotation_seed}
     return _file(sequence, rows, descriptors, config=config, weights_hash=weights_hash)
@@ -122,10 +125,22 @@ def read_image(
     sequence: Drive, row: int, grid: Grid | None, *, angle: Float[Array, ""] | None = None
 ) -> Float[Array, "h w"]:
     """The image of one scan, turned by `angle` radians if given. Raises ValueError where scans come without a grid."""
+    return read_views(sequence, row, grid, angle=angle)[0]
+
+
+def read_views(
+    sequence: Drive, row: int, grid: Grid | None, *, categories: int = 0, angle: Float[Array, ""] | None = None
+) -> tuple[Array, ...]:
+    """The image of one scan and, with `categories`, its map of so many classes, both turned by `angle` radians.
+
+    Raises ValueError where scans come without a grid, or without the labels asked for.
+    """
     if isinstance(sequence, ImageSequence):
+        if categories:
+            raise ValueError(f"sequence {sequence.name}: expected scans with labels, found ready-made images")
         image = jnp.asarray(sequence.image(row))
         image = image if angle is None else rotate_image(image, angle)
-        return image if grid is None else centre_crop(image, height=grid.height, width=grid.width)
+        return (image if grid is None else centre_crop(image, height=grid.height, width=grid.width),)
     if grid is None:
         raise ValueError("scans need a grid to be rasterised on, found none")
     points = sequence.points(row)
@@ -133,7 +148,11 @@ def read_image(
     padding = -len(points) % _POINTS_STEP
     padded = jnp.asarray(np.pad(points, ((0, padding), (0, 0))))
     padded = padded if angle is None else rotate_points(padded, angle)
-    return rasterize(padded, grid=grid, count=count).astype(jnp.float32)
+    image = rasterize(padded, grid=grid, count=count).astype(jnp.float32)
+    if not categories:
+        return (image,)
+    classes = jnp.asarray(np.pad(_classes(sequence, row, categories), (0, padding)))
+    return image, rasterize_labels(padded, classes, grid=grid, count=count)
 
 
 def _read_scan(
@@ -144,10 +163,15 @@ def _read_scan(
     finite = np.isfinite(points).all(axis=1)
     if not labels:
         return points[finite], None
+    return points[finite], _classes(sequence, row, 20)[finite]
+
+
+def _classes(sequence: ScanSequence, row: int, categories: int) -> Int32[np.ndarray, " n"]:
+    """The class of every point of one scan; ValueError where it has no labels."""
     raw = sequence.labels(row)
     if raw is None:
         raise ValueError(f"scan {sequence.ids[row]} of sequence {sequence.name}: expected labels, found none")
-    return points[finite], to_classes(raw[finite])
+    return to_classes(raw, categories=categories)
 
 
 def _turned(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndarray, "n 3"]:
@@ -157,7 +181,8 @@ def _turned(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndar
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)
 
 
-def _describe_padded(describe: DescribeFn, images: list[Array], batch: int) -> Float[np.ndarray, "b d"]:
+def _describe_padded(describe: DescribeFn, views: list[tuple[Array, ...]], batch: int) -> Float[np.ndarray, "b d"]:
     """Describe up to `batch` images in a call of always the same shape, so that it compiles once."""
-    stacked = jnp.stack(images + [images[-1]] * (batch - len(images)))
-    return np.asarray(jax.block_until_ready(describe(stacked)), np.float32)[: len(images)]
+    padded = views + [views[-1]] * (batch - len(views))
+    stacked = map(jnp.stack, zip(*padded, strict=True))
+    return np.asarray(jax.block_until_ready(describe(*stacked)), np.float32)[: len(views)]

@@ -28,6 +28,11 @@ class LossConfig:
     ignore_unlabelled: bool = False
     """Leave cells of class 0 (empty or unlabelled) out of the segmentation losses, as the scores do."""
 
+    @property
+    def segments(self) -> bool:
+        """Whether any term reads the segmentation head. One whose weight is 0 is not computed (table 7)."""
+        return self.ce_weight != 0 or self.dice_weight != 0
+
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
@@ -45,7 +50,11 @@ class OptimizerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """One training run."""
+    """One training run.
+
+    Where nothing reads labels, neither a loss nor the place head, `model.categories` becomes 0: weights that no loss
+    reaches would be kept and handed out untrained.
+    """
 
     model: ModelConfig = ModelConfig()
     sampling: TupleConfig = TupleConfig()
@@ -69,6 +78,9 @@ class TrainConfig:
     """Steps between scores and checkpoints."""
 
     def __post_init__(self):
+        learns_semantics = self.model.segments and self.loss.segments
+        if not (learns_semantics or self.model.head.reads_labels):
+            object.__setattr__(self, "model", dataclasses.replace(self.model, categories=0))
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
         if (self.chunk or self.images) % self.loss.segment_every:

@@ -25,7 +25,7 @@ Metrics = dict[str, Float[Array, ""]]
 
 
 class Summary(NamedTuple):
-    """What the losses need of a chunk of c images; the segmentation's part is None without labels."""
+    """What the losses need of a chunk of c images; None for a term without labels or weight."""
 
     descriptors: Any
     """(c, d)"""
@@ -87,25 +87,39 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
 
 def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
     """One chunk through the network; the segmentation head only where there are labels, on every n-th image."""
-    if chunk.maps is None:
-        return Summary(forward(params, chunk.images, key=chunk.key, segment=0).descriptor)
+    labels = chunk.maps if params.config.head.reads_labels else None
+    if chunk.maps is None or not (params.config.segments and config.segments):
+        return Summary(forward(params, chunk.images, labels, key=chunk.key, segment=0).descriptor)
     outputs = forward(params, chunk.images, key=chunk.key, segment=config.segment_every)
+    logits = outputs.logits
     maps, labelled = (x[:: config.segment_every] for x in (chunk.maps, chunk.labelled))
     counted = labelled[:, None, None] & ((maps != UNLABELLED) | (not config.ignore_unlabelled))
-    cross_entropy = losses.cross_entropy(outputs.logits, maps, where=counted, balance=config.class_balance).sum()
-    return Summary(outputs.descriptor, cross_entropy, losses.dice_sums(outputs.logits, maps, counted))
+    cross_entropy, dice_sums = None, None
+    if config.ce_weight:
+        cross_entropy = losses.cross_entropy(logits, maps, where=counted, balance=config.class_balance).sum()
+    if config.dice_weight:
+        dice_sums = losses.dice_sums(logits, maps, counted)
+    return Summary(outputs.descriptor, cross_entropy, dice_sums)
 
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
     """Equation 8 of a whole batch, and its terms."""
     triplet, metrics = triplet_loss(summary.descriptors, batch, config)
-    if summary.cross_entropy is None:
-        return triplet, metrics | {"loss": triplet}
     segmented = jnp.asarray(batch.labelled)[:: config.segment_every]
-    ce = summary.cross_entropy / jnp.maximum(segmented.sum(), 1)
-    dice = jnp.where(segmented.any(), losses.dice_from_sums(summary.dice_sums), 0.0)
-    total = losses.joint(triplet, ce, dice, ce_weight=config.ce_weight, dice_weight=config.dice_weight)
-    return total, metrics | {"cross_entropy": ce, "dice": dice, "loss": total}
+    terms = {}
+    if summary.cross_entropy is not None:
+        terms["cross_entropy"] = summary.cross_entropy / jnp.maximum(segmented.sum(), 1)
+    if summary.dice_sums is not None:
+        terms["dice"] = jnp.where(segmented.any(), losses.dice_from_sums(summary.dice_sums), 0.0)
+    zero = jnp.zeros(())
+    total = losses.joint(
+        triplet,
+        terms.get("cross_entropy", zero),
+        terms.get("dice", zero),
+        ce_weight=config.ce_weight,
+        dice_weight=config.dice_weight,
+    )
+    return total, metrics | terms | {"loss": total}
 
 
 def triplet_loss(

@@ -6,7 +6,7 @@ from PIL import Image
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Decision
-from sglpr_jax.labels import CATEGORIES, COLORS
+from sglpr_jax.labels import CATEGORIES, label_map
 from sglpr_jax.metrics import classification_curve
 
 
@@ -78,7 +78,7 @@ def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
         assert axes.get_images()[0].get_extent() == [-10, 10, -5, 5]
     picture = pixels(figure, tmp_path / "classes.png")
     third = picture.shape[1] // 3
-    road, building = COLORS[CATEGORIES.index("road")], COLORS[CATEGORIES.index("building")]
+    road, building = label_map().colors[[CATEGORIES.index("road"), CATEGORIES.index("building")]]
     middle = picture[: picture.shape[0] // 2]
     assert shows(middle[:, third : 2 * third], road) and not shows(middle[:, third : 2 * third], building)
     assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)

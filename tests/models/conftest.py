@@ -56,7 +56,7 @@ def model_config():
             heads=tuple(values["num_heads"]),
             window=values["window_size"],
             drop_path=values["drop_path_rate"],
-            classes=values["num_classes"],
+            categories=values["num_classes"],
         )
         return config, values["in_chans"]
 

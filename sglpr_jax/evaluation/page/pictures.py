@@ -17,6 +17,8 @@ class SemanticPicture:
     predicted: np.ndarray
     """(h, w) class ids."""
     resolution_m: float
+    categories: int = 20
+    """Which classes the ids are (`labels.label_map`)."""
 
 
 @dataclass(frozen=True, eq=False)

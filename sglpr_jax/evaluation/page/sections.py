@@ -85,7 +85,9 @@ def semantic_section(found: Mapping[str, SemanticPicture] | str) -> Section:
 
 
 def _semantic(frame: str, one: SemanticPicture) -> str:
-    panel = figures.segmentation_panel(one.counts, one.truth, one.predicted, resolution_m=one.resolution_m)
+    panel = figures.segmentation_panel(
+        one.counts, one.truth, one.predicted, resolution_m=one.resolution_m, categories=one.categories
+    )
     return figure_html(panel, f"semantic map of frame {frame}", caption=f"frame {frame}")
 
 
