@@ -16,6 +16,8 @@ _RECORDS = {
     "nclt": np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]),
 }
 
+_LASER_FIELDS = {"nuscenes": "ring", "nclt": "laser"}
+
 
 def scan_id(path: Path) -> str:
     """Return the name of a scan file without its endings: "000052" for 000052.bin, "sweep" for sweep.pcd.bin."""
@@ -56,6 +58,16 @@ def read_scan(path: Path, *, format: ScanFormat = "auto") -> Float32[np.ndarray,
     elif format == "nclt":
         xyz = (xyz.astype(np.float64) * 0.005 - 100.0) * [1.0, -1.0, -1.0]
     return np.ascontiguousarray(xyz, dtype=np.float32)
+
+
+def read_lasers(path: Path, *, format: ScanFormat = "auto") -> Int32[np.ndarray, " n"] | None:
+    """Return the number of the laser that each point of a scan is from, as the file has it (nuscenes, nclt), else None.
+
+    Raises what `read_scan` raises.
+    """
+    format = guess_format(path) if format == "auto" else format
+    field = _LASER_FIELDS.get(format)
+    return None if field is None else _read_records(path, format)[field].astype(np.int32)
 
 
 def _read_records(path: Path, format: str) -> np.ndarray:
