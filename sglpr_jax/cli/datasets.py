@@ -14,6 +14,7 @@ from sglpr_jax.sim.drive import RATE_HZ, name_of_path
 from sglpr_jax.sim.layouts import LAYOUTS
 
 SIMULATED = ("00", "05", "08")
+SIMULATED_DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 SIMULATED_SCANS = 300
 SIMULATED_AZIMUTH_STEPS = 900
 BYTES_PER_RAY = 16
@@ -34,6 +35,23 @@ def dataset_root(data: Path | None) -> Path:
         file=sys.stderr,
     )
     simulate(root, scans=SIMULATED_SCANS, azimuth_steps=SIMULATED_AZIMUTH_STEPS, seed=0)
+    return root
+
+
+def cached_sessions() -> Path:
+    """The folder of the simulated sessions in NCLT's layout, made on first use and kept in the user's cache."""
+    root = cache_folder() / f"sessions-v{VERSION}-{SIMULATED_SCANS}x{SIMULATED_AZIMUTH_STEPS}-seed0"
+    print(f"no sessions named: using the simulated ones in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
+    simulate_days(
+        root,
+        dates=SIMULATED_DAYS,
+        route="00",
+        scans=SIMULATED_SCANS,
+        sensor="hdl32e-nclt",
+        azimuth_steps=SIMULATED_AZIMUTH_STEPS,
+        seed=0,
+        rate_hz=RATE_HZ,
+    )
     return root
 
 

@@ -1,22 +1,24 @@
 """bin/reproduce: the paper's tables and figures, made anew on any dataset, beside the paper's numbers."""
 
 import dataclasses
+import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.datasets import dataset_root
+from sglpr_jax.cli.datasets import cached_sessions, dataset_root
 from sglpr_jax.cli.presets import load_preset, preset_asked_for
 from sglpr_jax.cli.reproduction import pictures, tables
+from sglpr_jax.cli.reproduction.check import check
 from sglpr_jax.cli.reproduction.experiments import EXPERIMENTS, FULL
 from sglpr_jax.cli.reproduction.plan import make_plan, time_a_step
-from sglpr_jax.cli.reproduction.results import Scores
 from sglpr_jax.cli.reproduction.runs import Runs
+from sglpr_jax.cli.reproduction.scores import across_sessions_rows, f1max_rows, methods_of, top1
 from sglpr_jax.cli.runtime import console, run, write_json, write_text
-from sglpr_jax.data import sequence_names
+from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.evaluation import figures
 from sglpr_jax.train.config import TrainConfig
@@ -25,6 +27,7 @@ What = Literal[
     "all", "table1", "table2", "table3", "table4", "table5", "table6", "table7",
     "figure5", "figure6", "figure7", "figure8", "figure9",
 ]  # fmt: skip
+PUBLISHED_NOTE = "published: the paper's numbers, on the real {}"
 PAPER_SEQUENCES = ("00", "02", "05", "06", "07", "08")
 
 
@@ -82,7 +85,8 @@ def reproduce(command: ReproduceCommand) -> Path:
     for done, (variant, seq) in enumerate(plan.missing):
         print(f"run {done + 1} of {len(plan.missing)}: {variant}, {seq}", file=sys.stderr)
         runs.train(variant, seq)
-    write_json(command.out / CONFIG_FILE, plain(command))
+    command.out.mkdir(parents=True, exist_ok=True)
+    write_json(command.out / "config.json", json.loads(json.dumps(dataclasses.asdict(command), default=str)))
     for name in names:
         make = _make_table if name.startswith("table") else _make_pictures
         make(name, command, runs, seqs)
@@ -92,10 +96,13 @@ def reproduce(command: ReproduceCommand) -> Path:
 def _make_table(name: str, command: ReproduceCommand, runs: Runs, seqs: Sequence[str]) -> None:
     """Print a table, and write it as JSON and Markdown."""
     title = f"{name}: {EXPERIMENTS[name].title}"
+    columns, about = list(seqs), f"data {runs.data}, preset {runs.preset}, {runs.config.steps} steps"
     if name == "table3":
-        columns, rows, caption = nclt_table(runs, seqs[0], nclt_root(command.nclt), command.baselines)
+        columns, rows = across_sessions_rows(runs, seqs[0], _sessions(command), command.baselines)
+        caption = f"here: {about}, drive {seqs[0]} left out; Recall@1 within 5 m; {PUBLISHED_NOTE.format('NCLT')}"
     else:
-        columns, rows, caption = seqs, f1max_rows(name, runs, seqs, command.baselines), _caption(runs)
+        rows = f1max_rows(name, runs, seqs, command.baselines)
+        caption = f"here: {about}, leave-one-out; top-1 F1max, 3 m / 20 m; {PUBLISHED_NOTE.format('KITTI')}"
     console().print(tables.rich_table(title, rows, columns, caption=caption))
     write_text(command.out / f"{name}.md", tables.markdown(title, rows, columns, caption=caption))
     write_json(command.out / f"{name}.json", tables.as_json(rows, columns))
@@ -104,12 +111,35 @@ def _make_table(name: str, command: ReproduceCommand, runs: Runs, seqs: Sequence
 def _make_pictures(name: str, command: ReproduceCommand, runs: Runs, seqs: Sequence[str]) -> None:
     """Draw the pictures of a figure, one for each drive where it has several."""
     drawings = {
-        "figure5": lambda: pictures.precision_recall(curves(runs, seqs, command.baselines)),
+        "figure5": lambda: pictures.precision_recall(
+            {
+                seq: {label: top1(runs, method, seq) for method, label in methods_of(name, command.baselines).items()}
+                for seq in seqs
+            }
+        ),
         "figure6": lambda: pictures.trajectories(runs, {seq: top1(runs, FULL, seq) for seq in seqs}),
         "figure7": lambda: pictures.semantic_maps(runs, seqs),
-        "figure8": lambda: pictures.feature_heat_maps(runs, seqs[0], [runs.drive(seqs[0]), _query_session(command)]),
+        "figure8": lambda: pictures.feature_heat_maps(runs, seqs[0], [runs.drive(seqs[0]), _last_session(command)]),
         "figure9": lambda: pictures.categories(lambda variant, seq: top1(runs, variant, seq).score, seqs),
     }
     for file, picture in drawings[name]().items():
         figures.save(picture, command.out / file)
         print(f"written: {command.out / file}")
+
+
+def _sessions(command: ReproduceCommand) -> Path:
+    return command.nclt or cached_sessions()
+
+
+def _last_session(command: ReproduceCommand) -> Drive:
+    root = _sessions(command)
+    return open_sequence(root, sequence_names(root)[-1])
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: reproduce(parse()))
+
+
+if __name__ == "__main__":
+    main()

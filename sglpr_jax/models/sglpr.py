@@ -71,7 +71,9 @@ class SGLPR(nn.Module):
         descriptor, head = PlaceHead(config.head, circular, name="place_head")(features)
         logits = None
         if segment:
-            pixels = features[::segment] if reads_pixels else expand(*jax.tree.map(lambda x: x[::segment], (tokens, maps)))
+            pixels = (
+                features[::segment] if reads_pixels else expand(*jax.tree.map(lambda x: x[::segment], (tokens, maps)))
+            )
             intermediates["pixels"] = pixels
             logits = self._logits(pixels, image[::segment])
         return Outputs(descriptor, logits, intermediates | head)

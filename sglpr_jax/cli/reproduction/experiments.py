@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from sglpr_jax.train.config import TrainConfig
 
@@ -45,7 +45,7 @@ class Experiment:
     """What this experiment calls its variants, where it is not `Variant.label`."""
     rotated: bool = False
     """Every scan of the test drives is turned by its own random angle."""
-    beside: Literal["nothing", "baselines"] = "nothing"
+    beside_baselines: bool = False
     """Whether methods without training stand beside the variants."""
 
     def names(self) -> dict[str, str]:
@@ -57,9 +57,9 @@ class Experiment:
 _WITH_FIGURE_9 = ("categories-6", "categories-15", FULL, "categories-25", "categories-34")
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "table1": Experiment("F1max beside other methods", beside="baselines"),
-    "table2": Experiment("F1max, every scan turned", (FULL, "no-turning"), rotated=True, beside="baselines"),
-    "table3": Experiment("Recall@1 across NCLT sessions, trained on other drives", beside="baselines"),
+    "table1": Experiment("F1max beside other methods", beside_baselines=True),
+    "table2": Experiment("F1max, every scan turned", (FULL, "no-turning"), rotated=True, beside_baselines=True),
+    "table3": Experiment("Recall@1 across NCLT sessions, trained on other drives", beside_baselines=True),
     "table4": Experiment(
         "CBAM and NetVLAD",
         ("convolutions", "no-cbam", FULL),
@@ -76,7 +76,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         (NO_SEGMENTATION, "no-dice", "no-cross-entropy", FULL),
         ("triplet", "triplet, cross-entropy", "triplet, Dice", "triplet, cross-entropy, Dice"),
     ),
-    "figure5": Experiment("Precision and recall", beside="baselines"),
+    "figure5": Experiment("Precision and recall", beside_baselines=True),
     "figure6": Experiment("Top-1 retrieval along the trajectory"),
     "figure7": Experiment("Counts, true and predicted semantic maps"),
     "figure8": Experiment("Feature heat maps with and without the segmentation branch", (FULL, NO_SEGMENTATION)),

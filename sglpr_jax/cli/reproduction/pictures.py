@@ -5,15 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sglpr_jax.cli.page_pictures import semantic_picture
 from sglpr_jax.cli.reproduction.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
 from sglpr_jax.cli.reproduction.runs import Runs
 from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
-from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.embed import read_image
 from sglpr_jax.retrieval.heat_maps import heat_maps
-from sglpr_jax.retrieval.semantic_maps import semantic_map
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -49,18 +48,17 @@ def semantic_maps(runs: Runs, seqs: Sequence[str]) -> Pictures:
     """
     pictures = {}
     for seq in seqs:
-        drive, params = runs.drive(seq), runs.params(FULL, seq)
+        drive = runs.drive(seq)
         if not isinstance(drive, ScanSequence):
-            raise ValueError(f"figure7: expected scans in sequence {seq}, found ready-made images, which have no labels")
+            raise ValueError(f"figure7: expected scans in sequence {seq}, found images, which have no labels")
         row = len(drive) // 2
-        labels = drive.labels(row)
-        classes = None if labels is None else to_classes(labels)
-        found = semantic_map(params, drive.points(row), classes)
+        shown = semantic_picture(drive, runs.params(FULL, seq), row)
         pictures[f"figure7-{seq}.png"] = figures.segmentation_panel(
-            found.counts,
-            None if labels is None else found.truth,
-            found.predicted,
-            resolution_m=params.config.grid.resolution_m,
+            shown.counts,
+            shown.truth,
+            shown.predicted,
+            resolution_m=shown.resolution_m,
+            categories=shown.categories,
             title=f"{seq}, scan {drive.ids[row]}",
         )
     return pictures
