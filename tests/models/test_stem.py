@@ -91,5 +91,5 @@ def test_every_weight_is_trained(params):
 
 
 def test_a_patch_that_the_stem_does_not_divide_is_refused():
-    with pytest.raises(ValueError, match="stem of 4 widths makes pixels of 8 cells.*found patch 4"):
+    with pytest.raises(ValueError, match=r"stem of 4 widths makes pixels of 8 cells.*found patch 4"):
         ModelConfig(stem=(8, 8, 8, 8))
