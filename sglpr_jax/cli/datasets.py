@@ -8,16 +8,19 @@ from pathlib import Path
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.kitti import PoseChoice
-from sglpr_jax.sim import SENSORS, write_dataset
+from sglpr_jax.sim import SENSORS, Sensor, write_dataset, write_sessions
 from sglpr_jax.sim.dataset import VERSION
 from sglpr_jax.sim.drive import RATE_HZ, name_of_path
 from sglpr_jax.sim.layouts import LAYOUTS
 
 SIMULATED = ("00", "05", "08")
+SIMULATED_DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 SIMULATED_SCANS = 300
 SIMULATED_AZIMUTH_STEPS = 900
 BYTES_PER_RAY = 16
 """Of a scan and its labels: 20 for every return, and most rays return."""
+BYTES_PER_NCLT_RAY = 5
+"""Of 8 for every return; many rays go into the sky."""
 BYTES_PER_IMAGE = 2000
 
 
@@ -32,6 +35,23 @@ def dataset_root(data: Path | None) -> Path:
         file=sys.stderr,
     )
     simulate(root, scans=SIMULATED_SCANS, azimuth_steps=SIMULATED_AZIMUTH_STEPS, seed=0)
+    return root
+
+
+def cached_sessions() -> Path:
+    """The folder of the simulated sessions in NCLT's layout, made on first use and kept in the user's cache."""
+    root = cache_folder() / f"sessions-v{VERSION}-{SIMULATED_SCANS}x{SIMULATED_AZIMUTH_STEPS}-seed0"
+    print(f"no sessions named: using the simulated ones in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
+    simulate_days(
+        root,
+        dates=SIMULATED_DAYS,
+        route="00",
+        scans=SIMULATED_SCANS,
+        sensor="hdl32e-nclt",
+        azimuth_steps=SIMULATED_AZIMUTH_STEPS,
+        seed=0,
+        rate_hz=RATE_HZ,
+    )
     return root
 
 
@@ -51,17 +71,10 @@ def simulate(
 
     Raises ValueError for an unknown sensor; for the other errors see `write_dataset`.
     """
-    if sensor not in SENSORS:
-        raise ValueError(f"expected a sensor among {', '.join(SENSORS)}, found {sensor!r}")
-    lidar = SENSORS[sensor]
-    lidar = lidar if azimuth_steps is None else dataclasses.replace(lidar, azimuth_steps=azimuth_steps)
+    lidar = _lidar(sensor, azimuth_steps)
     layout = "images" if images else "scans"
     drives = [*names, *map(name_of_path, along)]
-    unfinished = [name for name in drives if not LAYOUTS[layout].is_finished(root, name)]
-    if unfinished:
-        rays = len(lidar.elevations_deg) * lidar.azimuth_steps
-        size = (BYTES_PER_IMAGE if images else BYTES_PER_RAY * rays) * scans * len(unfinished) / 1e6
-        print(f"simulating {len(unfinished)} drives of {scans} {layout}, about {size:.0f} MB", file=sys.stderr)
+    _announce(root, drives, layout, scans=scans, bytes_each=BYTES_PER_IMAGE if images else BYTES_PER_RAY * _rays(lidar))
     with progress_bar("simulate", scans * len(drives)) as show:
         write_dataset(
             root,
@@ -74,6 +87,52 @@ def simulate(
             layout=layout,
             progress=lambda name, done, count: show(drives.index(name) * scans + done * scans // count),
         )
+
+
+def simulate_days(
+    root: Path,
+    *,
+    dates: Many[str],
+    route: str,
+    scans: int,
+    sensor: str,
+    azimuth_steps: int | None,
+    seed: int,
+    rate_hz: float,
+) -> None:
+    """Write what is missing of one simulated town on several days, in NCLT's layout; otherwise as `simulate`."""
+    lidar = _lidar(sensor, azimuth_steps)
+    _announce(root, dates, "nclt", scans=scans, bytes_each=BYTES_PER_NCLT_RAY * _rays(lidar))
+    with progress_bar("simulate", scans * len(dates)) as show:
+        write_sessions(
+            root,
+            dates=dates,
+            route=route,
+            scans=scans,
+            sensor=lidar,
+            seed=seed,
+            rate_hz=rate_hz,
+            progress=lambda date, done, _: show(dates.index(date) * scans + done),
+        )
+
+
+def _lidar(sensor: str, azimuth_steps: int | None) -> Sensor:
+    if sensor not in SENSORS:
+        raise ValueError(f"expected a sensor among {', '.join(SENSORS)}, found {sensor!r}")
+    lidar = SENSORS[sensor]
+    return lidar if azimuth_steps is None else dataclasses.replace(lidar, azimuth_steps=azimuth_steps)
+
+
+def _rays(lidar: Sensor) -> int:
+    return len(lidar.elevations_deg) * lidar.azimuth_steps
+
+
+def _announce(root: Path, drives: Many[str], layout: str, *, scans: int, bytes_each: int) -> None:
+    """Say how much there is to write, if anything."""
+    unfinished = [name for name in drives if not LAYOUTS[layout].is_finished(root, name)]
+    if unfinished:
+        size, what = bytes_each * scans * len(unfinished) / 1e6, "images" if layout == "images" else "scans"
+        print(f"simulating {len(unfinished)} drives of {scans} {what}, about {size:.0f} MB", file=sys.stderr)
 
 
 def leave_one_out(

@@ -3,19 +3,14 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
-from sglpr_jax.cli.methods import Method, network, reference
+from sglpr_jax.cli.methods import MethodName, method_named
 from sglpr_jax.cli.runtime import progress_bar, run
-from sglpr_jax.data import Drive, open_sequence
+from sglpr_jax.data import open_sequence
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.scan_files import ScanFormat
-from sglpr_jax.models.params import load
-from sglpr_jax.models.presets import model_preset
-
-MethodName = Literal["sglpr", "scan-context", "m2dp", "lidar-iris", "ssc", "solid", "polar-fft", "thumbnail", "random"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +52,7 @@ def embed_sequence(command: EmbedCommand) -> Path:
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
     sequence = open_sequence(command.data, command.seq, poses=command.poses, format=command.format)
-    method = _method(command, sequence)
+    method = method_named(command.method, command.weights, sequence)
     with progress_bar(f"embed {sequence.name}", len(sequence)) as show:
         file = method.embed(
             sequence,
@@ -70,14 +65,6 @@ def embed_sequence(command: EmbedCommand) -> Path:
     skipped = len(sequence) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
     return command.out
-
-
-def _method(command: EmbedCommand, sequence: Drive) -> Method:
-    if command.method != "sglpr":
-        return reference(command.method, sequence, model_preset("small").grid)
-    if command.weights is None:
-        raise ValueError("expected --weights (a training run's folder), found none")
-    return network(load(command.weights))
 
 
 def _report(scan: str, error: Exception) -> None:

@@ -2,18 +2,21 @@
 
 import dataclasses
 import functools
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.data import Drive, ImageSequence
 from sglpr_jax.evaluation.baselines import BASELINES, Baseline
-from sglpr_jax.models.params import weights_hash
+from sglpr_jax.models.params import load, weights_hash
+from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import Params, describe
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import DescribeFn, DescribeScanFn, embed, embed_scans
 
+MethodName = Literal["sglpr", "scan-context", "m2dp", "lidar-iris", "ssc", "solid", "polar-fft", "thumbnail", "random"]
 BEV_IMAGE_RADIUS = 62.0
 """Pixels from the centre to which the ready-made KITTI images have content."""
 
@@ -54,6 +57,8 @@ class ScanMethod:
     distance: str
     about: dict[str, Any]
 
+    weights_hash = ""
+
     def embed(self, sequence: Drive, *, batch: int = 1, **options: Any) -> DescriptorFile:
         """Describe a whole sequence; options are those of `ImageMethod`, but for `batch`: scans come one at a time.
 
@@ -70,6 +75,15 @@ class ScanMethod:
 
 
 Method = ImageMethod | ScanMethod
+
+
+def method_named(name: MethodName, weights: Path | None, sequence: Drive) -> Method:
+    """The network with these weights, or a reference; ValueError for the network without weights."""
+    if name != "sglpr":
+        return reference(name, sequence, model_preset("small").grid)
+    if weights is None:
+        raise ValueError("expected --weights (a training run's folder), found none")
+    return network(load(weights))
 
 
 def network(params: Params) -> ImageMethod:

@@ -40,7 +40,7 @@ def take_pictures(sequence: Drive, params: Params | None, source: Input, worst: 
         return Pictures(
             images, "Semantic maps: add --data with scans; ready-made images have no points to label.", heat
         )
-    return Pictures(images, {sequence.ids[row]: _semantic(sequence, params, row) for row in shown}, heat)
+    return Pictures(images, {sequence.ids[row]: semantic_picture(sequence, params, row) for row in shown}, heat)
 
 
 def sequence_rows(sequence: Drive, source: Input) -> Mapping[int, int]:
@@ -67,7 +67,8 @@ def _heat(sequence: Drive, params: Params, row: int) -> HeatPicture:
     return HeatPicture(np.asarray(views[0]), heat_maps(params, *views))
 
 
-def _semantic(sequence: ScanSequence, params: Params, row: int) -> SemanticPicture:
+def semantic_picture(sequence: ScanSequence, params: Params, row: int) -> SemanticPicture:
+    """Return one scan's counts and semantic maps: the network's and, with labels, the true one."""
     labels, config = sequence.labels(row), params.config
     classes = None if labels is None else to_classes(labels, categories=config.categories)
     found = semantic_map(params, sequence.points(row), classes)

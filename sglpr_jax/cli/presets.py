@@ -1,5 +1,6 @@
 """Training presets: the Python files in configs/, each of which sets CONFIG."""
 
+import argparse
 import runpy
 from pathlib import Path
 
@@ -12,6 +13,13 @@ _FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")  # in a wheel; in
 def preset_names() -> tuple[str, ...]:
     """The presets there are."""
     return tuple(sorted(path.stem for folder in _FOLDERS for path in folder.glob("*.py")))
+
+
+def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
+    """What --preset says, read before the other flags are, because it sets their defaults."""
+    chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    chooser.add_argument("--preset", default=default)
+    return chooser.parse_known_args(arguments)[0].preset
 
 
 def load_preset(name: str) -> TrainConfig:

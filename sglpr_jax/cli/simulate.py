@@ -1,11 +1,12 @@
-"""bin/simulate: write simulated drives in KITTI's layout, or as images in BEVPlace's."""
+"""bin/simulate: write simulated drives in KITTI's layout, as images in BEVPlace's, or several days in NCLT's."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.datasets import SIMULATED, SIMULATED_SCANS, simulate
+from sglpr_jax.cli.datasets import SIMULATED, SIMULATED_SCANS, simulate, simulate_days
 from sglpr_jax.cli.runtime import run
 from sglpr_jax.sim.drive import RATE_HZ, name_of_path
 
@@ -14,7 +15,9 @@ from sglpr_jax.sim.drive import RATE_HZ, name_of_path
 class SimulateCommand:
     """Drive a simulated LiDAR through simulated towns; write scans, labels, poses, calibration and times.
 
-    Example: bin/simulate --out towns --seq 08 --scans 400 --sensor hdl64e --seed 0
+    Examples:
+      bin/simulate --out towns --seq 08 --scans 400 --sensor hdl64e --seed 0
+      bin/simulate --out days --sessions 2012-01-15 2012-02-04 2012-03-17 --scans 400
     """
 
     out: Path
@@ -24,12 +27,16 @@ class SimulateCommand:
     direction, 08 in the opposite one, the others none. None: 00 05 08, or none where --along is given."""
     along: tuple[Path, ...] = ()
     """KITTI pose files to drive along, each through a town of its own; every k-th line, to have at most --scans."""
+    sessions: tuple[str, ...] = ()
+    """Dates: one town on so many days, in NCLT's layout. The first drives one route of --seq (00), the others the same
+    streets, partly the other way; parked cars and traffic are other ones."""
     scans: int = SIMULATED_SCANS
     """Scans of each drive."""
     rate_hz: float = RATE_HZ
     """Scans per second of a route; KITTI's rate is 10."""
-    sensor: str = "hdl64e"
-    """The LiDAR: hdl64e (KITTI's), hdl32e or vlp16."""
+    sensor: str | None = None
+    """The LiDAR: hdl64e (KITTI's), hdl32e, hdl32e-nclt (NCLT's, upside down) or vlp16. None: hdl64e, or hdl32e-nclt for
+    --sessions."""
     azimuth_steps: int | None = None
     """Firings per turn; fewer make smaller files. None: as many as the real sensor's."""
     images: bool = False
@@ -39,20 +46,42 @@ class SimulateCommand:
 
 def simulate_drives(command: SimulateCommand) -> Path:
     """Do what the command says; returns the dataset's folder."""
+    drives = _simulate_sessions(command) if command.sessions else _simulate_towns(command)
+    print(f"{command.out}: drives {', '.join(drives)}")
+    return command.out
+
+
+def _simulate_towns(command: SimulateCommand) -> Sequence[str]:
     names = command.seq if command.seq is not None else () if command.along else SIMULATED
     simulate(
         command.out,
         names=names,
         along=command.along,
         scans=command.scans,
-        sensor=command.sensor,
+        sensor=command.sensor or "hdl64e",
         azimuth_steps=command.azimuth_steps,
         seed=command.seed,
         rate_hz=command.rate_hz,
         images=command.images,
     )
-    print(f"{command.out}: drives {', '.join([*names, *map(name_of_path, command.along)])}")
-    return command.out
+    return [*names, *map(name_of_path, command.along)]
+
+
+def _simulate_sessions(command: SimulateCommand) -> Sequence[str]:
+    routes = command.seq or ("00",)
+    if command.along or command.images or len(routes) != 1:
+        raise ValueError("expected at most one route (--seq) beside --sessions, found more, or --along or --images")
+    simulate_days(
+        command.out,
+        dates=command.sessions,
+        route=routes[0],
+        scans=command.scans,
+        sensor=command.sensor or "hdl32e-nclt",
+        azimuth_steps=command.azimuth_steps,
+        seed=command.seed,
+        rate_hz=command.rate_hz,
+    )
+    return command.sessions
 
 
 def main() -> None:

@@ -1,10 +1,10 @@
 """bin/train: train on all drives but one, then test on that one, beside references."""
 
-import argparse
 import dataclasses
 import importlib.util
 import json
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,15 +13,16 @@ import tyro
 
 from sglpr_jax.cli.datasets import dataset_root, leave_one_out
 from sglpr_jax.cli.final_test import final_test
-from sglpr_jax.cli.presets import load_preset, preset_names
+from sglpr_jax.cli.presets import load_preset, preset_asked_for, preset_names
 from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
 from sglpr_jax.cli.training_recall import training_recall
 from sglpr_jax.data import Drive, ScanSequence
-from sglpr_jax.data.batch import read_batch
+from sglpr_jax.data.batch import Batch, read_batch
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.evaluation import figures
 from sglpr_jax.models.params import save
+from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.loop import METRICS_FILE, train
 from sglpr_jax.train.metrics_log import read_metrics
@@ -62,26 +63,51 @@ class TrainCommand:
 
 def parse(arguments: list[str] | None = None) -> TrainCommand:
     """Defaults, overridden by the preset, overridden by the flags."""
-    chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    chooser.add_argument("--preset", default=TrainCommand.preset)
-    preset = chooser.parse_known_args(arguments)[0].preset
+    preset = preset_asked_for(arguments, default=TrainCommand.preset)
     default = TrainCommand(preset=preset, config=load_preset(preset))
     return tyro.cli(TrainCommand, args=arguments, default=default, prog="train", description=_description())
 
 
 def train_and_test(command: TrainCommand) -> Path:
     """Do what the command says; returns the run's folder."""
-    folder = command.out or Path("runs") / f"{Path(command.preset).stem}-{command.seq}"
+    folder = run_folder(command)
+    params, test = train_only(command)
+    final_test(params, test, folder / "test", seed=command.config.seed)
+    return folder
+
+
+def run_folder(command: TrainCommand) -> Path:
+    """Where everything of the run goes."""
+    return command.out or Path("runs") / f"{Path(command.preset).stem}-{command.seq}"
+
+
+def train_only(command: TrainCommand) -> tuple[Params, Drive]:
+    """Train, and save the weights; returns them with the drive to test on. Exits with 130 where it is interrupted."""
+    folder = run_folder(command)
     root = dataset_root(command.data)
     drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
     config = command.config
     if config.model.categories_read:
         for drive in (*drives, test):
             _require_labels(drive)
-    pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
+    pool, make_batch = batches(drives, config)
     _claim(folder, command, resume=command.resume)
+    with stop_on_signal() as stopped:
+        score = training_recall(drives, pool, config)
+        state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)
+    save(state.params, folder / "weights")
+    if int(state.step) < config.steps:
+        print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
+        sys.exit(130)
+    draw_learning_curve(folder)
+    return state.params, test
 
-    def make_batch(step: int):
+
+def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Callable[[int], Batch]]:
+    """The tuples that drives hold, and the batch of each step, a function of the step alone."""
+    pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
+
+    def make_batch(step: int) -> Batch:
         frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
         return read_batch(
             drives,
@@ -92,16 +118,7 @@ def train_and_test(command: TrainCommand) -> Path:
             categories=config.model.categories,
         )
 
-    with stop_on_signal() as stopped:
-        score = training_recall(drives, pool, config)
-        state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)
-    save(state.params, folder / "weights")
-    if int(state.step) < config.steps:
-        print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
-        sys.exit(130)
-    draw_learning_curve(folder)
-    final_test(state.params, test, folder / "test", seed=config.seed)
-    return folder
+    return pool, make_batch
 
 
 def draw_learning_curve(folder: Path) -> None:
@@ -117,21 +134,33 @@ def draw_learning_curve(folder: Path) -> None:
 def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
     """Note the effective configuration in the run's folder, or see that a resumed run has the same."""
     path = folder / CONFIG_FILE
-    settings = json.loads(
-        json.dumps(dataclasses.asdict(dataclasses.replace(command, out=None, resume=False)), default=str)
-    )
     if path.exists() and not resume:
         raise FileExistsError(f"{folder}: there is a run already; go on with --resume, or choose another --out")
     if resume:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: expected a run to resume, found none")
-        different = sorted(_differences(json.loads(path.read_text()), settings) - {"config.steps"})
-        if different:
-            raise ValueError(
-                f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
-            )
+        require_same_settings(folder, command)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(path, settings)
+    write_json(path, _settings(command))
+
+
+def require_same_settings(folder: Path, command: TrainCommand) -> None:
+    """See that a run was begun with the settings of `command`, the number of steps apart.
+
+    Raises FileNotFoundError where there is no run, ValueError, naming them, where settings differ.
+    """
+    path = folder / CONFIG_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a run to resume, found none")
+    different = sorted(_differences(json.loads(path.read_text()), _settings(command)) - {"config.steps"})
+    if different:
+        raise ValueError(
+            f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
+        )
+
+
+def _settings(command: TrainCommand) -> dict[str, Any]:
+    """The effective configuration as it is written beside the results."""
+    plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
+    return json.loads(json.dumps(plain, default=str))
 
 
 def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:

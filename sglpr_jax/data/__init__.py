@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sglpr_jax.data import bev_images, folder, kitti
+from sglpr_jax.data import bev_images, folder, kitti, nclt
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.scan_files import ScanFormat, read_scan
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
@@ -13,15 +13,16 @@ __all__ = ["Drive", "ImageSequence", "ScanSequence", "open_sequence", "read_scan
 def sequence_names(root: Path) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, in order: those of the first layout that fits.
 
-    The layouts are KITTI's (`kitti.py`), ready-made BEV images (`bev_images.py`), and a folder of scans (`folder.py`),
-    which is one sequence with the folder's name. Raises FileNotFoundError where `root` has none of them.
+    The layouts are KITTI's (`kitti.py`), ready-made BEV images (`bev_images.py`), NCLT's (`nclt.py`), and a folder of
+    scans (`folder.py`), which is one sequence with the folder's name. Raises FileNotFoundError where `root` has none.
     """
-    names = kitti.sequence_names(root) or bev_images.sequence_names(root) or folder.sequence_names(root)
+    layouts = (kitti, bev_images, nclt, folder)
+    names = next(filter(None, (layout.sequence_names(root) for layout in layouts)), ())
     if not names:
         found = "nothing of the kind" if root.is_dir() else "no such folder"
         raise FileNotFoundError(
-            f"{root}: expected sequences/NN/velodyne/*.bin (KITTI), NN/imgs/*.png with NN/pose.txt (BEV images)"
-            f" or single scans (*.bin, *.pcd), found {found}"
+            f"{root}: expected sequences/NN/velodyne/*.bin (KITTI), NN/imgs/*.png with NN/pose.txt (BEV images),"
+            f" YYYY-MM-DD/velodyne_sync/*.bin (NCLT) or single scans (*.bin, *.pcd), found {found}"
         )
     return names
 
@@ -45,4 +46,6 @@ def open_sequence(
         return kitti.open_sequence(root, name, poses=poses)
     if name in bev_images.sequence_names(root):
         return bev_images.open_sequence(root, name)
+    if name in nclt.sequence_names(root):
+        return nclt.open_sequence(root, name)
     return folder.open_sequence(root, format=format)

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from sglpr_jax.data.pose_files import read_poses
-from sglpr_jax.data.scan_files import ScanFormat, read_scan, scan_id
+from sglpr_jax.data.scan_files import ScanFormat, read_lasers, read_scan, scan_id
 from sglpr_jax.data.sequence import ScanSequence
 
 
@@ -35,6 +35,7 @@ def open_sequence(root: Path, *, format: ScanFormat = "auto") -> ScanSequence:
         scan_paths=scan_paths,
         label_paths=(None,) * len(scan_paths),
         read_scan=partial(read_scan, format=format),
+        read_lasers=partial(read_lasers, format=format),
     )
 
 

@@ -10,11 +10,20 @@ from sglpr_jax.data.pcd import read_pcd
 
 ScanFormat = Literal["auto", "kitti", "nuscenes", "nclt", "pcd"]
 
+NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+NCLT_UNIT_M = 0.005
+NCLT_OFFSET_M = -100.0
+"""Metres = value * unit + offset."""
+Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
+"""Half a turn about x: from forward, right, down to forward, left, up. Negating z alone would mirror the scan."""
+
 _RECORDS = {
     "kitti": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4")]),
     "nuscenes": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<f4")]),
-    "nclt": np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")]),
+    "nclt": NCLT_RECORD,
 }
+
+_LASER_FIELDS = {"nuscenes": "ring", "nclt": "laser"}
 
 
 def scan_id(path: Path) -> str:
@@ -54,8 +63,18 @@ def read_scan(path: Path, *, format: ScanFormat = "auto") -> Float32[np.ndarray,
     if format == "nuscenes":
         xyz = np.stack([xyz[:, 1], -xyz[:, 0], xyz[:, 2]], axis=1)
     elif format == "nclt":
-        xyz = (xyz.astype(np.float64) * 0.005 - 100.0) * [1.0, -1.0, -1.0]
+        xyz = (xyz.astype(np.float64) * NCLT_UNIT_M + NCLT_OFFSET_M) * Z_UP_FROM_Z_DOWN
     return np.ascontiguousarray(xyz, dtype=np.float32)
+
+
+def read_lasers(path: Path, *, format: ScanFormat = "auto") -> Int32[np.ndarray, " n"] | None:
+    """Return the number of the laser that each point of a scan is from, as the file has it (nuscenes, nclt), else None.
+
+    Raises what `read_scan` raises.
+    """
+    format = guess_format(path) if format == "auto" else format
+    field = _LASER_FIELDS.get(format)
+    return None if field is None else _read_records(path, format)[field].astype(np.int32)
 
 
 def _read_records(path: Path, format: str) -> np.ndarray:

@@ -4,7 +4,7 @@ Both have the same first five fields. A file is read only when it is asked for.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ class ScanSequence:
 
     `ids` are the file stems ("000052"). `positions` are metres, z up, or None where nothing tells them; `pose_source`
     names where they come from. `times` are seconds, or None. `label_paths` has None for each scan without labels.
+    `read_lasers` is there where the files say which laser each point is from.
     """
 
     name: str
@@ -29,6 +30,7 @@ class ScanSequence:
     scan_paths: tuple[Path, ...]
     label_paths: tuple[Path | None, ...]
     read_scan: Callable[[Path], np.ndarray]
+    read_lasers: Callable[[Path], np.ndarray | None] | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -49,6 +51,10 @@ class ScanSequence:
         """
         path = self.label_paths[i]
         return None if path is None else read_labels(path, points=len(self.points(i)))
+
+    def lasers(self, i: int) -> Int32[np.ndarray, " n"] | None:
+        """Read the number of the laser that each point of scan `i` is from, or None where the file does not say."""
+        return None if self.read_lasers is None else self.read_lasers(self.scan_paths[i])
 
 
 @dataclass(frozen=True, eq=False)

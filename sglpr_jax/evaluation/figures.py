@@ -100,6 +100,32 @@ def learning_curve(
     return figure
 
 
+def stress(
+    changes: Mapping[tuple[str, str], Mapping[str, Sequence[tuple[str, float]]]], *, title: str = ""
+) -> "matplotlib.figure.Figure":
+    """Draw how much each method's score changes with the strength of a disturbance: a row of panels for each protocol.
+
+    `changes` has by (protocol, kind of disturbance), by method, the labels of the strengths and the changes.
+    """
+    protocols, kinds = (list(dict.fromkeys(names)) for names in zip(*changes, strict=True))
+    figure = _figure(max(1.6 + 1.9 * len(kinds), 4.0), 1.0 + 2.4 * len(protocols))
+    figure.suptitle(title)
+    panels = figure.subplots(len(protocols), len(kinds), sharey="row", squeeze=False)
+    for (protocol, kind), methods in changes.items():
+        row, column = protocols.index(protocol), kinds.index(kind)
+        axes = panels[row, column]
+        for method, points in methods.items():
+            labels, values = zip(("clean", 0.0), *points, strict=True)
+            axes.plot(range(len(values)), values, "o-", markersize=3.5, linewidth=1.6, label=method)
+        axes.set_xticks(range(len(labels)), labels, fontsize=8)
+        axes.set(title=kind if row == 0 else "", ylabel=f"{protocol}: change" if column == 0 else "")
+        axes.axhline(0, color="0.6", linewidth=0.8, zorder=0)
+        axes.grid(axis="y", color="0.92")
+    lines, names = panels[0, 0].get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside lower center", ncols=min(len(names), 6), frameon=False)
+    return figure
+
+
 def segmentation_panel(
     bev: Num[np.ndarray, "h w"],
     truth: Int[np.ndarray, "h w"] | None,

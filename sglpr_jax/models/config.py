@@ -59,6 +59,9 @@ class ModelConfig:
     polar: tuple[int, int] | None = None
     """(rings, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
     patch: int = 4
+    stem: tuple[int, ...] = ()
+    """Widths of convolutions before the patch embedding, the second and later ones at half the resolution of the one
+    before; the segmentation head sees each of them again. (): none, as in the paper."""
     embed_dim: int = 96
     depths: tuple[int, ...] = (2, 2, 2, 2)
     heads: tuple[int, ...] = (3, 6, 12, 24)
@@ -78,6 +81,11 @@ class ModelConfig:
             raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
         if self.polar and self.field != "circle":
             raise ValueError(f"a polar image covers a circle: expected field 'circle', found {self.field!r}")
+        if self.stem and self.patch % 2 ** (len(self.stem) - 1):
+            raise ValueError(
+                f"a stem of {len(self.stem)} widths makes pixels of {2 ** (len(self.stem) - 1)} cells, of which a "
+                f"patch must be made, found patch {self.patch}"
+            )
         step = self.patch * 2 ** (len(self.depths) - 1)
         for size in self.image_size:
             if size % step:
@@ -107,3 +115,8 @@ class ModelConfig:
     def image_size(self) -> tuple[int, int]:
         """Rows and columns of the image that the backbone sees."""
         return self.polar or (self.grid.height, self.grid.width)
+
+    @property
+    def token_pixels(self) -> int:
+        """Edge of a token's patch in pixels of the map that the backbone reads: the image, or the stem's last."""
+        return self.patch // 2 ** max(len(self.stem) - 1, 0)

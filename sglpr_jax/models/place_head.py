@@ -1,12 +1,11 @@
 """The place head: from the backbone's feature map to a descriptor (section 4.1.2)."""
 
 import flax.linen as nn
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.cbam import CBAM
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.layers import LayerNorm, l2_normalize
+from sglpr_jax.models.layers import LayerNorm, convolution, l2_normalize
 from sglpr_jax.models.mean_pooling import MeanPooling
 from sglpr_jax.models.netvlad import NetVLAD
 
@@ -28,7 +27,7 @@ class PlaceHead(nn.Module):
             x = seen["cbam"] = CBAM(self.config.cbam_reduction, name="cbam")(x)
         shapes = zip(self.config.channels, self.config.kernels, self.config.strides, strict=True)
         for i, (channels, kernel, stride) in enumerate(shapes):
-            x = self._convolution(x, channels, kernel, stride, name=f"convolution_{i}")
+            x = convolution(x, channels, kernel, stride, circular=self.circular, name=f"convolution_{i}")
             x = seen[f"head_convolution{i}"] = nn.relu(LayerNorm(name=f"norm_{i}")(x))
         locals_ = x.reshape(len(x), -1, x.shape[-1])
         return l2_normalize(self._pooling()(locals_)), seen
@@ -37,12 +36,3 @@ class PlaceHead(nn.Module):
         if self.config.pooling == "mean":
             return MeanPooling(self.config.descriptor_size, name="mean_pooling")
         return NetVLAD(self.config.clusters, self.config.descriptor_size, name="netvlad")
-
-    def _convolution(self, x: Array, channels: int, kernel: int, stride: int, *, name: str) -> Array:
-        """He-initialised. Patches side by side (kernel = stride) need no border, others PyTorch's of kernel // 2."""
-        border = 0 if kernel == stride else kernel // 2
-        if self.circular:
-            x = jnp.pad(x, ((0, 0), (0, 0), (border, border), (0, 0)), mode="wrap")
-        padding = [(border, border), (0, 0) if self.circular else (border, border)]
-        init = nn.initializers.he_normal()
-        return nn.Conv(channels, (kernel, kernel), stride, padding, kernel_init=init, name=name)(x)

@@ -1,5 +1,6 @@
 """SG-LPR whole (figure 2): shared Swin-Unet features, the place head, and the segmentation head of training time."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -18,6 +19,7 @@ from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.polar import from_polar, to_polar
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.raw_place import RawPlace
+from sglpr_jax.models.stem import Stem, StemDecoder
 from sglpr_jax.models.swin import FinalPatchExpand
 from sglpr_jax.models.swin_unet import SwinUnet
 
@@ -48,30 +50,41 @@ class SGLPR(nn.Module):
     @nn.compact
     def __call__(self, image: Float[Array, "b h w c"], *, segment: int = 0, train: bool = False) -> Outputs:
         """`segment` n: semantic logits of every n-th image (True: of all); 0: that head does not exist."""
-        config, seen = self.config, image
+        config, seen, circular = self.config, image, self.config.polar is not None
         if config.polar:
             seen = to_polar(image, config.grid, *config.polar)
+        maps = Stem(config.stem, circular, name="stem")(seen) if config.stem else []
         tokens, intermediates = SwinUnet(
             embed_dim=config.embed_dim,
             depths=config.depths,
             heads=config.heads,
             window=config.window,
             mlp_ratio=config.mlp_ratio,
-            patch=config.patch,
+            patch=config.token_pixels,
             drop_path=config.drop_path,
-            circular=config.polar is not None,
+            circular=circular,
             name="backbone",
-        )(seen, train=train)
-        expand = FinalPatchExpand(config.patch, name="expand")
+        )(maps[-1] if maps else seen, train=train)
+        expand = self._expansion()
         reads_pixels = config.head.tap == "pixels"
-        features = expand(tokens) if reads_pixels else tokens
-        descriptor, head = PlaceHead(config.head, config.polar is not None, name="place_head")(features)
+        features = expand(tokens, maps) if reads_pixels else tokens
+        descriptor, head = PlaceHead(config.head, circular, name="place_head")(features)
         logits = None
         if segment:
-            pixels = features[::segment] if reads_pixels else expand(tokens[::segment])
+            pixels = (
+                features[::segment] if reads_pixels else expand(*jax.tree.map(lambda x: x[::segment], (tokens, maps)))
+            )
             intermediates["pixels"] = pixels
             logits = self._logits(pixels, image[::segment])
         return Outputs(descriptor, logits, intermediates | head)
+
+    def _expansion(self) -> Callable[[Array, list[Array]], Array]:
+        """From tokens to pixels: a linear layer, or past the maps of the stem."""
+        config = self.config
+        if config.stem:
+            return StemDecoder(config.token_pixels, config.polar is not None, name="decoder")
+        expand = FinalPatchExpand(config.patch, name="expand")
+        return lambda tokens, _: expand(tokens)
 
     def _logits(self, pixels: Float[Array, "b p q c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w k"]:
         """The segmentation head. Few channels cross from the polar image to the grid: a linear layer comes first."""

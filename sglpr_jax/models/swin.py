@@ -130,14 +130,16 @@ class PatchExpand(nn.Module):
 
 
 class FinalPatchExpand(nn.Module):
-    """From patches back to pixels, keeping the channels."""
+    """From patches back to pixels."""
 
     patch: int = 4
+    channels: int | None = None
+    """None: as many as before."""
 
     @nn.compact
-    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b {self.patch}*h {self.patch}*w c"]:
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b {self.patch}*h {self.patch}*w _"]:
         """Each token becomes patch x patch pixels."""
-        return _expand(x, factor=self.patch, channels=x.shape[-1])
+        return _expand(x, factor=self.patch, channels=self.channels or x.shape[-1])
 
 
 def _expand(x: Float[Array, "b h w c"], *, factor: int, channels: int) -> Float[Array, "b _ _ _"]:

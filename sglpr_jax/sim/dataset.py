@@ -13,8 +13,9 @@ from pathlib import Path
 from sglpr_jax.sim.drive import RATE_HZ, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.routes import ROLES
-from sglpr_jax.sim.sensor import HDL64E, Sensor
+from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
 from sglpr_jax.sim.sequence import SimulatedSequence, simulate_sequence
+from sglpr_jax.sim.sessions import plan_sessions
 
 SETTINGS_FILE = "simulation.json"
 VERSION = 2
@@ -51,7 +52,7 @@ def write_dataset(
     unknown = [name for name in names if name not in ROLES]
     if unknown or scans < 2:
         raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")
-    if len(files) < len(names) + len(along) or layout not in LAYOUTS:
+    if len(files) < len(names) + len(along) or layout not in ("scans", "images"):
         drives = [*names, *map(name_of_path, along)]
         raise ValueError(f"expected different names and layout scans or images, found {', '.join(drives)} and {layout}")
     settings = {"version": VERSION, "layout": layout, "scans": scans, "seed": seed, "rate_hz": rate_hz}
@@ -62,7 +63,33 @@ def write_dataset(
         count = scans if file is None else len(thinned(read_path(file), scans).times)
         simulate = functools.partial(simulate_sequence, name, **options)
         show = functools.partial(progress, name) if progress else lambda done, scans: None
-        _write_drive(root, name, simulate, scans=count, layout=LAYOUTS[layout], progress=show)
+        ids = tuple(f"{i:06d}" for i in range(count))
+        _write_drive(root, name, simulate, ids=ids, layout=LAYOUTS[layout], progress=show)
+    return root
+
+
+def write_sessions(
+    root: Path,
+    *,
+    dates: Sequence[str],
+    route: str = "00",
+    scans: int = 300,
+    sensor: Sensor = SENSORS["hdl32e-nclt"],
+    seed: int = 0,
+    rate_hz: float = RATE_HZ,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one town on several days into the folder `root`, in NCLT's layout; return `root`.
+
+    Of the arguments and the drives see `plan_sessions`, of files, progress and errors `write_dataset`. Sessions cannot
+    be added: with more days the streets are others.
+    """
+    settings = {"version": VERSION, "layout": "nclt", "scans": scans, "seed": seed, "rate_hz": rate_hz}
+    sessions = plan_sessions(dates, route=route, scans=scans, sensor=sensor, seed=seed, rate_hz=rate_hz)
+    _claim(root, {**settings, "sensor": dataclasses.asdict(sensor), "sessions": dates, "route": route}, {})
+    for date, ids, simulate in sessions:
+        show = functools.partial(progress, date) if progress else lambda done, scans: None
+        _write_drive(root, date, simulate, ids=ids, layout=LAYOUTS["nclt"], progress=show)
     return root
 
 
@@ -106,12 +133,13 @@ def _write_drive(
     name: str,
     simulate: Callable[[], SimulatedSequence],
     *,
-    scans: int,
+    ids: Sequence[str],
     layout: Layout,
     progress: Callable[[int, int], None],
 ) -> None:
     """Write what is missing of one drive; its town is built only where something is."""
-    missing = [i for i in range(scans) if not all(file.exists() for file in layout.files_of_scan(root, name, i))]
+    scans = len(ids)
+    missing = [i for i in range(scans) if not all(file.exists() for file in layout.files_of_scan(root, name, ids[i]))]
     progress(scans - len(missing), scans)
     if not missing and layout.is_finished(root, name):
         return
@@ -119,7 +147,7 @@ def _write_drive(
 
     def write_scan(i: int) -> None:
         contents = layout.scan_contents(*sequence.render(i))
-        for file, content in zip(layout.files_of_scan(root, name, i), contents, strict=True):
+        for file, content in zip(layout.files_of_scan(root, name, ids[i]), contents, strict=True):
             _write(file, content)
 
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -130,7 +158,7 @@ def _write_drive(
             pool.shutdown(cancel_futures=True)
             raise
     for file, content in layout.drive_contents(sequence.drive).items():
-        _write(root / layout.folder.format(name=name) / file, content)
+        _write(layout.file_of_drive(root, name, file), content)
 
 
 def _write(path: Path, content: bytes) -> None:

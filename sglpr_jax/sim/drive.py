@@ -61,16 +61,22 @@ def plan_trajectory(rng: np.random.Generator, name: str, *, scans: int, rate_hz:
     return thinned(plan_path(rng, name, scans=scans, rate_hz=rate_hz), scans)
 
 
-def plan_path(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> Trajectory:
-    """Return the whole way of `plan_trajectory`, a pose about every 0.1 s: a whole multiple of `scans` poses."""
+def plan_path(
+    rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ, days: int = 1
+) -> Trajectory:
+    """Return the whole way of `plan_trajectory`, a pose about every 0.1 s: a whole multiple of `scans * days` poses.
+
+    With more than one `days`, equal parts of it are that many drives through the same streets, one after the other.
+    """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
     role = ROLES[name]
     seconds = max(scans / rate_hz, SHORTEST_S)
-    path = _in_lane(rng, plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m)))
+    path = _in_lane(rng, plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m), days=days))
     heading = np.unwrap(np.arctan2(*np.gradient(path, axis=0).T[::-1]))
     clock = _clock(rng, path, heading, FREE_SPEED * role.speed_mps)
-    times = np.linspace(0, clock[-1], scans * max(1, round(clock[-1] * PATH_HZ / scans)))
+    poses = scans * days
+    times = np.linspace(0, clock[-1], poses * max(1, round(clock[-1] * PATH_HZ / poses)))
     x, y, yaw = (np.interp(times, clock, values) for values in (*path.T, heading))
     return Trajectory(np.stack([x, y], axis=1), yaw, times)
 

@@ -1,4 +1,4 @@
-"""How a simulated drive lies on disk: scans in KITTI's layout, or images in BEVPlace's."""
+"""How a simulated drive lies on disk: scans in KITTI's layout or NCLT's, or images in BEVPlace's."""
 
 import io
 from collections.abc import Callable
@@ -8,9 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.density_image import density_image
+from sglpr_jax.data.scan_files import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
 from sglpr_jax.sim.drive import Drive
+from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Camera x right, y down, z forward from LiDAR x forward, y left, z up; both at one place."""
@@ -22,21 +25,25 @@ class Layout(NamedTuple):
     folder: str
     """Of the drive `{name}`."""
     scan_files: tuple[str, ...]
-    """Of scan `{i}`."""
+    """Of scan `{id}`."""
     scan_contents: Callable[[np.ndarray, np.ndarray], tuple[bytes, ...]]
     """What is in them, from points (n, 4) and labels (n,)."""
     drive_contents: Callable[[Drive], dict[str, bytes]]
-    """The files of the drive as a whole, written when all its scans are there."""
+    """The files of the drive as a whole, by their names, written when all its scans are there."""
     last_file: str
     """Of these; says that the drive is finished."""
 
-    def files_of_scan(self, root: Path, name: str, i: int) -> tuple[Path, ...]:
-        """Where scan `i` of drive `name` lies."""
-        return tuple(root / self.folder.format(name=name) / file.format(i=i) for file in self.scan_files)
+    def files_of_scan(self, root: Path, name: str, id: str) -> tuple[Path, ...]:
+        """Where scan `id` of drive `name` lies."""
+        return tuple(root / self.folder.format(name=name) / file.format(id=id) for file in self.scan_files)
+
+    def file_of_drive(self, root: Path, name: str, file: str) -> Path:
+        """Where one of the files of drive `name` as a whole lies."""
+        return root / self.folder.format(name=name) / file.format(name=name)
 
     def is_finished(self, root: Path, name: str) -> bool:
         """Whether drive `name` was written to its end."""
-        return (root / self.folder.format(name=name) / self.last_file).exists()
+        return self.file_of_drive(root, name, self.last_file).exists()
 
 
 def _points_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray) -> tuple[bytes, ...]:
@@ -71,20 +78,60 @@ def _bevplace_files(drive: Drive) -> dict[str, bytes]:
     return {"pose.txt": "".join(_row(pose) for pose in drive.world_from_lidar).encode()}
 
 
+def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray) -> tuple[bytes, ...]:
+    """Return the bytes of a scan in NCLT's body frame: x forward, y right, z down, from the ground below the sensor.
+
+    `points` are metres from the sensor, z up, and reflectivities 0 to 1. Lasers are not told apart. NCLT's numbers
+    reach from -100 to 227 m in steps of 5 mm.
+    """
+    above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, NCLT_HEIGHT_M])
+    body = above_ground * Z_UP_FROM_Z_DOWN
+    records = np.zeros(len(points), NCLT_RECORD)
+    records["xyz"] = np.round((body - NCLT_OFFSET_M) / NCLT_UNIT_M)
+    records["intensity"] = np.round(255 * points[:, 3])
+    return (records.tobytes(),)
+
+
+def _nclt_files(drive: Drive) -> dict[str, bytes]:
+    """The ground truth, north, east, down: one row per scan, where NCLT has a hundred a second."""
+    lidar_from_body = np.eye(4)
+    lidar_from_body[2, 3] = -NCLT_HEIGHT_M
+    world_from_body = drive.world_from_lidar @ lidar_from_body
+    turns = np.diag(Z_UP_FROM_Z_DOWN) @ world_from_body[:, :3, :3] @ np.diag(Z_UP_FROM_Z_DOWN)
+    angles = Rotation.from_matrix(turns).as_euler("ZYX")[:, ::-1]
+    places = world_from_body[:, :3, 3] * Z_UP_FROM_Z_DOWN
+    rows = zip(drive.times, np.concatenate([places, angles], axis=1), strict=True)
+    lines = (f"{to_utime(time)}," + ",".join(f"{value:.9g}" for value in row) for time, row in rows)
+    return {"groundtruth_{name}.csv": "".join(f"{line}\n" for line in lines).encode()}
+
+
+def to_utime(seconds: float) -> int:
+    """Return seconds since 1970 as the whole microseconds that name NCLT's scans."""
+    return round(seconds * 1e6)
+
+
 LAYOUTS = {
     "scans": Layout(
         folder="sequences/{name}",
-        scan_files=("velodyne/{i:06d}.bin", "labels/{i:06d}.label"),
+        scan_files=("velodyne/{id}.bin", "labels/{id}.label"),
         scan_contents=_points_and_labels,
         drive_contents=_kitti_files,
         last_file="poses.txt",
     ),
     "images": Layout(
         folder="{name}",
-        scan_files=("imgs/{i:06d}.png",),
+        scan_files=("imgs/{id}.png",),
         scan_contents=_image,
         drive_contents=_bevplace_files,
         last_file="pose.txt",
     ),
+    "nclt": Layout(
+        folder="{name}",
+        scan_files=("velodyne_sync/{id}.bin",),
+        scan_contents=nclt_scan,
+        drive_contents=_nclt_files,
+        last_file="groundtruth_{name}.csv",
+    ),
 }
-"""KITTI odometry's and SemanticKITTI's layout, and BEVPlace's density images, which have neither labels nor times."""
+"""KITTI odometry's and SemanticKITTI's layout; BEVPlace's density images, which have neither labels nor times; NCLT's
+sessions, which have no labels."""

@@ -5,7 +5,7 @@ some crossings are roundabouts, and corners are rounded. A street that is driven
 """
 
 import dataclasses
-from collections import Counter
+from collections import Counter, defaultdict
 from itertools import pairwise
 
 import numpy as np
@@ -65,10 +65,13 @@ ROLES = {
 end, and 01 (a highway), 03, 04 (a straight road) and 10 never. Shares are larger than KITTI's where those are small."""
 
 
-def plan_route(rng: np.random.Generator, role: Role, *, blocks: int) -> Float[np.ndarray, "n 2"]:
-    """Return the middle of the streets that a drive of about `blocks` blocks takes, a point every STEP_M metres."""
-    walk = np.array(plan_walk(rng, role, blocks=blocks))
-    corners = resampled(_Streets(rng, role, walk).line(), STEP_M)
+def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int = 1) -> Float[np.ndarray, "n 2"]:
+    """Return the middle of the streets that a drive of about `blocks` blocks takes, a point every STEP_M metres.
+
+    With more than one day, as many blocks of the same streets follow for each, see `plan_days`.
+    """
+    walk = plan_walk(rng, role, blocks=blocks) if days == 1 else plan_days(rng, role, blocks=blocks, days=days)
+    corners = resampled(_Streets(rng, role, np.array(walk)).line(), STEP_M)
     return resampled(gaussian_filter1d(corners, role.corner_m / STEP_M, axis=0, mode="nearest"), STEP_M)
 
 
@@ -97,6 +100,27 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
         if walk := _walk_in_loops(rng, role, shares):
             return walk
     raise ValueError(f"no walk of {blocks} blocks with {loops} loops was found; a loop needs 8 blocks or more")
+
+
+def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -> list[Node]:
+    """Return a walk as long as `days` of `plan_walk`: on the later days it keeps to the streets of the first.
+
+    A later day begins with a turn at a roundabout, as every street that ends is left. Of the ways ahead the one is
+    taken that was driven least in that direction, so that the later days go partly in the opposite one.
+    """
+    walk = plan_walk(rng, role, blocks=blocks)
+    ahead = defaultdict(set)
+    for a, b in pairwise(walk):
+        ahead[a].add(b)
+        ahead[b].add(a)
+    driven = Counter(pairwise(walk))
+    for step in range(blocks * (days - 1)):
+        here, before = walk[-1], walk[-2]
+        ways = sorted(ahead[here] - {before}) if step % blocks else []
+        taken = [driven[here, way] + rng.random() for way in ways]  # at random where driven equally often
+        walk.append(ways[np.argmin(taken)] if ways else before)
+        driven[here, walk[-1]] += 1
+    return walk
 
 
 def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> list[Node]:
@@ -197,6 +221,8 @@ class _Streets:
         self.bend = rng.uniform(-role.winding, role.winding, (2, columns, rows)) / 2  # of streets along x and along y
         self.is_round = rng.random((columns, rows)) < role.roundabouts
         self.walk: list[Node] = [(int(column), int(row)) for column, row in walk - low]
+        for before, node, after in zip(self.walk[:-2], self.walk[1:-1], self.walk[2:], strict=True):
+            self.is_round[node] |= before == after  # the vehicle turns round there
 
     def line(self) -> Float[np.ndarray, "n 2"]:
         """The way along the walk, with sharp corners; roundabouts are taken counter-clockwise."""
@@ -224,5 +250,5 @@ class _Streets:
 
     def _arc(self, node: Node, entry: Float[np.ndarray, "2"], exit: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
         first, last = (np.arctan2(*(point - self.crossing[node])[::-1]) for point in (entry, exit))
-        angle = first + np.linspace(0, (last - first) % (2 * np.pi), 30)
+        angle = first + np.linspace(0, (last - first) % (2 * np.pi) or 2 * np.pi, 30)
         return self.crossing[node] + ROUNDABOUT_RADIUS_M * np.stack([np.cos(angle), np.sin(angle)], axis=1)

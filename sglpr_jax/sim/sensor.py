@@ -19,6 +19,8 @@ from sglpr_jax.sim.world import World
 HDL64E_DEG = (*np.linspace(2.0, -8.33, 32).tolist(), *np.linspace(-8.83, -24.8, 32).tolist())
 """The elevations of the HDL-64E: two blocks of 32 lasers, the upper one finer."""
 HDL32E_DEG = tuple(np.linspace(10.67, -30.67, 32).tolist())
+NCLT_DEG = tuple(-elevation for elevation in HDL32E_DEG)
+NCLT_HEIGHT_M = 1.03
 VLP16_DEG = tuple(np.linspace(15.0, -15.0, 16).tolist())
 TURN_S = 0.1
 LASERS_AT_A_TIME = 16
@@ -69,8 +71,9 @@ KITTI_SHADOWS_DEG = (
 HDL64E = Sensor(shadows_deg=KITTI_SHADOWS_DEG)
 SENSORS = {
     "hdl64e": HDL64E,
-    # NCLT's, on a Segway.
     "hdl32e": Sensor(HDL32E_DEG, azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
+    # Upside down on a Segway: elevations and height are those that fit a real scan of NCLT.
+    "hdl32e-nclt": Sensor(NCLT_DEG, azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
     "vlp16": Sensor(VLP16_DEG, min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
 }
 """Real sensors, by the names that the command line knows."""

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Float, Int, Int32, PRNGKeyArray
 
 from sglpr_jax.data.sequence import ScanSequence
 from sglpr_jax.sim.drive import (
     RATE_HZ,
     Drive,
+    Trajectory,
     body_tilt,
     drive_seed,
     every_kth,
@@ -21,10 +22,9 @@ from sglpr_jax.sim.drive import (
     poses_on,
     read_path,
     speeds,
-    thinned,
 )
 from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
-from sglpr_jax.sim.world import build_world
+from sglpr_jax.sim.world import World, build_world
 
 KEPT_SCANS = 8
 """The last ones rendered, so that asking for a scan's points and then for its labels costs one rendering."""
@@ -70,19 +70,49 @@ def simulate_sequence(
         path = plan_path(rng, name, scans=scans, rate_hz=rate_hz)
     seeds = drive_seed(seed, name)
     world = build_world(seeds, path.xy, path.times)
-    xy, yaw, times = thinned(path, scans)
-    tilt = body_tilt(np.random.default_rng((*seeds, 2)), times)
+    rows = np.arange(len(path.times))[every_kth(path, scans)]
+    return drive_through(
+        world,
+        path,
+        rows,
+        name=name,
+        ids=tuple(f"{i:06d}" for i in range(len(rows))),
+        times=path.times[rows],
+        sensor=sensor,
+        key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
+        rng=np.random.default_rng((*seeds, 2)),
+    )
+
+
+def drive_through(
+    world: World,
+    path: Trajectory,
+    rows: Int[np.ndarray, " n"],
+    *,
+    name: str,
+    ids: tuple[str, ...],
+    times: Float[np.ndarray, " n"],
+    sensor: Sensor,
+    key: PRNGKeyArray,
+    rng: np.random.Generator,
+) -> SimulatedSequence:
+    """Return the drive `name` through a town, with a scan at each of these `rows` of `path`.
+
+    `ids` and `times` (seconds) are what the scans are called and when they are said to be taken; the town's own clock
+    is that of `path`. `key` draws what the sensor measures, `rng` how the vehicle's body tilts.
+    """
+    xy, yaw, clock = (values[rows] for values in path)
+    tilt = body_tilt(rng, clock)
     drive = Drive(poses_on(world.ground.relief, xy, yaw, height_m=sensor.height_m, tilt=tilt), times)
-    speed = speeds(path)[every_kth(path, scans)]
-    key = jax.random.fold_in(jax.random.key(seed), seeds[1])
+    speed = speeds(path)[rows]
+    row_of = {scan_id: i for i, scan_id in enumerate(ids)}
 
     @functools.lru_cache(maxsize=KEPT_SCANS)
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
         pose, velocity = drive.world_from_lidar[i], np.array([speed[i], 0, 0])
-        return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(times[i]), velocity=velocity)
+        return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(clock[i]), velocity=velocity)
 
-    ids = tuple(f"{i:06d}" for i in range(len(times)))
-    names = tuple(Path(i) for i in ids)
+    names = tuple(Path(scan_id) for scan_id in ids)
     return SimulatedSequence(
         name=name,
         ids=ids,
@@ -91,7 +121,7 @@ def simulate_sequence(
         pose_source="simulation",
         scan_paths=names,
         label_paths=names,
-        read_scan=lambda path: render(int(path.name))[0][:, :3],
+        read_scan=lambda path: render(row_of[path.name])[0][:, :3],
         drive=drive,
         render=render,
     )

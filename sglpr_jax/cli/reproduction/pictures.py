@@ -1,0 +1,93 @@
+"""Figures 5 to 9 from the runs, as matplotlib figures by the name of the file that each is written to."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sglpr_jax.cli.page_pictures import semantic_picture
+from sglpr_jax.cli.reproduction.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
+from sglpr_jax.cli.reproduction.runs import Runs
+from sglpr_jax.data import Drive, ScanSequence
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.retrieval.embed import read_image
+from sglpr_jax.retrieval.heat_maps import heat_maps
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+Pictures = dict[str, "matplotlib.figure.Figure"]
+HEAT_MAPS = ("decoder", "CBAM")
+
+
+def precision_recall(results: Mapping[str, Mapping[str, Result]]) -> Pictures:
+    """Figure 5: a plot for each drive, with a line for each method, from results by drive and method."""
+    pictures = {}
+    for seq, of_method in results.items():
+        curves = {method: result.curve for method, result in of_method.items() if result.curve is not None}
+        if curves:
+            pictures[f"figure5-{seq}.png"] = figures.precision_recall(curves, title=seq)
+    return pictures
+
+
+def trajectories(runs: Runs, results: Mapping[str, Result]) -> Pictures:
+    """Figure 6: a plot for each drive, of the model's decisions along the way."""
+    pictures = {}
+    for seq, result in results.items():
+        positions = runs.drive(seq).positions
+        if result.decisions is not None and positions is not None:
+            pictures[f"figure6-{seq}.png"] = figures.trajectory(positions, result.decisions, title=seq)
+    return pictures
+
+
+def semantic_maps(runs: Runs, seqs: Sequence[str]) -> Pictures:
+    """Figure 7: a scan from the middle of each drive, as the model that never saw the drive labels it.
+
+    Raises ValueError where a drive has images instead of scans.
+    """
+    pictures = {}
+    for seq in seqs:
+        drive = runs.drive(seq)
+        if not isinstance(drive, ScanSequence):
+            raise ValueError(f"figure7: expected scans in sequence {seq}, found images, which have no labels")
+        row = len(drive) // 2
+        shown = semantic_picture(drive, runs.params(FULL, seq), row)
+        pictures[f"figure7-{seq}.png"] = figures.segmentation_panel(
+            shown.counts,
+            shown.truth,
+            shown.predicted,
+            resolution_m=shown.resolution_m,
+            categories=shown.categories,
+            title=f"{seq}, scan {drive.ids[row]}",
+        )
+    return pictures
+
+
+def feature_heat_maps(runs: Runs, seq: str, drives: Sequence[Drive]) -> Pictures:
+    """Figure 8: a scan from the middle of each drive, seen by the models without and with the segmentation branch.
+
+    Both models were trained without `seq`.
+    """
+    models = {"without": runs.params(NO_SEGMENTATION, seq), "with": runs.params(FULL, seq)}
+    pictures = {}
+    for drive in drives:
+        row = len(drive) // 2
+        image = np.asarray(read_image(drive, row, runs.config.model.grid))
+        maps = {
+            f"{name}: {layer}": values
+            for name, params in models.items()
+            for layer, values in heat_maps(params, image).items()
+            if layer in HEAT_MAPS
+        }
+        title = f"{drive.name}, scan {drive.ids[row]}, without and with the segmentation branch"
+        pictures[f"figure8-{drive.name}.png"] = figures.heat_maps(image, maps, title=title)
+    return pictures
+
+
+def categories(score: Callable[[str, str], float], seqs: Sequence[str]) -> Pictures:
+    """Figure 9: the score of every drive over the number of categories; `score(variant, seq)`."""
+    numbers = EXPERIMENTS["figure9"].names()
+    curves = {seq: [(int(number), score(variant, seq)) for variant, number in numbers.items()] for seq in seqs}
+    plot = figures.learning_curve(curves, xlabel="categories", ylabel="top-1 F1max")
+    return {"figure9.png": plot}

@@ -1,0 +1,76 @@
+"""Methods on a clean sequence and on disturbed ones under the same protocols, side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.report import format_score, to_json
+
+
+@dataclass(frozen=True, eq=False)
+class StressRow:
+    """What the methods score under one disturbance. Of several rows the first is the clean sequence."""
+
+    name: str
+    kind: str
+    label: str
+    """The strength, with its unit."""
+    results: Mapping[str, Sequence[Result]]
+    """By method, one for each protocol: the same methods and protocols in every row."""
+
+
+def score_changes(row: StressRow, clean: StressRow) -> dict[str, list[float]]:
+    """Return by method the change of every protocol's score against the clean sequence; NaN without a revisit."""
+    return {
+        method: [there.score - here.score for there, here in zip(results, clean.results[method], strict=True)]
+        for method, results in row.results.items()
+    }
+
+
+def stress_table(rows: Sequence[StressRow], *, title: str = "") -> Table:
+    """Return one row per disturbance, one column per method and protocol: the score, and its change against clean."""
+    table = Table("disturbance", title=title)
+    for method, results in rows[0].results.items():
+        for result in results:
+            table.add_column(f"{method}\n{result.name}", justify="right")
+    for row in rows:
+        changes = score_changes(row, rows[0])
+        cells = [
+            format_score(result) if row is rows[0] or np.isnan(change) else f"{format_score(result)} {change:+.3f}"
+            for method, results in row.results.items()
+            for result, change in zip(results, changes[method], strict=True)
+        ]
+        table.add_row(row.name, *cells)
+    return table
+
+
+def stress_json(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
+    """Return plain values for `json.dump`: of every row the results, each with its `change` (null: no revisit)."""
+    return [
+        {
+            "disturbance": row.name,
+            "methods": {
+                method: [
+                    {**result, "change": None if np.isnan(change) else change}
+                    for result, change in zip(to_json(row.results[method]), changes, strict=True)
+                ]
+                for method, changes in score_changes(row, rows[0]).items()
+            },
+        }
+        for row in rows
+    ]
+
+
+def changes_by_kind(rows: Sequence[StressRow]) -> dict[tuple[str, str], dict[str, list[tuple[str, float]]]]:
+    """Return what `figures.stress` draws: by protocol and kind of disturbance, by method, labels and changes."""
+    found: dict[tuple[str, str], dict[str, list[tuple[str, float]]]] = {}
+    for row in rows[1:]:
+        for method, changes in score_changes(row, rows[0]).items():
+            for result, change in zip(row.results[method], changes, strict=True):
+                panel = found.setdefault((result.name, row.kind), {})
+                panel.setdefault(method, []).append((row.label, change))
+    return found

@@ -1,0 +1,98 @@
+"""One town on several days: the same streets, houses and trees, but other parked cars, other traffic, another way.
+
+The days are equal parts of one long drive with a pause between every two. So a place that is seen on two days is one
+place, and all that comes and goes has come and gone.
+"""
+
+import datetime
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from sglpr_jax.sim.drive import RATE_HZ, Trajectory, drive_seed, plan_path
+from sglpr_jax.sim.layouts import to_utime
+from sglpr_jax.sim.sensor import SENSORS, Sensor
+from sglpr_jax.sim.sequence import SimulatedSequence, drive_through
+from sglpr_jax.sim.world import World, build_world
+
+PAUSE_S = 1800.0
+"""Between two days, on the town's clock: three times as long as a car stays parked on average."""
+START_H = 12
+"""Every session starts at noon, UTC."""
+
+
+class Session(NamedTuple):
+    """One day: the scans it will have, and the way to make them."""
+
+    date: str
+    ids: tuple[str, ...]
+    simulate: Callable[[], SimulatedSequence]
+
+
+def plan_sessions(
+    dates: Sequence[str],
+    *,
+    route: str = "00",
+    scans: int = 300,
+    sensor: Sensor = SENSORS["hdl32e-nclt"],
+    seed: int = 0,
+    rate_hz: float = RATE_HZ,
+) -> tuple[Session, ...]:
+    """Return a session of `scans` scans for each of `dates`; the town is built when the first of them is simulated.
+
+    The first session drives `route`, the others the same streets in another order, partly in the opposite direction.
+    Times are seconds since 1970, ids the same in microseconds, as in NCLT.
+
+    Raises ValueError for an unknown route, and for what is no date or is named twice.
+    """
+    starts = [_start_of(date) for date in dates]
+    if len(set(dates)) < max(len(dates), 1) or scans < 2:
+        raise ValueError(f"expected different dates and 2 scans or more, found {', '.join(dates) or 'none'}; {scans}")
+    seeds = drive_seed(seed, f"sessions {route}")
+    path = _with_pauses(
+        plan_path(np.random.default_rng((*seeds, 1)), route, scans=scans, rate_hz=rate_hz, days=len(dates)), len(dates)
+    )
+    days = np.split(np.arange(0, len(path.times), len(path.times) // (scans * len(dates))), len(dates))
+    town = functools.cache(lambda: build_world(seeds, path.xy, path.times))
+    return tuple(
+        _session(date, start, path, rows, town, sensor, (*seeds, day))
+        for day, (date, start, rows) in enumerate(zip(dates, starts, days, strict=True))
+    )
+
+
+def _session(
+    date: str,
+    start_s: float,
+    path: Trajectory,
+    rows: np.ndarray,
+    town: Callable[[], World],
+    sensor: Sensor,
+    seeds: tuple[int, int, int],
+) -> Session:
+    times = start_s + path.times[rows] - path.times[rows[0]]
+    ids = tuple(str(to_utime(time)) for time in times.tolist())
+
+    def simulate() -> SimulatedSequence:
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seeds[0]), seeds[1]), seeds[2])
+        rng = np.random.default_rng((*seeds, 2))
+        return drive_through(town(), path, rows, name=date, ids=ids, times=times, sensor=sensor, key=key, rng=rng)
+
+    return Session(date, ids, simulate)
+
+
+def _with_pauses(path: Trajectory, days: int) -> Trajectory:
+    """The same way with PAUSE_S between every two of `days` equal parts."""
+    day = np.arange(len(path.times)) * days // len(path.times)
+    return path._replace(times=path.times + PAUSE_S * day)
+
+
+def _start_of(date: str) -> float:
+    """Return when a session starts, in seconds since 1970; ValueError for what is no date."""
+    try:
+        day = datetime.datetime.strptime(date, "%Y-%m-%d")
+    except ValueError as error:
+        raise ValueError(f"expected dates such as 2012-01-15, found {date!r}") from error
+    return day.replace(hour=START_H, tzinfo=datetime.UTC).timestamp()

@@ -1,0 +1,138 @@
+"""bin/reproduce: leave-one-out runs on the small town, and the tables and figures made of them."""
+
+import json
+
+import pytest
+
+from sglpr_jax.cli.presets import load_preset
+from sglpr_jax.cli.reproduction.experiments import EXPERIMENTS, VARIANTS, variant_config
+from sglpr_jax.cli.reproduction.scores import published_rows
+from sglpr_jax.cli.reproduction.tables import OURS, PUBLISHED, Row, as_json, markdown
+from sglpr_jax.evaluation.published import KITTI, TABLES
+from sglpr_jax.sim.dataset import write_sessions
+from sglpr_jax.train.metrics_log import read_metrics
+
+from .conftest import SENSOR, assert_one_line_error
+
+DAYS = ("2012-01-15", "2012-02-04")
+WANTED = ("table1", "table2", "table3", "table5", "figure5", "figure6", "figure7", "figure8")
+OPTIONS = ("--seqs", "08", "--baselines", "polar-fft", "ssc")
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    return write_sessions(tmp_path_factory.mktemp("data") / "days", dates=DAYS, scans=12, sensor=SENSOR)
+
+
+@pytest.fixture(scope="module")
+def reproduced(town, preset, sessions, tmp_path_factory):
+    from .conftest import run_command
+
+    folder = tmp_path_factory.mktemp("reproduced")
+    options = ("--data", town, "--nclt", sessions, "--preset", preset, "--out", folder, *OPTIONS)
+    ended = run_command("reproduce", *WANTED, *options)
+    assert ended.status == 0, ended.error
+    return folder, ended, options
+
+
+def test_the_plan_says_what_is_trained_and_only_that_is(reproduced):
+    folder, ended, _ = reproduced
+    assert "3 leave-one-out runs of 4 steps, 0 of them there already" in ended.error
+    assert "s a step" in ended.error and "run 3 of 3" in ended.error
+    assert {path.parent.parent.name for path in folder.glob("*/08/trained.json")} == {"full", "no-turning", "no-segmentation"}
+
+
+def test_tables_have_ours_and_the_papers_rows(reproduced):
+    folder, ended, _ = reproduced
+    table = json.loads((folder / "table5.json").read_text())
+    assert [(row["method"], row["source"]) for row in table] == [
+        ("without", OURS),
+        ("with", OURS),
+        ("without semantic segmentation", PUBLISHED),
+        ("with semantic segmentation", PUBLISHED),
+    ]
+    assert [row["scores"]["08"] for row in table[2:]] == [0.785, 0.898]
+    for row in table[:2]:
+        assert 0 <= row["scores"]["08"] <= 1 and row["mean"] == row["scores"]["08"]
+    assert "without semantic segmentation" in ended.out and "| with | here |" in (folder / "table5.md").read_text()
+
+
+def test_table_1_stands_beside_methods_without_training_and_table_2_says_what_turning_costs(reproduced):
+    folder, _, _ = reproduced
+    raw, turned = (json.loads((folder / f"table{n}.json").read_text()) for n in (1, 2))
+    ours = {row["method"]: row for row in raw if row["source"] == OURS}
+    assert set(ours) == {"SG-LPR", "polar-fft", "ssc"}
+    for row in turned:
+        if row["source"] == OURS and row["method"] in ours:
+            assert row["change"] == pytest.approx(row["mean"] - ours[row["method"]]["mean"])
+        elif row["source"] == PUBLISHED:
+            assert row["change"] is None
+
+
+def test_table_3_asks_the_later_sessions_and_leaves_out_what_needs_labels(reproduced):
+    folder, _, _ = reproduced
+    table = json.loads((folder / "table3.json").read_text())
+    assert [row["method"] for row in table if row["source"] == OURS] == ["SG-LPR", "polar-fft"]
+    assert all(set(row["scores"]) == {DAYS[1]} for row in table)
+    assert next(row for row in table if row["method"] == "BEVPlace++")["scores"][DAYS[1]] == 0.953
+
+
+def test_figures_are_pictures_of_the_drives_and_sessions(reproduced):
+    folder, ended, _ = reproduced
+    wanted = {"figure5-08", "figure6-08", "figure7-08", "figure8-08", f"figure8-{DAYS[1]}"}
+    assert {path.stem for path in folder.glob("figure*.png")} == wanted
+    for name in wanted:
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG") and f"{name}.png" in ended.out
+
+
+def test_what_is_there_is_used_again(reproduced, command):
+    folder, _, options = reproduced
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/*/weights/*")}
+    again = command("reproduce", "table5", *options)
+    assert again.status == 0 and "2 leave-one-out runs of 4 steps, 2 of them there already" in again.error
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*/weights/*")} == before
+
+
+def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
+    folder, _, options = reproduced
+    other = command("reproduce", "table5", *options, "--optimizer.learning-rate", "0.5")
+    assert_one_line_error(other, "no-segmentation", "config.optimizer.learning_rate")
+    assert_one_line_error(command("reproduce", "table5", *options, "--steps", 2), "up to 2 steps, found 4")
+    more = command("reproduce", "table5", *options, "--steps", 6, "--plan")
+    assert more.status == 0 and "0 of them there already" in more.error
+    assert read_metrics(folder / "full" / "08" / "metrics.jsonl")[-1]["step"] == 4  # only said, not done
+
+
+def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, tmp_path, command):
+    def refused(*arguments):
+        return command("reproduce", *arguments, "--preset", preset, "--out", tmp_path / "out")
+
+    assert_one_line_error(refused("--data", town), "expected tables or figures", "table1")
+    assert_one_line_error(refused("table1", "--data", town, "--baselines", "bow"), "'bow'", "scan-context")
+    assert_one_line_error(refused("table1", "--data", town, "--seqs", "99"), "99")
+    assert_one_line_error(refused("table1", "--data", images, "--baselines", "m2dp"), "m2dp needs points", "00")
+    assert_one_line_error(refused("table5", "--data", images), "table5 is about semantics", "expected labels")
+    assert refused("table9", "--data", town).status == 2
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("preset_name", ["small", "paper"])
+def test_every_variant_differs_from_the_preset_and_from_every_other(preset_name):
+    config = load_preset(preset_name)
+    configs = {name: variant_config(config, name) for name in VARIANTS}
+    assert configs["full"] == config and len(set(configs.values())) == len(VARIANTS)
+
+
+def test_every_table_of_the_paper_has_its_rows_here_in_the_same_order():
+    for table in TABLES[3:]:
+        assert len(EXPERIMENTS[f"table{table.number}"].variants) == len(table.rows)
+        assert [row.scores["08"] for row in published_rows(f"table{table.number}", KITTI)] == [
+            row.scores[-1] for row in table.rows
+        ]
+    assert published_rows("table1", ["town"]) == []
+
+
+def test_a_mean_needs_every_column():
+    rows = [Row("whole", OURS, {"00": 0.5, "08": 0.75}), Row("part", OURS, {"00": 0.5, "08": None})]
+    assert [row["mean"] for row in as_json(rows, ("00", "08"))] == [0.625, None]
+    assert "| part | here | 0.500 |  |  |" in markdown("title", rows, ("00", "08"), caption="")
