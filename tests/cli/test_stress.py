@@ -122,7 +122,7 @@ def test_a_drive_that_never_comes_back_has_nothing_to_lose(stress, images):
     assert not (out / "results.json").exists()
 
 
-def test_wrong_names_are_refused_before_any_work(stress, rings, town, tmp_path):
+def test_wrong_names_are_refused_before_any_work(stress, rings, tmp_path):
     options = ("--data", rings, "--method", "solid")
     assert_one_line_error(stress(*options, "--only", "beams-61")[0], "no disturbance 'beams-61'", "mean 'beams-16'")
     assert_one_line_error(stress(*options, "--protocols", "top1")[0], "no protocol 'top1'", "mean 'top1-f1max'")

@@ -162,6 +162,15 @@ def test_a_kind_stands_for_all_its_strengths():
     ]
 
 
+@pytest.mark.parametrize(
+    ("kind", "strength"),
+    [("beams", 0.0), ("dropout", 1.5), ("occlusion", 361.0), ("noise", -0.1), ("offset", float("nan"))],
+)
+def test_a_strength_that_cannot_be_is_refused(kind, strength):
+    with pytest.raises(ValueError, match=f"expected {kind} of a strength from . to .*, found {strength:g}"):
+        Disturbance(kind, strength)
+
+
 @pytest.mark.parametrize(("name", "nearest"), [("beams-64", "beams-16"), ("rotatoin", "rotation"), ("noize", "noise")])
 def test_an_unknown_name_gets_the_nearest(name, nearest):
     with pytest.raises(ValueError, match=f"no disturbance '{name}'; did you mean '{nearest}.*There are rotation, occ"):
