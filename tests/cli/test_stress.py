@@ -90,6 +90,7 @@ def test_descriptors_of_other_settings_are_never_taken(stress, rings, trained, r
     _, out = stress(*options, "--data", rings)
     ended, _ = stress(*options, "--data", rings, "--seed", 1)
     assert_one_line_error(ended, out / "descriptors" / "dropout-0.5-solid.npz", "seed 1, found 0", "--out")
+    assert json.loads((out / "config.json").read_text())["seed"] == 0, "as the results beside it"
 
     thinner = tmp_path / "thinner"
     shutil.copytree(rings, thinner)
