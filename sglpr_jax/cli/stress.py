@@ -70,11 +70,11 @@ def stress_test(command: StressCommand) -> Path:
     disturbances = _fitting(sequence, command.only, command.seed)
     methods = _methods(command, sequence)
     (command.out / "descriptors").mkdir(parents=True, exist_ok=True)
-    write_json(command.out / "config.json", _config(command, sequence, protocols, disturbances, methods))
     rows = [
         _row(command, sequence, disturbance, methods, protocols, progress=f"{i + 1}/{len(disturbances) + 1}")
         for i, disturbance in enumerate((CLEAN, *disturbances))
     ]
+    write_json(command.out / "config.json", _config(command, sequence, protocols, disturbances, methods))
     _write(command.out, rows, title=f"sequence {sequence.name}, {len(sequence)} scans")
     return command.out
 

@@ -15,14 +15,23 @@ from sglpr_jax.data.rings import keep_rings, ring_numbers
 
 Kind = Literal["clean", "rotation", "occlusion", "beams", "noise", "dropout", "offset"]
 _UNITS = {"occlusion": "°", "noise": " m", "offset": " m"}
+_LIMITS = {"occlusion": (0, 360), "beams": (1, np.inf), "dropout": (0, 1)}
 
 
 @dataclasses.dataclass(frozen=True)
 class Disturbance:
-    """What happens to every scan of a sequence, and how much of it; see `disturb` for the meaning of `strength`."""
+    """What happens to every scan of a sequence, and how much of it; see `disturb` for the meaning of `strength`.
+
+    Raises ValueError for a strength that the kind cannot have.
+    """
 
     kind: Kind
     strength: float = 0.0
+
+    def __post_init__(self):
+        low, high = _LIMITS.get(self.kind, (0, np.inf))
+        if not low <= self.strength <= high:
+            raise ValueError(f"expected {self.kind} of a strength from {low:g} to {high:g}, found {self.strength:g}")
 
     @property
     def name(self) -> str:

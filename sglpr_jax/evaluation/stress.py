@@ -40,12 +40,16 @@ def stress_table(rows: Sequence[StressRow], *, title: str = "") -> Table:
     for row in rows:
         changes = score_changes(row, rows[0])
         cells = [
-            format_score(result) if row is rows[0] or np.isnan(change) else f"{format_score(result)} {change:+.3f}"
+            format_score(result) if row is rows[0] or np.isnan(change) else f"{format_score(result)} {_signed(change)}"
             for method, results in row.results.items()
             for result, change in zip(results, changes[method], strict=True)
         ]
         table.add_row(row.name, *cells)
     return table
+
+
+def _signed(change: float) -> str:
+    return f"{round(change, 3) + 0.0:+.3f}"  # + 0.0: a loss that rounds to none is no minus zero
 
 
 def stress_json(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
