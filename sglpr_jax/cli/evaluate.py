@@ -17,7 +17,14 @@ from sglpr_jax.evaluation.inputs import Input
 from sglpr_jax.evaluation.inputs.choice import check_names
 from sglpr_jax.evaluation.page import Evaluation, Pictures, can_draw, draw_curves, draw_trajectory, page
 from sglpr_jax.evaluation.protocols import ScoredPairs, TopK
-from sglpr_jax.evaluation.report import comparison, published_rows, published_table, table, to_json
+from sglpr_jax.evaluation.report import (
+    PUBLISHED_NOTE,
+    comparison,
+    published_rows,
+    published_table,
+    table,
+    to_json,
+)
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 PAGE = "report.html"
@@ -96,6 +103,7 @@ def evaluate_file(command: EvaluateCommand) -> Path:
         console().print(comparison(found.methods))
     if found.published:
         console().print(published_table(found.published))
+        console().print(PUBLISHED_NOTE, soft_wrap=True)
     pictures = Pictures() if sequence is None else take_pictures(sequence, params, source, found.worst)
     folder = command.out or _folder(command.file)
     _write(folder, found, pictures, _as_json(found, source, command.file))

@@ -1,5 +1,6 @@
 """bin/evaluate with --database: one session is the map, the others ask."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from sglpr_jax.evaluation.inputs.own_file import read_own_file
 from sglpr_jax.evaluation.page.across_sessions import sessions_page
 from sglpr_jax.evaluation.report import table, to_json
 from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, AcrossSessions, evaluate_sessions, mean_score
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
 def evaluate_session_files(
@@ -34,14 +36,14 @@ def evaluate_session_files(
     return folder
 
 
-def _read(path: Path):
+def _read(path: Path) -> DescriptorFile:
     if path.suffix != ".npz":
         raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
     return read_own_file(path, None)
 
 
 def _print(found: AcrossSessions, title: str, published: bool) -> None:
-    rows = Table(*found.columns, title=title, caption=PUBLISHED_NOTE if published else None)
+    rows = Table(*found.columns, title=title)
     for row in found.rows():
         rows.add_row(*row)
     if published:
@@ -50,13 +52,22 @@ def _print(found: AcrossSessions, title: str, published: bool) -> None:
             rows.add_row(*row)
     console().print(table([result for of_one in found.protocols.values() for result in of_one]))
     console().print(rows)
+    if published:
+        console().print(PUBLISHED_NOTE, soft_wrap=True)
 
 
 def _as_json(found: AcrossSessions, files: Sequence[Path], database: Path, published: bool) -> dict[str, Any]:
     results = {
-        name: {"mean": mean_score(of_one), "sessions": dict(zip(found.sessions, to_json(of_one), strict=True))}
+        name: {
+            "mean": _or_null(mean_score(of_one)),
+            "sessions": dict(zip(found.sessions, to_json(of_one), strict=True)),
+        }
         for name, of_one in found.protocols.items()
     }
     beside = {"published": {"about": PUBLISHED_NOTE, "columns": found.columns, "rows": found.published_rows()}}
     about = {"files": [str(path) for path in files], "database": str(database), "map": found.map_session}
     return {**about, "results": results, **(beside if published else {})}
+
+
+def _or_null(score: float) -> float | None:
+    return None if math.isnan(score) else score

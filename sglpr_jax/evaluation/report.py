@@ -64,8 +64,8 @@ def published_rows(sequence: str) -> list[tuple[str, ...]]:
 
 
 def published_table(rows: Sequence[tuple[str, ...]]) -> Table:
-    """Return `published_rows` as a table of its own, with the note that they need."""
-    table = Table(*PUBLISHED_COLUMNS, caption=PUBLISHED_NOTE)
+    """Return `published_rows` as a table of its own; `PUBLISHED_NOTE` belongs below it."""
+    table = Table(*PUBLISHED_COLUMNS)
     for row in rows:
         table.add_row(*row)
     return table
