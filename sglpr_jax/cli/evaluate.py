@@ -1,4 +1,4 @@
-"""bin/evaluate: score what any method says of a sequence under chosen protocols."""
+"""bin/evaluate: score what any method says of a sequence, or of several sessions, under chosen protocols."""
 
 import dataclasses
 import sys
@@ -8,6 +8,7 @@ from typing import Any
 import tyro
 
 from sglpr_jax.cli.evaluate_inputs import PoseOptions, open_dataset, read_methods, score
+from sglpr_jax.cli.evaluate_sessions import evaluate_session_files
 from sglpr_jax.cli.page_pictures import take_pictures
 from sglpr_jax.cli.runtime import console, run, write_json, write_text
 from sglpr_jax.data.trajectory import PoseFormat
@@ -16,7 +17,14 @@ from sglpr_jax.evaluation.inputs import Input
 from sglpr_jax.evaluation.inputs.choice import check_names
 from sglpr_jax.evaluation.page import Evaluation, Pictures, can_draw, draw_curves, draw_trajectory, page
 from sglpr_jax.evaluation.protocols import ScoredPairs, TopK
-from sglpr_jax.evaluation.report import comparison, table, to_json
+from sglpr_jax.evaluation.report import (
+    PUBLISHED_NOTE,
+    comparison,
+    published_rows,
+    published_table,
+    table,
+    to_json,
+)
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 PAGE = "report.html"
@@ -34,10 +42,18 @@ class EvaluateCommand:
       bin/evaluate 08.npz
       bin/evaluate mine.npy --poses poses/08.txt --pose-format kitti --times times.txt --distance cosine
       bin/evaluate mine.npy --data KITTI --seq 08 --protocols all --compare 08.npz
+      bin/evaluate 2012-02-04.npz 2012-03-17.npz --database 2012-01-15.npz --published
     """
 
     file: tyro.conf.Positional[Path]
     """Descriptors, a top-k list or scored pairs."""
+    more: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """With --database: descriptor files of further sessions; the table then has a column for each."""
+    database: Path | None = None
+    """The descriptor file of the session that is the map: the others ask it, by the protocols across sessions
+    (bevplace-nclt-recall, pointnetvlad-recall)."""
+    published: bool = False
+    """Print the paper's numbers as well, marked as published: those of table 1 for the sequence, or of table 3."""
     out: Path | None = None
     """Folder for results.json, report.html and the pictures. None: FILE without its ending."""
     poses: Path | None = None
@@ -62,6 +78,13 @@ class EvaluateCommand:
 
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Do what the command says; returns the folder written."""
+    if command.database is not None:
+        return _evaluate_sessions(command, command.database)
+    if command.more:
+        raise ValueError(
+            f"expected --database beside several files, found {command.more[0]} without; methods to stand "
+            "beside FILE are given by --compare"
+        )
     check_names(command.protocols)
     sequence, params = open_dataset(command.data, command.seq, command.weights)
     poses = PoseOptions(command.poses, command.pose_format, command.times)
@@ -73,14 +96,34 @@ def evaluate_file(command: EvaluateCommand) -> Path:
         about=_about(source, command.file),
         methods=score(inputs, command.protocols),
         positions=source.positions,
+        published=published_rows(_sequence_of(source)) if command.published else (),
     )
     console().print(table(found.results, title=found.title))
     if len(found.methods) > 1:
         console().print(comparison(found.methods))
+    if found.published:
+        console().print(published_table(found.published))
+        console().print(PUBLISHED_NOTE, soft_wrap=True)
     pictures = Pictures() if sequence is None else take_pictures(sequence, params, source, found.worst)
     folder = command.out or _folder(command.file)
     _write(folder, found, pictures, _as_json(found, source, command.file))
     return folder
+
+
+def _evaluate_sessions(command: EvaluateCommand, database: Path) -> Path:
+    """Ask one session about the others; ValueError for options that say nothing there."""
+    silent = ("poses", "times", "distance", "compare", "data", "seq", "weights")
+    given = [name for name in silent if getattr(command, name)]
+    if given:
+        raise ValueError(f"expected descriptor files alone beside --database, found --{given[0]}")
+    return evaluate_session_files(
+        (command.file, *command.more),
+        database,
+        protocols=command.protocols,
+        published=command.published,
+        folder=command.out or _folder(command.file),
+        page=PAGE,
+    )
 
 
 def _write(folder: Path, found: Evaluation, pictures: Pictures, numbers: dict[str, Any]) -> None:
@@ -111,6 +154,10 @@ def _title(source: Input, file: Path) -> str:
     return f"sequence {source.sequence}, {len(source)} scans"
 
 
+def _sequence_of(source: Input) -> str:
+    return "scored pairs" if isinstance(source, ScoredPairs) else source.sequence
+
+
 def _about(source: Input, file: Path) -> str:
     """Say what the file holds and how it is compared."""
     if isinstance(source, ScoredPairs):
@@ -126,7 +173,13 @@ def _as_json(found: Evaluation, source: Input, file: Path) -> dict[str, Any]:
         about |= {"config": source.config, "weights_hash": source.weights_hash, "distance": source.distance}
     others = {name: to_json(results) for name, results in list(found.methods.items())[1:]}
     worst = [dataclasses.asdict(mistake) for mistake in found.worst]
-    return {**about, "results": to_json(found.results), "false_positives": worst, "compared": others}
+    return {
+        **about,
+        "results": to_json(found.results),
+        "false_positives": worst,
+        "compared": others,
+        "published": found.published,
+    }
 
 
 def main() -> None:

@@ -10,8 +10,14 @@ from rich.table import Table
 from sglpr_jax.evaluation.inputs import Input
 from sglpr_jax.evaluation.inputs.choice import protocols_of
 from sglpr_jax.evaluation.protocols import HEADLINES, Result, protocol_named
+from sglpr_jax.evaluation.published import LEARNED, TABLE_1
 
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
+PUBLISHED_COLUMNS = ("method", "published F1max", "numbers from")
+PUBLISHED_NOTE = (
+    f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
+    "protocol: those of RINet's paper are pairs-f1max, the others top1-f1max as far as is known."
+)
 
 
 def evaluate(source: Input, protocols: Sequence[str] = HEADLINES) -> list[Result]:
@@ -46,6 +52,23 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
     for method, results in methods.items():
         rows.add_row(method, *map(format_score, results))
     return rows
+
+
+def published_rows(sequence: str) -> list[tuple[str, ...]]:
+    """Return what table 1 of the paper has for a KITTI sequence, of the learned methods; ValueError where nothing."""
+    if sequence not in TABLE_1.columns:
+        raise ValueError(f"expected a sequence with published numbers, {', '.join(TABLE_1.columns)}, found {sequence}")
+    sources = {row.method: row.source for row in TABLE_1.rows}
+    scores = TABLE_1.column(sequence, kind=LEARNED)
+    return [(method, f"{score:.3f}", sources[method]) for method, score in scores.items()]
+
+
+def published_table(rows: Sequence[tuple[str, ...]]) -> Table:
+    """Return `published_rows` as a table of its own; `PUBLISHED_NOTE` belongs below it."""
+    table = Table(*PUBLISHED_COLUMNS)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def format_score(result: Result) -> str:

@@ -49,7 +49,9 @@ def test_a_pose_file_and_another_sensor(command, tmp_path):
 def test_wrong_input_is_refused_before_anything_is_written(command, tmp_path):
     out = ("--out", tmp_path / "town")
     assert_one_line_error(command("simulate", *out, "--seq", "11"), "00, 01,", "'11'")
-    assert_one_line_error(command("simulate", *out, "--sensor", "hdl16"), "hdl64e, hdl32e, vlp16", "'hdl16'")
+    assert_one_line_error(
+        command("simulate", *out, "--sensor", "hdl16"), "hdl64e, hdl32e, hdl32e-nclt, vlp16", "'hdl16'"
+    )
     (tmp_path / "bad.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4 + "1 0 0 nan 0 1 0 0 0 0 1 0\n")
     ended = command("simulate", *out, "--along", tmp_path / "bad.txt")
     assert_one_line_error(ended, "bad.txt, line 5", "expected finite numbers", "nan")

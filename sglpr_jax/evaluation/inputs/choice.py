@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 
 from sglpr_jax.evaluation.protocols import (
+    CROSS_SESSION_PROTOCOLS,
     HEADLINES,
     PROTOCOLS,
     TOP_K_PROTOCOLS,
@@ -30,8 +31,10 @@ def protocols_of(source: Source | ScoredPairs) -> Mapping[str, Callable[..., Res
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise ValueError, with the nearest name, unless all are protocols or `all`."""
+    """Raise ValueError, with the nearest name, unless all are protocols of one sequence or `all`."""
     for name in names:
+        if name in CROSS_SESSION_PROTOCOLS:
+            raise ValueError(f"expected --database, the map, for protocol {name}; found none")
         if name != ALL:
             protocol_named(name, PROTOCOLS | LISTED_PAIRS)
 

@@ -16,6 +16,8 @@ def page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictu
     parts = [sections.results_section(found.results)]
     if len(found.methods) > 1:
         parts.append(sections.comparison_section(found.methods))
+    if found.published:
+        parts.append(sections.published_section(found.published))
     parts += [
         sections.curves_section(curves, drawn=drawn),
         sections.trajectory_section(trajectory, drawn=drawn),

@@ -21,6 +21,8 @@ class Evaluation:
     """By the name of the method; the first is the one in question."""
     positions: np.ndarray | None
     """(n, 3) float64, metres, z up; None where pairs came with labels alone."""
+    published: Sequence[tuple[str, ...]] = ()
+    """`report.published_rows` of the sequence, where they were asked for."""
 
     @property
     def results(self) -> Sequence[Result]:

@@ -11,7 +11,7 @@ from sglpr_jax.evaluation.page.document import Section, bev_html, figure_html, h
 from sglpr_jax.evaluation.page.pictures import HeatPicture, SemanticPicture
 from sglpr_jax.evaluation.page.plots import Plots
 from sglpr_jax.evaluation.protocols import Result
-from sglpr_jax.evaluation.report import COLUMNS, cells, format_score
+from sglpr_jax.evaluation.report import COLUMNS, PUBLISHED_COLUMNS, PUBLISHED_NOTE, cells, format_score
 
 NO_MATPLOTLIB = "Drawings: install the extra viz (pip install 'sglpr-jax[viz]')."
 INTERVALS = (
@@ -32,6 +32,12 @@ def comparison_section(methods: Mapping[str, Sequence[Result]]) -> Section:
     of_each = zip(*methods.values(), strict=True)
     rows = [(results[0].name, *map(format_score, results)) for results in of_each]
     return Section("Methods side by side", html_table(("protocol", *methods), rows, numbers=list(methods)))
+
+
+def published_section(rows: Sequence[tuple[str, ...]]) -> Section:
+    """Table 1's numbers for the sequence, apart from ours: they come from real KITTI and from several protocols."""
+    table = html_table(PUBLISHED_COLUMNS, rows, numbers=PUBLISHED_COLUMNS[1:2])
+    return Section("Published numbers", f"{table}\n<p class='about'>{escape(PUBLISHED_NOTE)}</p>")
 
 
 def curves_section(plots: Plots, *, drawn: bool) -> Section:

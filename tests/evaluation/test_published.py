@@ -1,0 +1,73 @@
+"""The paper's tables: whole, consistent with each other, and with means as printed."""
+
+import re
+
+import numpy as np
+import pytest
+
+from sglpr_jax.evaluation import published
+from sglpr_jax.evaluation.published import KITTI, LEARNED, NCLT, TABLE_1, TABLE_2, TABLE_3, TABLES
+
+ROUNDING = 0.0005 + 1e-9
+ODD_MEANS = {(1, "SC_LPR"): 0.8533, (2, "SC_LPR"): 0.8533}
+"""Rows whose printed mean is another one; see the module's docstring."""
+NAMES = {"SC": "Scan Context", "LI": "LiDAR Iris", "PNV": "PointNetVLAD", "OT": "OverlapTransformer"}
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: f"table {table.number}")
+def test_every_row_is_whole_and_its_mean_as_printed(table):
+    assert table.columns == (NCLT if table.number == 3 else KITTI)
+    for row in table.rows:
+        assert len(row.scores) == len(table.columns) and 0 <= min(row.scores) <= max(row.scores) <= 1
+        expected = ODD_MEANS.get((table.number, row.method), row.mean)
+        assert abs(np.mean(row.scores) - expected) <= 2 * ROUNDING, row  # the scores are rounded, too
+    assert len({row.method for row in table.rows}) == len(table.rows)
+
+
+def test_the_odd_means_are_odd():
+    means = {(table.number, row.method): (row.mean, np.mean(row.scores)) for table in TABLES for row in table.rows}
+    odd = {name for name, (printed, mean) in means.items() if abs(printed - mean) > 2 * ROUNDING}
+    assert odd == set(ODD_MEANS)
+
+
+def test_the_complete_model_has_one_row_in_all_ablations():
+    ours = {row.method: row for row in TABLE_1.rows}["SG-LPR"]
+    assert [len(table.rows) for table in TABLES] == [14, 12, 8, 3, 2, 4, 4]
+    for table in TABLES[3:]:
+        assert (table.rows[-1].scores, table.rows[-1].mean) == (ours.scores, ours.mean)
+    without = TABLES[4].rows[0].scores
+    assert without == TABLES[6].rows[0].scores  # no segmentation branch: the triplet loss alone
+
+
+def test_a_column_is_one_sequence_of_all_methods_or_of_one_kind():
+    assert TABLE_1.column("08")["DiSCO"] == 0.903 and len(TABLE_1.column("08")) == 14
+    learned = TABLE_1.column("08", kind=LEARNED)
+    assert set(TABLE_1.column("08")) - set(learned) == {"M2DP", "Scan Context", "LiDAR Iris", "SSC"}
+    assert TABLE_3.column("2013-02-23")["SG-LPR"] == 0.913
+    assert TABLE_1.column("01") == {}
+
+
+def test_the_sources_are_those_that_the_paper_names():
+    of = {row.method: row.source for row in TABLE_1.rows}
+    from_rinet = {method for method, source in of.items() if source == published.RINET}
+    assert from_rinet == {"M2DP", "Scan Context", "LiDAR Iris", "PointNetVLAD", "SSC", "SGPR", "RINet"}
+    assert {method for method, source in of.items() if source == published.OWN_RUN} == {
+        "OverlapTransformer", "BEVPlace", "SG-LPR",
+    }  # fmt: skip
+    assert {row.method for row in TABLE_2.rows if row.source != published.RINET} == {"BEVPlace", "SG-LPR"}
+
+
+def test_the_numbers_are_the_papers(shared):
+    """Every row's seven numbers, in this order, stand in one line of the paper's text, and there are no others."""
+    text = (shared / "paper/sg-lpr.md").read_text()
+    printed = []
+    for line in text[text.index("\nTable 1.") :].splitlines():
+        cells = re.sub(r"</?u>", "", line).split("\t")
+        numbers = [float(cell) for cell in cells if re.fullmatch(r"[01]\.\d{3}", cell)]
+        if len(numbers) >= 7:
+            printed.append(tuple(numbers[:7]))
+    assert printed == [(*row.scores, row.mean) for table in TABLES for row in table.rows]
+    for row in TABLE_1.rows:
+        short = next((s for s, name in NAMES.items() if name == row.method), row.method)
+        scores = r"\t".join(f"{score:.3f}" for score in row.scores)
+        assert re.search(rf"\t{short} ?[\[(].*?\t{scores}", re.sub(r"</?u>", "", text)), row

@@ -1,0 +1,95 @@
+"""One map, many sessions: the columns are the protocols' own scores, and every wrong set of files is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sglpr_jax.evaluation.page.across_sessions import sessions_page
+from sglpr_jax.evaluation.protocols import bevplace_nclt_recall, pointnetvlad_recall
+from sglpr_jax.evaluation.published import NCLT, TABLE_3
+from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, check_one_world, evaluate_sessions
+
+MAP = "2012-01-15"
+
+
+@pytest.fixture
+def session(make_file):
+    """Return a maker of sessions along one street, 10 m to a frame, described by where they are and some noise."""
+
+    def make(name: str, *, noise_m: float = 6.0, offset_m: float = 0.0):
+        rng = np.random.default_rng(len(name) + int(name[5:7]))
+        places = np.stack([10.0 * np.arange(50) + rng.normal(0, 1, 50) + offset_m, np.zeros(50), np.zeros(50)], axis=1)
+        return make_file(places, (places + rng.normal(0, noise_m, (50, 3))) / 100, sequence=name)
+
+    return make
+
+
+def test_columns_are_the_protocols_scores_and_their_mean(session):
+    database, queries = session(MAP), [session(NCLT[0]), session(NCLT[1])]
+    found = evaluate_sessions(database, queries)
+    nclt = [bevplace_nclt_recall(database, file).score for file in queries]
+    runs = [pointnetvlad_recall(database, file).score for file in queries]
+    assert 0 < min(nclt) < 1 and found.columns == ("", NCLT[0], NCLT[1], "mean")
+    assert found.rows() == [
+        ("bevplace-nclt-recall", *(f"{score:.3f}" for score in (*nclt, np.mean(nclt)))),
+        ("pointnetvlad-recall", *(f"{score:.3f}" for score in (*runs, np.mean(runs)))),
+    ]
+
+
+def test_protocols_can_be_chosen(session):
+    files = session(MAP), [session(NCLT[0])]
+    assert list(evaluate_sessions(*files, ["pointnetvlad-recall"]).protocols) == ["pointnetvlad-recall"]
+    assert list(evaluate_sessions(*files, ["all"]).protocols) == ["bevplace-nclt-recall", "pointnetvlad-recall"]
+    with pytest.raises(ValueError, match="no protocol 'nclt'; did you mean 'bevplace-nclt-recall'"):
+        evaluate_sessions(*files, ["nclt"])
+
+
+def test_a_session_without_revisits_says_so_and_is_no_part_of_the_mean(session):
+    near, beside = session(NCLT[0]), session(NCLT[1])
+    beside = dataclasses.replace(beside, positions=np.add(beside.positions, [0, 12, 0]))
+    (row,) = evaluate_sessions(session(MAP), [near, beside], ["bevplace-nclt-recall"]).rows()
+    assert row[2] == "no revisit" and row[1] == row[3] != row[2]
+    (alone,) = evaluate_sessions(session(MAP), [beside], ["bevplace-nclt-recall"]).rows()
+    assert alone[1:] == ("no revisit", "no revisit")
+
+
+def test_published_rows_are_table_3s_in_the_same_columns(session):
+    whole = evaluate_sessions(session(MAP), [session(name) for name in NCLT], ["bevplace-nclt-recall"])
+    assert [row[0] for row in whole.published_rows()] == [f"published: {row.method}" for row in TABLE_3.rows]
+    assert whole.published_rows()[-1][1:] == ("0.947", "0.936", "0.931", "0.916", "0.914", "0.913", "0.926")
+    part = evaluate_sessions(session(MAP), [session(NCLT[5]), session("2013-04-05"), session(NCLT[0])])
+    assert part.published_rows()[-1] == ("published: SG-LPR", "0.913", "", "0.947", "0.930")
+
+
+def test_other_sessions_have_no_published_numbers(session):
+    elsewhere = evaluate_sessions(session(MAP), [session("2013-04-05")])
+    another_map = evaluate_sessions(session(NCLT[0]), [session(NCLT[1])])
+    for found in (elsewhere, another_map):
+        with pytest.raises(ValueError, match=r"expected map 2012-01-15 and queries among 2012-02-04, .* found map"):
+            found.published_rows()
+
+
+def test_the_page_holds_the_table_and_what_it_rests_on(session):
+    found = evaluate_sessions(session(MAP), [session(NCLT[0])])
+    page = sessions_page(found, title="<days>", about="made up", published=True)
+    for words in ("&lt;days&gt;", "bevplace-nclt-recall", NCLT[0], "50 queries", "published: M2DP", "0.632"):
+        assert words in page
+    assert PUBLISHED_NOTE.partition("rule")[0].replace("'", "&#x27;") in page and "real NCLT" in PUBLISHED_NOTE
+    assert "published: M2DP" not in sessions_page(found, title="", about="", published=False)
+
+
+def test_sessions_of_two_worlds_or_named_twice_are_refused(session):
+    database = session(MAP)
+    with pytest.raises(ValueError, match=r"2012-02-04 in the world frame of the map .* no place is in both"):
+        evaluate_sessions(database, [session(NCLT[0], offset_m=2000)])
+    with pytest.raises(ValueError, match=f"expected different sessions, found map {MAP}, queries {MAP}"):
+        evaluate_sessions(database, [database])
+    with pytest.raises(ValueError, match="expected different sessions"):
+        evaluate_sessions(database, [session(NCLT[0]), session(NCLT[0])])
+    with pytest.raises(ValueError, match="expected positions to score sequence 2012-02-04"):
+        evaluate_sessions(database, [dataclasses.replace(session(NCLT[0]), positions=None)])
+
+
+def test_sessions_side_by_side_are_of_one_world(session):
+    check_one_world(session(MAP), session(NCLT[0], offset_m=510))  # the end of one street is the start of the next

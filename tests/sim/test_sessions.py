@@ -1,0 +1,163 @@
+"""One town on several days: streets and houses stay, what moves has moved, and the files are NCLT's."""
+
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from scipy.spatial import KDTree
+
+from sglpr_jax.data import open_sequence
+from sglpr_jax.data.scan_files import read_scan
+from sglpr_jax.labels import CATEGORIES, to_classes
+from sglpr_jax.sim import SENSORS, Sensor, plan_sessions, write_sessions
+from sglpr_jax.sim.drive import plan_path
+from sglpr_jax.sim.layouts import nclt_scan
+from sglpr_jax.sim.routes import ROLES, plan_days
+from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
+
+DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
+TINY = Sensor(elevations_deg=(10.0, 2.0, -1.0, -3.0, -6.0, -10.0, -14.0, -18.0), azimuth_steps=120, height_m=1.0)
+SCANS = 24
+OPTIONS = {"scans": SCANS, "sensor": TINY, "seed": 1, "rate_hz": 0.4}
+
+
+@pytest.fixture(scope="module")
+def days():
+    return [session.simulate() for session in plan_sessions(DAYS, **OPTIONS)]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    return write_sessions(tmp_path_factory.mktemp("days") / "data", dates=DAYS, **OPTIONS)
+
+
+def test_every_day_has_its_scans_named_by_the_time(days):
+    assert [day.name for day in days] == list(DAYS)
+    for date, day in zip(DAYS, days, strict=True):
+        assert day.ids == tuple(str(round(time * 1e6)) for time in day.times) and len(set(day.ids)) == SCANS
+        assert np.datetime64(int(day.ids[0]), "us") == np.datetime64(f"{date}T12:00:00")
+        assert np.all(np.diff(day.times) > 0)
+
+
+def test_most_places_are_seen_again_partly_in_the_opposite_direction():
+    path = plan_path(np.random.default_rng(0), "00", scans=60, rate_hz=1.0, days=3)
+    (first, *others), (yaw, *yaws) = (np.array_split(values, 3) for values in (path.xy, path.yaw))
+    opposite = []
+    for xy, heading in zip(others, yaws, strict=True):
+        apart, nearest = KDTree(first).query(xy)
+        assert np.mean(apart < 5) > 0.5
+        assert np.median(apart) > 0.05  # not the same way again
+        opposite.append(np.cos(heading - yaw[nearest])[apart < 5] < -0.7)
+    assert 0.1 < np.mean(np.concatenate(opposite)) < 0.9
+
+
+def test_houses_stay_and_parked_cars_do_not(days):
+    """Of the ground that each kind covers on the last day, within 2 m squares, how much it covered on the first."""
+    first, last = days[0], days[-1]
+    apart, nearest = KDTree(first.positions[:, :2]).query(last.positions[:, :2])
+    pairs = [(int(nearest[i]), int(i)) for i in np.argsort(apart)[:5]]
+
+    def squares(day, i: int, category: str) -> set[tuple[int, int]]:
+        points = day.points(i)[to_classes(day.labels(i)) == CATEGORIES.index(category)]
+        world = points @ day.drive.world_from_lidar[i, :3, :3].T + day.positions[i]
+        return set(map(tuple, np.floor(world[:, :2] / 2).astype(int).tolist()))
+
+    def stays(category: str) -> float:
+        seen = [(squares(first, i, category), squares(last, j, category)) for i, j in pairs]
+        return sum(len(a & b) for a, b in seen) / sum(len(b) for _, b in seen)
+
+    assert stays("building") > 1.5 * stays("car")
+
+
+def test_days_keep_to_the_streets_of_the_first():
+    for name, role in ROLES.items():
+        walk = plan_days(np.random.default_rng(3), role, blocks=12, days=3)
+        length = len(walk) - 1 - 2 * 12
+        streets = [frozenset(street) for street in pairwise(walk)]
+        assert set(streets[length:]) <= set(streets[:length]), name
+        assert all(abs(a[0] - b[0]) + abs(a[1] - b[1]) == 1 for a, b in pairwise(walk))
+        ways = Counter(pairwise(walk))
+        assert any((b, a) in ways for a, b in ways), name
+
+
+def test_the_vehicle_turns_round_at_roundabouts_never_on_the_spot():
+    path = plan_path(np.random.default_rng(0), "00", scans=60, rate_hz=1.0, days=3)
+    steps = np.linalg.norm(np.diff(path.xy, axis=0), axis=1)
+    turn = np.abs(np.diff(path.yaw)) / np.maximum(steps, 1e-9)
+    assert np.isfinite(path.xy).all() and steps.max() < 3
+    assert turn[steps > 0.05].max() < 1 / 3  # radius of 3 m
+
+
+def test_the_reader_gives_back_the_days(dataset, days):
+    assert not list(dataset.rglob("*.label"))
+    for day in days:
+        on_disk = open_sequence(dataset, day.name)
+        assert on_disk.ids == day.ids and on_disk.pose_source == f"groundtruth_{day.name}.csv"
+        up = day.drive.world_from_lidar[:, :3, 2]
+        np.testing.assert_allclose(on_disk.positions, day.positions - NCLT_HEIGHT_M * up, atol=1e-5)
+        for i in (0, SCANS - 1):
+            lifted = day.points(i) + np.float32([0, 0, NCLT_HEIGHT_M])
+            np.testing.assert_allclose(on_disk.points(i), lifted, atol=0.00251)
+
+
+def test_the_ground_truth_turns_forward_right_down_to_north_east_down(dataset, days):
+    rows = np.loadtxt(dataset / DAYS[1] / f"groundtruth_{DAYS[1]}.csv", delimiter=",")
+    roll, pitch, yaw = rows[:, 4:].T
+    east_of_north = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)], axis=1)
+    forward = days[1].drive.world_from_lidar[:, :3, 0]
+    np.testing.assert_allclose(east_of_north * [1, -1, -1], forward, atol=1e-6)
+    assert np.abs(roll).max() < 0.2  # upright, not upside down
+
+
+@settings(max_examples=30, deadline=None)
+@given(points=arrays.arrays(np.float32, (20, 3), elements=st.floats(-95, 95, width=32)))
+def test_a_scan_comes_back_as_its_rounded_self(tmp_path_factory, points):
+    path = tmp_path_factory.mktemp("scan") / "velodyne_sync" / "1.bin"
+    path.parent.mkdir()
+    (content,) = nclt_scan(np.pad(points, ((0, 0), (0, 1)), constant_values=0.5), np.zeros(20, int))
+    path.write_bytes(content)
+    body = np.add(points.astype(np.float64), [0, 0, NCLT_HEIGHT_M]) * [1, -1, -1]
+    rounded = np.round((body + 100) / 0.005) * 0.005 - 100
+    np.testing.assert_allclose(read_scan(path), rounded * [1, -1, -1], atol=1e-5)
+    np.testing.assert_allclose(read_scan(path) - [0, 0, NCLT_HEIGHT_M], points, atol=0.00251)
+
+
+def test_the_sensor_of_nclt_is_an_hdl32e_turned_over():
+    np.testing.assert_allclose(sorted(SENSORS["hdl32e-nclt"].elevations_deg)[0], -10.67)
+    np.testing.assert_allclose(sorted(SENSORS["hdl32e-nclt"].elevations_deg)[-1], 30.67)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_an_interrupted_run_goes_on(dataset, tmp_path):
+    def interrupt(date: str, done: int, scans: int) -> None:
+        if date == DAYS[1] and done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_sessions(tmp_path / "again", dates=DAYS, **OPTIONS, progress=interrupt)
+    assert not (tmp_path / "again" / DAYS[1] / f"groundtruth_{DAYS[1]}.csv").exists()
+    write_sessions(tmp_path / "again", dates=DAYS, **OPTIONS)
+    files = [path.relative_to(dataset) for path in dataset.rglob("*") if path.is_file()]
+    assert len(files) == 3 * (SCANS + 1) + 1
+    assert all((tmp_path / "again" / file).read_bytes() == (dataset / file).read_bytes() for file in files)
+    with pytest.raises(ValueError, match="belongs to another simulated dataset"):
+        write_sessions(tmp_path / "again", dates=DAYS[:2], **OPTIONS)
+
+
+@pytest.mark.parametrize(
+    "dates, changes, words",
+    [
+        (("2012-01-15", "2012-01-15"), {}, "expected different dates"),
+        ((), {}, "expected different dates .* found none"),
+        (("2012-13-15",), {}, "expected dates such as 2012-01-15, found '2012-13-15'"),
+        (DAYS, {"scans": 1}, "2 scans or more"),
+        (DAYS, {"route": "11"}, "expected a route among 00, .* found '11'"),
+    ],
+)
+def test_what_is_no_day_is_refused(dates, changes, words):
+    with pytest.raises(ValueError, match=words):
+        plan_sessions(dates, **(OPTIONS | changes))
