@@ -62,7 +62,9 @@ class ReproduceCommand:
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     plan: bool = False
     """Only say what would be trained."""
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=TrainConfig)
+    config: Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = dataclasses.field(
+        default_factory=TrainConfig
+    )
 
 
 def parse(arguments: list[str] | None = None) -> ReproduceCommand:

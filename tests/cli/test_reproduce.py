@@ -39,7 +39,11 @@ def test_the_plan_says_what_is_trained_and_only_that_is(reproduced):
     folder, ended, _ = reproduced
     assert "3 leave-one-out runs of 4 steps, 0 of them there already" in ended.error
     assert "s a step" in ended.error and "run 3 of 3" in ended.error
-    assert {path.parent.parent.name for path in folder.glob("*/08/trained.json")} == {"full", "no-turning", "no-segmentation"}
+    assert {path.parent.parent.name for path in folder.glob("*/08/trained.json")} == {
+        "full",
+        "no-turning",
+        "no-segmentation",
+    }
 
 
 def test_tables_have_ours_and_the_papers_rows(reproduced):
