@@ -24,7 +24,7 @@ class EmbedCommand:
     """
 
     data: Path
-    """A dataset (KITTI's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
     out: Path
     """The descriptor file to write (.npz)."""
     weights: Path | None = None
@@ -32,7 +32,7 @@ class EmbedCommand:
     method: MethodName = "sglpr"
     """The network, or a reference that needs no weights; scan-context to solid need points, ssc labels too."""
     seq: str | None = None
-    """Which sequence; may be left out where there is only one."""
+    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
     poses: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
