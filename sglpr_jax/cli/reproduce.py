@@ -25,7 +25,7 @@ from sglpr_jax.train.config import TrainConfig
 
 What = Literal[
     "all", "table1", "table2", "table3", "table4", "table5", "table6", "table7",
-    "figure5", "figure6", "figure7", "figure8", "figure9",
+    "figure5", "figure6", "figure7", "figure8", "figure9", "normalisation",
 ]  # fmt: skip
 PUBLISHED_NOTE = "published: the paper's numbers, on the real {}"
 PAPER_SEQUENCES = ("00", "02", "05", "06", "07", "08")
@@ -90,7 +90,7 @@ def reproduce(command: ReproduceCommand) -> Path:
     command.out.mkdir(parents=True, exist_ok=True)
     write_json(command.out / "config.json", json.loads(json.dumps(dataclasses.asdict(command), default=str)))
     for name in names:
-        make = _make_table if name.startswith("table") else _make_pictures
+        make = _make_pictures if name.startswith("figure") else _make_table
         make(name, command, runs, seqs)
     return command.out
 

@@ -31,6 +31,8 @@ VARIANTS: dict[str, Variant] = {
     "counts-and-labels": Variant("RB+RS: counts and labels", {"model.head.input": "counts+labels"}),
     "no-dice": Variant("triplet, cross-entropy", {"loss.dice_weight": 0.0}),
     "no-cross-entropy": Variant("triplet, Dice", {"loss.ce_weight": 0.0}),
+    "raw-counts": Variant("counts as they are", {"model.counts": "raw"}),
+    "clipped-counts": Variant("min(n, 10) / 10", {"model.counts": "clipped"}),
     **{f"categories-{n}": Variant(f"{n} categories", {"model.categories": n}) for n in (6, 15, 25, 34)},
 }
 
@@ -82,6 +84,11 @@ EXPERIMENTS: dict[str, Experiment] = {
     "figure8": Experiment("Feature heat maps with and without the segmentation branch", (FULL, NO_SEGMENTATION)),
     "figure9": Experiment(
         "Number of semantic categories", (NO_SEGMENTATION, *_WITH_FIGURE_9), ("0", "6", "15", "20", "25", "34")
+    ),
+    "normalisation": Experiment(
+        "Point counts as input (not in the paper)",
+        ("raw-counts", "clipped-counts", FULL),
+        ("n", "min(n, 10) / 10", "log(1 + n)"),
     ),
 }
 

@@ -57,10 +57,12 @@ def methods_of(name: str, baselines: Sequence[str]) -> Mapping[str, str]:
 
 def published_rows(name: str, columns: Sequence[str]) -> list[Row]:
     """The paper's rows of a table, where it has any of these columns."""
-    table = next(table for table in TABLES if name == f"table{table.number}")
-    if not set(columns) & set(table.columns):
-        return []
-    return [Row(row.method, PUBLISHED, dict(zip(table.columns, row.scores, strict=True))) for row in table.rows]
+    return [
+        Row(row.method, PUBLISHED, dict(zip(table.columns, row.scores, strict=True)))
+        for table in TABLES
+        if name == f"table{table.number}" and set(columns) & set(table.columns)
+        for row in table.rows
+    ]
 
 
 def _row(label: str, runs: Runs, method: str, seqs: Sequence[str], *, rotated: bool = False) -> Row:
