@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import tyro
 
+from sglpr_jax.cli.descriptor_files import embed_or_reuse, fingerprint
 from sglpr_jax.cli.methods import Method, MethodName, method_named
 from sglpr_jax.cli.runtime import console, run, write_json
-from sglpr_jax.cli.stress_files import embed_or_reuse, fingerprint
 from sglpr_jax.data import Drive, ImageSequence, open_sequence
 from sglpr_jax.data.disturbances import CLEAN, ROTATION, Disturbance, chosen_disturbances
 from sglpr_jax.data.disturbed import disturbed

@@ -4,10 +4,10 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from sglpr_jax.cli.descriptor_files import embed_or_reuse
 from sglpr_jax.cli.methods import network, reference
 from sglpr_jax.cli.reproduction.experiments import VARIANTS, variant_config
 from sglpr_jax.cli.runtime import write_json
-from sglpr_jax.cli.stress_files import embed_or_reuse
 from sglpr_jax.cli.train import TrainCommand, require_same_settings, train_only
 from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.disturbances import CLEAN, ROTATION

@@ -1,4 +1,4 @@
-"""Descriptor files of bin/stress: one per method and disturbance, taken again only if made with the same settings."""
+"""Descriptor files of a method and a disturbance, taken again only if they were made with the same settings."""
 
 import dataclasses
 import hashlib
@@ -13,7 +13,7 @@ from sglpr_jax.data.disturbances import CLEAN, ROTATION, Disturbance
 from sglpr_jax.data.disturbed import disturbed
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
-SETTINGS = "stress"
+SETTINGS = "made_with"
 """The key of a descriptor file's `config` under which they stand."""
 
 
