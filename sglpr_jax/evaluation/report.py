@@ -12,6 +12,8 @@ from sglpr_jax.evaluation.inputs.choice import protocols_of
 from sglpr_jax.evaluation.protocols import HEADLINES, Result, protocol_named
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
 
+MOST_COLUMNS = 6
+"""More protocols side by side would not fit a terminal."""
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
 PUBLISHED_COLUMNS = ("method", "published F1max", "numbers from")
 PUBLISHED_NOTE = (
@@ -46,11 +48,20 @@ def cells(result: Result) -> tuple[str, ...]:
 
 
 def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> Table:
-    """Return one row per method and one column per protocol. The methods are scored on the same sequence."""
+    """Return one row per method and one column per protocol; the other way round where that would be too wide.
+
+    The methods are scored on the same sequence.
+    """
     names = [result.name for result in next(iter(methods.values()))]
-    rows = Table("method", *names, title=title)
-    for method, results in methods.items():
-        rows.add_row(method, *map(format_score, results))
+    scores = [[format_score(result) for result in results] for results in methods.values()]
+    if len(names) <= MOST_COLUMNS:
+        rows = Table("method", *names, title=title)
+        lines = zip(methods, scores, strict=True)
+    else:
+        rows = Table("protocol", *methods, title=title)
+        lines = zip(names, zip(*scores, strict=True), strict=True)
+    for name, line in lines:
+        rows.add_row(escape(name), *line)
     return rows
 
 

@@ -5,6 +5,7 @@ import pytest
 from rich.console import Console
 
 from sglpr_jax.evaluation import report
+from sglpr_jax.evaluation.protocols import PROTOCOLS
 
 
 @pytest.fixture
@@ -62,6 +63,16 @@ def test_methods_stand_side_by_side(found, nothing_to_find):
     rows = {line.split("│")[1].strip(): line for line in text.splitlines() if "│" in line}
     assert f"{found[0].score:.3f}" in rows["ours"]
     assert rows["other"].count("no revisit") == 3
+
+
+def test_many_protocols_stand_below_one_another_with_their_names_whole(make_file, two_laps):
+    results = report.evaluate(make_file(two_laps, two_laps / 200), list(PROTOCOLS))
+    console = Console(width=80)
+    with console.capture() as capture:
+        console.print(report.comparison({"ours": results, "other": results}))
+    lines = capture.get().splitlines()
+    for result in results:
+        assert any(result.name in line and report.format_score(result) in line for line in lines)
 
 
 def test_json_says_the_same(found, nothing_to_find):
