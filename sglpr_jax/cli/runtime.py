@@ -1,6 +1,7 @@
 """What every command does around its work: a compilation cache, orderly interruption, errors in one line."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -12,6 +13,8 @@ from typing import Any
 import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from sglpr_jax.files import writing
 
 _TABLE_WIDTH = 140
 
@@ -47,27 +50,42 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(text)
-        os.replace(temporary, path)
+        with writing(path):
+            temporary.write_text(text)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
+@dataclasses.dataclass
+class StopRequest:
+    """Whether work was asked to stop (call it), and by which signal."""
+
+    signal: int | None = None
+
+    def __call__(self) -> bool:
+        return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """130 after Ctrl-C, as shells have it; 0 after SIGTERM: who ends a run to go on later is told that it worked."""
+        return 130 if self.signal == signal.SIGINT else 0
+
+
 @contextlib.contextmanager
-def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a flag, so that work ends where nothing is lost; the second one kills."""
-    asked = False
+def stop_on_signal() -> Iterator[StopRequest]:
+    """Turn the first Ctrl-C or SIGTERM into a request, so that work ends where nothing is lost; the second one kills."""
+    request = StopRequest()
 
     def ask(number, _frame):
-        nonlocal asked
-        if asked:
+        if request():
             raise KeyboardInterrupt
-        asked = True
+        request.signal = number
         print("stopping after this step; once more to stop at once", file=sys.stderr)
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield request
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
