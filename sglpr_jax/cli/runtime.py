@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import logging
 import os
 import signal
 import sys
@@ -26,6 +27,7 @@ def cache_folder() -> Path:
 
 def run(command: Callable[[], object]) -> None:
     """Run a command line: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax logs pages about a failed write, which it raises too
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     try:
@@ -68,13 +70,13 @@ class StopRequest:
 
     @property
     def exit_status(self) -> int:
-        """130 after Ctrl-C, as shells have it; 0 after SIGTERM: who ends a run to go on later is told that it worked."""
+        """130 after Ctrl-C, as shells have it; 0 after SIGTERM, for whoever ends a run so that it can go on later."""
         return 130 if self.signal == signal.SIGINT else 0
 
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request, so that work ends where nothing is lost; the second one kills."""
+    """Turn the first Ctrl-C or SIGTERM into a request, so that work ends where nothing is lost; a second one kills."""
     request = StopRequest()
 
     def ask(number, _frame):

@@ -114,7 +114,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Say in one line, with the folder's name, what orbax and the writers below it raise as a ValueError of many."""
+        """Say in one line, with the folder's name, what orbax and the writers below it say in many."""
         try:
             yield
         except (OSError, ValueError) as error:
