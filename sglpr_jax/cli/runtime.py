@@ -1,7 +1,9 @@
 """What every command does around its work: a compilation cache, orderly interruption, errors in one line."""
 
 import contextlib
+import dataclasses
 import json
+import logging
 import os
 import signal
 import sys
@@ -13,6 +15,8 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sglpr_jax.files import writing
+
 _TABLE_WIDTH = 140
 
 
@@ -23,6 +27,7 @@ def cache_folder() -> Path:
 
 def run(command: Callable[[], object]) -> None:
     """Run a command line: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax logs pages about a failed write, which it raises too
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     try:
@@ -47,27 +52,42 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_text(text)
-        os.replace(temporary, path)
+        with writing(path):
+            temporary.write_text(text)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
+@dataclasses.dataclass
+class StopRequest:
+    """Whether work was asked to stop (call it), and by which signal."""
+
+    signal: int | None = None
+
+    def __call__(self) -> bool:
+        return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """130 after Ctrl-C, as shells have it; 0 after SIGTERM, for whoever ends a run so that it can go on later."""
+        return 130 if self.signal == signal.SIGINT else 0
+
+
 @contextlib.contextmanager
-def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C or SIGTERM into a flag, so that work ends where nothing is lost; the second one kills."""
-    asked = False
+def stop_on_signal() -> Iterator[StopRequest]:
+    """Turn the first Ctrl-C or SIGTERM into a request, so that work ends where nothing is lost; a second one kills."""
+    request = StopRequest()
 
     def ask(number, _frame):
-        nonlocal asked
-        if asked:
+        if request():
             raise KeyboardInterrupt
-        asked = True
+        request.signal = number
         print("stopping after this step; once more to stop at once", file=sys.stderr)
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield request
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

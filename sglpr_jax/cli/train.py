@@ -1,10 +1,10 @@
 """bin/train: train on all drives but one, then test on that one, beside references."""
 
+import contextlib
 import dataclasses
-import importlib.util
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,9 @@ import numpy as np
 import tyro
 
 from sglpr_jax.cli.datasets import dataset_root, leave_one_out
+from sglpr_jax.cli.environment import note_environment
 from sglpr_jax.cli.final_test import final_test
+from sglpr_jax.cli.learning_curves import draw_learning_curves
 from sglpr_jax.cli.presets import load_preset, preset_asked_for, preset_names
 from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
 from sglpr_jax.cli.training_recall import training_recall
@@ -20,12 +22,13 @@ from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.data.batch import Batch, read_batch
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
-from sglpr_jax.evaluation import figures
 from sglpr_jax.models.params import save
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.loop import METRICS_FILE, train
 from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.train.tensorboard import EVENTS, event_writer
+from sglpr_jax.train.throughput import throughput
 
 CONFIG_FILE = "config.json"
 
@@ -54,6 +57,8 @@ class TrainCommand:
     """Go on from the run's newest checkpoint."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
+    tensorboard: bool = False
+    """Write event files for TensorBoard too (extra `tensorboard`)."""
     poses: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     config: Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = dataclasses.field(
@@ -82,7 +87,10 @@ def run_folder(command: TrainCommand) -> Path:
 
 
 def train_only(command: TrainCommand) -> tuple[Params, Drive]:
-    """Train, and save the weights; returns them with the drive to test on. Exits with 130 where it is interrupted."""
+    """Train, and save the weights; returns them with the drive to test on.
+
+    Exits where it is asked to stop, with what was made saved: with 0 after SIGTERM, with 130 after Ctrl-C.
+    """
     folder = run_folder(command)
     root = dataset_root(command.data)
     drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
@@ -91,15 +99,26 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
         for drive in (*drives, test):
             _require_labels(drive)
     pool, make_batch = batches(drives, config)
-    _claim(folder, command, resume=command.resume)
-    with stop_on_signal() as stopped:
-        score = training_recall(drives, pool, config)
-        state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)
+    with event_writer(folder / EVENTS) if command.tensorboard else contextlib.nullcontext(_ignore) as record:
+        _claim(folder, command, resume=command.resume)
+        with stop_on_signal() as stopped:
+            score = training_recall(drives, pool, config)
+            state = train(
+                config,
+                make_batch,
+                folder,
+                score=score,
+                resume=command.resume,
+                stopped=stopped,
+                places=lambda step: _places(drives, pool, config, step),
+                record=record,
+            )
     save(state.params, folder / "weights")
+    draw_learning_curves(folder)
+    _print_throughput(folder, config)
     if int(state.step) < config.steps:
         print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
-        sys.exit(130)
-    draw_learning_curve(folder)
+        sys.exit(stopped.exit_status)
     return state.params, test
 
 
@@ -121,14 +140,26 @@ def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Ca
     return pool, make_batch
 
 
-def draw_learning_curve(folder: Path) -> None:
-    """Draw a run's loss and its score, recall@1 among its own places, over the steps."""
-    if not importlib.util.find_spec("matplotlib"):
-        return
-    lines = read_metrics(folder / METRICS_FILE)
-    names = {"loss": "loss", "score": "recall@1 of training places"}
-    curves = {title: [(line["step"], line[name]) for line in lines if name in line] for name, title in names.items()}
-    figures.save(figures.learning_curve(curves, ylabel="loss, recall@1"), folder / "learning-curve.png")
+def _places(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig, step: int) -> str:
+    """The frames of a step's batch, for an error: the drives they are of and their names there."""
+    frames = np.unique(pool.draw(seed=config.seed, step=step, tuples=config.tuples))
+    of_drive = {drive.name: frames[pool.drive[frames] == number] for number, drive in enumerate(drives)}
+    named = {drive.name: " ".join(drive.ids[pool.frame[f]] for f in of_drive[drive.name]) for drive in drives}
+    return "; ".join(f"drive {name} frames {ids}" for name, ids in named.items() if ids)
+
+
+def _print_throughput(folder: Path, config: TrainConfig) -> None:
+    measured = throughput(read_metrics(folder / METRICS_FILE))
+    if measured is not None:
+        print(
+            f"{measured.steps_per_second:.3g} steps/s, {measured.steps_per_second * config.tuples:.3g} tuples/s, "
+            f"{measured.data_wait:.1%} of the time waiting for data",
+            file=sys.stderr,
+        )
+
+
+def _ignore(step: int, values: Mapping[str, float]) -> None:
+    pass
 
 
 def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
@@ -139,7 +170,10 @@ def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
     if resume:
         require_same_settings(folder, command)
     folder.mkdir(parents=True, exist_ok=True)
+    for left in folder.glob(".*.tmp"):  # by a process that was killed
+        left.unlink()
     write_json(path, _settings(command))
+    note_environment(folder, seed=command.config.seed)
 
 
 def require_same_settings(folder: Path, command: TrainCommand) -> None:
@@ -160,6 +194,7 @@ def require_same_settings(folder: Path, command: TrainCommand) -> None:
 def _settings(command: TrainCommand) -> dict[str, Any]:
     """The effective configuration as it is written beside the results."""
     plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
+    del plain["tensorboard"]  # how a run is watched; it may change
     return json.loads(json.dumps(plain, default=str))
 
 

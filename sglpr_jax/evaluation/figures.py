@@ -100,6 +100,21 @@ def learning_curve(
     return figure
 
 
+def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]]]]) -> "matplotlib.figure.Figure":
+    """Draw named curves of (step, value), in one panel for each title, below each other over the same steps."""
+    figure = _figure(6.4, 0.8 + 2.2 * len(panels))
+    rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
+    for axes, (title, curves) in zip(rows, panels.items(), strict=True):
+        for name, points in curves.items():
+            axes.plot(*np.array(points, dtype=np.float64).T, ".-", markersize=3, linewidth=1.4, label=name)
+        axes.set_ylabel(title)
+        axes.grid(color="0.92")
+        if len(curves) > 1:
+            axes.legend(loc="best", framealpha=0.95)
+    rows[-1].set_xlabel("step")
+    return figure
+
+
 def stress(
     changes: Mapping[tuple[str, str], Mapping[str, Sequence[tuple[str, float]]]], *, title: str = ""
 ) -> "matplotlib.figure.Figure":

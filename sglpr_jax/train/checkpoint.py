@@ -1,5 +1,10 @@
 """Checkpoints of a training run: atomic, the newest and the best kept. The one file that knows orbax."""
 
+import contextlib
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,26 +17,49 @@ from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.state import TrainState, new_state
 
 _KEPT_LATEST = 2
+_INTACT = "the last checkpoint is intact"
+_UNLOGGED = "unlogged"
+_OUTDATED = "outdated"
+"""Checkpoints are moved here whole before they are deleted: one deleted in part would look like a checkpoint."""
 
 
 class Checkpoints:
     """The checkpoints in one folder; weights and optimiser are separate items, so that either can be read alone."""
 
     def __init__(self, folder: Path):
+        self._folder = folder.resolve()
+        self._sweep()
         policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=lambda m: m["score"], n=1)])
-        options = ocp.CheckpointManagerOptions(preservation_policy=policy, cleanup_tmp_directories=True)
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=policy, cleanup_tmp_directories=True, todelete_subdir=_OUTDATED
+        )
         handlers = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
-        self._manager = ocp.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
+        self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=handlers)
 
-    def save(self, state: TrainState, *, score: float | None = None) -> None:
-        """Write the state under its step, with its score if it has one. A step already there is left as it is."""
+    def save(
+        self, state: TrainState, *, score: float | None = None, unlogged: Sequence[Mapping[str, float]] = ()
+    ) -> None:
+        """Write the state under its step, with its score if it has one. A step already there is left as it is.
+
+        `unlogged` are the measurements of the steps since the last line of the log. Raises OSError where this
+        checkpoint or the one before it, written meanwhile, cannot be written.
+        """
         step = int(state.step)
         if step in self._manager.all_steps():
             return
+        self._wait()
+        self._require_room(state)
         items = ocp.args.Composite(
             weights=ocp.args.StandardSave(state.params.weights), optimizer=ocp.args.StandardSave(state.optimizer)
         )
-        self._manager.save(step, args=items, metrics={"score": -1.0 if score is None else score}, force=True)
+        with self._writing():
+            self._manager.save(
+                step,
+                args=items,
+                metrics={"score": -1.0 if score is None else score},
+                custom_metadata={_UNLOGGED: [dict(measured) for measured in unlogged]},
+                force=True,
+            )
 
     def latest_step(self) -> int | None:
         """The newest whole checkpoint's step, or None."""
@@ -58,9 +86,41 @@ class Checkpoints:
         found: Any = self._manager.restore(step, args=items)
         return TrainState(jax.numpy.asarray(step, "int32"), Params(found.weights, config.model), found.optimizer)
 
+    def unlogged(self) -> list[dict[str, float]]:
+        """The measurements that the newest state was saved with."""
+        found = self._manager.metadata(self.latest_step()).custom_metadata or {}
+        return [dict(measured) for measured in found.get(_UNLOGGED, ())]
+
     def close(self) -> None:
-        """Wait until everything is written."""
-        self._manager.close()
+        """Wait until everything is written. Raises OSError where it cannot be."""
+        with self._writing():
+            self._manager.close()
+        self._sweep()
+
+    def _wait(self) -> None:
+        with self._writing():
+            self._manager.wait_until_finished()
+        self._sweep()
+
+    def _sweep(self) -> None:
+        shutil.rmtree(self._folder / _OUTDATED, ignore_errors=True)
+
+    def _require_room(self, state: TrainState) -> None:
+        """Raise OSError where the disk is too full for a checkpoint, before a part of one is written."""
+        needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state.params.weights, state.optimizer)))
+        free = shutil.disk_usage(self._folder).free
+        if free < needed:
+            raise OSError(f"{self._folder}: expected {needed:,} bytes free for a checkpoint, found {free:,}; {_INTACT}")
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Say in one line, with the folder's name, what orbax and the writers below it say in many."""
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            code = re.search(r"os_error_code='(\d+)'", str(error))
+            reason = os.strerror(int(code[1])) if code else str(error)
+            raise OSError(f"{self._folder}: expected to write a checkpoint, found: {reason}; {_INTACT}") from error
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:

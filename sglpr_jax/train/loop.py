@@ -1,7 +1,9 @@
 """The training loop: steps, measurements, scores, checkpoints; it can be interrupted and resumed."""
 
+import contextlib
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -23,6 +25,8 @@ METRICS_FILE = "metrics.jsonl"
 
 ScoreFn = Callable[[Params], dict[str, float]]
 """Measures how good weights are; its "score" tells the best checkpoint."""
+RecordFn = Callable[[int, Mapping[str, float]], None]
+"""Is told the measurements of a step."""
 
 
 def train(
@@ -33,61 +37,85 @@ def train(
     score: ScoreFn,
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
+    places: Callable[[int], str] | None = None,
+    record: RecordFn = lambda step, values: None,
 ) -> TrainState:
     """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch.
 
     Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest one, if there is one yet.
-    Raises FloatingPointError, naming the step, when the loss is no longer finite.
+    `record` is told what the metrics are told. Raises FloatingPointError, naming the step and its batch as `places`
+    does, when the loss is no longer finite, and OSError when metrics or a checkpoint cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    checkpoints = Checkpoints(folder / CHECKPOINTS)
-    go_on = resume and checkpoints.latest_step() is not None
-    state = checkpoints.restore(config) if go_on else new_state(config)
-    start = int(state.step)
-    log = MetricsLog(folder / METRICS_FILE, start_step=start)
-    batches = read_ahead(make_batch, start=start, stop=config.steps)
-    try:
-        with _progress() as progress:
-            bar = progress.add_task("train", total=config.steps, completed=start, terms="")
-            for state, measured in _steps(config, state, batches, stopped):  # noqa: B020 - state in, state out
-                progress.update(bar, completed=int(state.step), terms=_terms(measured))
-                log.append(int(state.step), measured)
-                if int(state.step) % config.score_every == 0 or int(state.step) == config.steps:
-                    scores = score(state.params)
-                    log.append(int(state.step), scores)
-                    checkpoints.save(state, score=scores.get("score"))
-        checkpoints.save(state)
-    finally:
-        batches.close()
-        checkpoints.close()
-        log.close()
+    with contextlib.ExitStack() as opened:
+        checkpoints = opened.enter_context(contextlib.closing(Checkpoints(folder / CHECKPOINTS)))
+        go_on = resume and checkpoints.latest_step() is not None
+        state = checkpoints.restore(config) if go_on else new_state(config)
+        unlogged = checkpoints.unlogged() if go_on else []
+        start = int(state.step)
+        log = opened.enter_context(contextlib.closing(MetricsLog(folder / METRICS_FILE, start_step=start)))
+        batches = opened.enter_context(contextlib.closing(read_ahead(make_batch, start=start, stop=config.steps)))
+        progress = opened.enter_context(_progress())
+        bar = progress.add_task("train", total=config.steps, completed=start, terms="")
+        for state, measured in _steps(config, state, batches, stopped, places, unlogged):  # noqa: B020 - in and out
+            step = int(state.step)
+            if measured:
+                progress.update(bar, completed=step, terms=_terms(measured))
+                log.append(step, measured)
+                record(step, measured)
+            if _scored(config, step):
+                scores = score(state.params)
+                log.append(step, scores)
+                record(step, scores)
+                log.sync()
+                checkpoints.save(state, score=scores.get("score"))
+        log.sync()
+        checkpoints.save(state, unlogged=unlogged)
     return state
 
 
 def _steps(
-    config: TrainConfig, state: TrainState, batches: Iterator[Batch], stopped: Callable[[], bool]
+    config: TrainConfig,
+    state: TrainState,
+    batches: Iterator[Batch],
+    stopped: Callable[[], bool],
+    places: Callable[[int], str] | None,
+    unlogged: list[dict[str, float]],
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
-    """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps."""
-    since, measured, waited, stop = time.perf_counter(), [], 0.0, False
+    """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps.
+
+    `unlogged` holds the measurements of the steps since then. A stop in between yields the state and no measurements,
+    so that the lines are those of a run that was not stopped.
+    """
+    since, waited, made, stop = time.perf_counter(), 0.0, 0, False
     while int(state.step) < config.steps and not stop:
         asked = time.perf_counter()
         batch = next(batches)
         waited += time.perf_counter() - asked
         state, metrics = train_step(state, batch, config=config)
-        measured.append(jax.device_get(metrics))
-        step, stop = int(state.step), stopped()
-        _require_finite(measured[-1], step)
-        if step % config.log_every == 0 or step % config.score_every == 0 or step == config.steps or stop:
+        unlogged.append({name: float(value) for name, value in jax.device_get(metrics).items()})
+        made, step, stop = made + 1, int(state.step), stopped()
+        _require_finite(unlogged[-1], step, places)
+        if step % config.log_every == 0 or _scored(config, step):
             seconds = time.perf_counter() - since
-            means = {name: float(np.mean([m[name] for m in measured])) for name in metrics}
-            yield state, means | {"steps_per_second": len(measured) / seconds, "data_wait": waited / seconds}
-            since, measured, waited = time.perf_counter(), [], 0.0
+            means = {name: float(np.mean([measured[name] for measured in unlogged])) for name in unlogged[-1]}
+            unlogged.clear()
+            yield state, means | {"steps_per_second": made / seconds, "data_wait": waited / seconds}
+            since, waited, made = time.perf_counter(), 0.0, 0
+        elif stop:
+            yield state, {}
 
 
-def _require_finite(metrics: dict[str, np.ndarray], step: int) -> None:
-    broken = [name for name, value in metrics.items() if not np.isfinite(value)]
+def _scored(config: TrainConfig, step: int) -> bool:
+    """Whether a step is followed by a score and a checkpoint."""
+    return step % config.score_every == 0 or step == config.steps
+
+
+def _require_finite(metrics: dict[str, float], step: int, places: Callable[[int], str] | None) -> None:
+    broken = [name for name, value in metrics.items() if not math.isfinite(value)]
     if broken:
-        raise FloatingPointError(f"step {step}: {', '.join(broken)} not finite; the last checkpoint is intact")
+        batch = f" (batch: {places(step - 1)})" if places else ""
+        raise FloatingPointError(f"step {step}: {', '.join(broken)} not finite{batch}; the last checkpoint is intact")
 
 
 def _progress() -> Progress:

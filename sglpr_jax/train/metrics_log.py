@@ -7,28 +7,42 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sglpr_jax.files import writing
+
 
 class MetricsLog:
-    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped."""
+    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped.
+
+    Raises OSError, naming the file, where a line cannot be written.
+    """
 
     def __init__(self, path: Path, *, start_step: int = 0):
         kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
         temporary = path.with_name(f".{path.name}.tmp")
-        temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        os.replace(temporary, path)
-        self._file = path.open("a")
+        with writing(path):
+            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
+            os.replace(temporary, path)
+        self._path = path
+        self._file = path.open("ab", buffering=0)  # nothing is left behind that closing would have to write
 
     def append(self, step: int, values: Mapping[str, Any]) -> None:
         """Write the measurements of one step; values that are not finite become null."""
         self._write({"step": step, **{name: _plain(value) for name, value in values.items()}})
+
+    def sync(self) -> None:
+        """Have the lines on the disk itself, before a checkpoint that is ahead of them is."""
+        with writing(self._path):
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
     def _write(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        left = json.dumps(line).encode() + b"\n"
+        with writing(self._path):
+            while left:  # a disk that is nearly full takes a part
+                left = left[self._file.write(left) :]
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -47,7 +47,7 @@ def runs(town, preset, tmp_path_factory):
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(train_command, "final_test", lambda *_, **__: None)
                 patch.setattr(train_command, "training_recall", lambda *_: lambda _: {"score": 0.0})
-                patch.setattr(train_command, "draw_learning_curve", lambda _: None)
+                patch.setattr(train_command, "draw_learning_curves", lambda _: None)
                 flags = ("--data", town, "--preset", preset, "--out", folder, "--steps", 2, *flags_of(name))
                 ended = run_command("train", "--seq", "08", *flags)
             assert ended.status == 0, ended.error

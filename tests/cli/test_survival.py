@@ -1,0 +1,143 @@
+"""A run through the real command line that is killed, asked to stop or out of disk ends as one that never was."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sglpr_jax.train.metrics_log import read_metrics
+
+KILLS = 24
+STEPS = 60
+TIMES = {"steps_per_second", "data_wait"}
+TIMEOUT_S = 240
+
+
+class Runs:
+    """Starts `bin/train` in processes of its own, on one run's folder."""
+
+    def __init__(self, folder: Path, options: tuple[object, ...]):
+        self.folder = folder
+        self.metrics = folder / "metrics.jsonl"
+        self.checkpoints = folder / "checkpoints"
+        self.errors = folder.with_suffix(".err")
+        self.command = [sys.executable, "-m", "sglpr_jax.cli.train", *map(str, options), "--out", str(folder)]
+
+    def start(self, *, file_kib: int | None = None) -> subprocess.Popen:
+        """Begin the run, or go on with it where it has begun; no file may grow beyond `file_kib`."""
+        resume = ["--resume"] if (self.folder / "config.json").exists() else []
+        limit = [] if file_kib is None else ["bash", "-c", f'ulimit -f {file_kib}; exec "$@"', "-"]
+        with self.errors.open("wb") as errors:
+            return subprocess.Popen([*limit, *self.command, *resume], stdout=subprocess.DEVNULL, stderr=errors)
+
+    def finish(self, **options) -> int:
+        """Start and wait; returns the exit status."""
+        return self.start(**options).wait(TIMEOUT_S)
+
+    def wait_for(self, process: subprocess.Popen, event: Callable[[], bool]) -> None:
+        """Wait until `event`, looking a thousand times a second. The process may not end before."""
+        until = time.monotonic() + TIMEOUT_S
+        while not event():
+            assert process.poll() is None, self.errors.read_text()
+            assert time.monotonic() < until
+            time.sleep(1e-3)
+
+    def wait_for_lines(self, process: subprocess.Popen, lines: int) -> None:
+        """Wait until a process just started has written so many lines of metrics."""
+        before = self._inode()
+        self.wait_for(process, lambda: self._inode() != before)  # a resumed run writes the file anew
+        kept = self.metrics.read_bytes().count(b"\n")
+        self.wait_for(process, lambda: self.metrics.read_bytes().count(b"\n") >= kept + lines)
+
+    def half_written(self) -> set[str]:
+        """The checkpoints that have not got their names yet."""
+        return {path.name for path in self.checkpoints.glob("*.orbax-checkpoint-tmp")}
+
+    def measured(self) -> list[dict]:
+        """The metrics without those of time."""
+        return [{k: v for k, v in line.items() if k not in TIMES} for line in read_metrics(self.metrics)]
+
+    def _inode(self) -> int | None:
+        return self.metrics.stat().st_ino if self.metrics.exists() else None
+
+
+@pytest.fixture(scope="module")
+def options(images, preset) -> tuple[object, ...]:
+    """Lines of the log and checkpoints fall apart, so that stops come between them."""
+    every = ("--steps", STEPS, "--log-every", 2, "--score-every", 3)
+    return ("--seq", "06", "--data", images, "--preset", preset, *every)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(options, tmp_path_factory) -> Runs:
+    """The run that all others should be equal to. It leaves compiled programs in the cache."""
+    runs = Runs(tmp_path_factory.mktemp("whole") / "run", options)
+    assert runs.finish() == 0, runs.errors.read_text()
+    return runs
+
+
+def assert_equal(runs: Runs, uninterrupted: Runs) -> None:
+    """Same measurements, same weights, and the same files, none half-written."""
+    assert runs.measured() == uninterrupted.measured()
+    weights = Path("weights", "model.safetensors")
+    assert (runs.folder / weights).read_bytes() == (uninterrupted.folder / weights).read_bytes()
+    for folder in (".", "checkpoints", "weights", "test"):
+        found, expected = (sorted(os.listdir(r.folder / folder)) for r in (runs, uninterrupted))
+        assert found == expected
+
+
+def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninterrupted, tmp_path):
+    runs = Runs(tmp_path / "run", options)
+    rng = np.random.default_rng(0)
+    in_a_write = 0
+    for kill in range(KILLS):
+        process = runs.start()
+        if kill % 3 == 0:  # while it starts: imports, compilation, restoring
+            time.sleep(rng.uniform(0, 4))
+        elif kill % 3 == 1:  # while it makes steps
+            runs.wait_for_lines(process, rng.integers(1, 5))
+            time.sleep(rng.uniform(0, 0.05))
+        else:  # while it writes a checkpoint
+            runs.wait_for_lines(process, 1)
+            runs.wait_for(process, lambda: bool(runs.half_written()))
+            time.sleep(rng.uniform(0, 0.02))
+        assert process.poll() is None
+        process.kill()
+        process.wait()
+        in_a_write += bool(runs.half_written())
+        if kill == KILLS // 2:
+            with runs.metrics.open("a") as file:
+                file.write('{"step": 59, "lo')
+    assert in_a_write >= KILLS // 6
+    assert runs.finish() == 0, runs.errors.read_text()
+    assert_equal(runs, uninterrupted)
+    starts = json.loads((runs.folder / "environment.json").read_text())
+    assert KILLS // 2 <= len(starts["resumes"]) <= KILLS
+
+
+def test_signals_and_a_full_disk_stop_a_run_that_then_goes_on(options, uninterrupted, tmp_path):
+    runs = Runs(tmp_path / "run", options)
+    for number, status in ((signal.SIGTERM, 0), (signal.SIGINT, 130)):
+        process = runs.start()
+        runs.wait_for_lines(process, 3)
+        process.send_signal(number)
+        assert process.wait(TIMEOUT_S) == status
+        assert "go on with --resume" in runs.errors.read_text()
+        last = max(int(path.name) for path in runs.checkpoints.iterdir())
+        assert f"stopped at step {last} of {STEPS}" in runs.errors.read_text()
+
+    assert runs.finish(file_kib=8) == 1
+    error = runs.errors.read_text()
+    assert error.splitlines()[-1].startswith(f"error: {runs.folder}")
+    assert "File too large" in error and "Traceback" not in error
+    assert max(int(path.name) for path in runs.checkpoints.iterdir() if path.name.isdigit()) == last
+
+    assert runs.finish() == 0, runs.errors.read_text()
+    assert_equal(runs, uninterrupted)
