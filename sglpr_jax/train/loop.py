@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -14,6 +15,8 @@ from sglpr_jax.data.loader import read_ahead
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.checkpoint import Checkpoints
 from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.train.devices import data_mesh, own_copy, replicate, split
+from sglpr_jax.train.hosts import is_first_host, of_first_host, on_any_host
 from sglpr_jax.train.metrics_log import MetricsLog
 from sglpr_jax.train.state import TrainState, new_state
 from sglpr_jax.train.step import train_step
@@ -34,28 +37,30 @@ def train(
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> TrainState:
-    """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch.
+    """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch (the host's part).
 
-    Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest one, if there is one yet.
-    Raises FloatingPointError, naming the step, when the loss is no longer finite.
+    All devices share a step. Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest
+    one, if there is one yet. Raises FloatingPointError, naming the step, when the loss is no longer finite; ValueError
+    where the devices cannot share a step (`data_mesh`).
     """
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints = Checkpoints(folder / CHECKPOINTS)
     go_on = resume and checkpoints.latest_step() is not None
-    state = checkpoints.restore(config) if go_on else new_state(config)
+    mesh = data_mesh(config)
+    state = replicate(checkpoints.restore(config) if go_on else new_state(config), mesh)
     start = int(state.step)
-    log = MetricsLog(folder / METRICS_FILE, start_step=start)
-    batches = read_ahead(make_batch, start=start, stop=config.steps)
+    log = MetricsLog(folder / METRICS_FILE if is_first_host() else None, start_step=start)
+    batches = read_ahead(lambda step: split(make_batch(step), mesh), start=start, stop=config.steps)
     try:
         with _progress() as progress:
             bar = progress.add_task("train", total=config.steps, completed=start, terms="")
-            for state, measured in _steps(config, state, batches, stopped):  # noqa: B020 - state in, state out
+            for state, measured in _steps(config, mesh, state, batches, stopped):  # noqa: B020 - state in, state out
                 progress.update(bar, completed=int(state.step), terms=_terms(measured))
                 log.append(int(state.step), measured)
                 if int(state.step) % config.score_every == 0 or int(state.step) == config.steps:
-                    scores = score(state.params)
+                    scores = score(own_copy(state.params)) if is_first_host() else {"score": 0.0}
                     log.append(int(state.step), scores)
-                    checkpoints.save(state, score=scores.get("score"))
+                    checkpoints.save(state, score=of_first_host(scores["score"]))
         checkpoints.save(state)
     finally:
         batches.close()
@@ -65,7 +70,7 @@ def train(
 
 
 def _steps(
-    config: TrainConfig, state: TrainState, batches: Iterator[Batch], stopped: Callable[[], bool]
+    config: TrainConfig, mesh: Mesh, state: TrainState, batches: Iterator[Batch], stopped: Callable[[], bool]
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps."""
     since, measured, waited, stop = time.perf_counter(), [], 0.0, False
@@ -73,9 +78,10 @@ def _steps(
         asked = time.perf_counter()
         batch = next(batches)
         waited += time.perf_counter() - asked
-        state, metrics = train_step(state, batch, config=config)
+        with jax.set_mesh(mesh):
+            state, metrics = train_step(state, batch, config=config)
         measured.append(jax.device_get(metrics))
-        step, stop = int(state.step), stopped()
+        step, stop = int(state.step), on_any_host(stopped())
         _require_finite(measured[-1], step)
         if step % config.log_every == 0 or step % config.score_every == 0 or step == config.steps or stop:
             seconds = time.perf_counter() - since
@@ -98,7 +104,7 @@ def _progress() -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.fields[terms]}"),
         console=Console(stderr=True),
-        disable=not Console(stderr=True).is_terminal,
+        disable=not (Console(stderr=True).is_terminal and is_first_host()),
     )
 
 

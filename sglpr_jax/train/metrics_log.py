@@ -9,9 +9,15 @@ from typing import Any
 
 
 class MetricsLog:
-    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped."""
+    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped.
 
-    def __init__(self, path: Path, *, start_step: int = 0):
+    Without a path nothing is written: of several hosts one keeps the log.
+    """
+
+    def __init__(self, path: Path | None, *, start_step: int = 0):
+        self._file = None
+        if path is None:
+            return
         kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
         temporary = path.with_name(f".{path.name}.tmp")
         temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
@@ -24,11 +30,13 @@ class MetricsLog:
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        if self._file:
+            self._file.close()
 
     def _write(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        if self._file:
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
