@@ -25,6 +25,8 @@ from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.models.params import save
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.train.devices import own_copy
+from sglpr_jax.train.hosts import connected, is_first_host, own_part
 from sglpr_jax.train.loop import METRICS_FILE, train
 from sglpr_jax.train.metrics_log import read_metrics
 from sglpr_jax.train.tensorboard import EVENTS, event_writer
@@ -43,6 +45,7 @@ class TrainCommand:
       bin/train --seq 08 --data KITTI --resume            goes on where the run was stopped
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
       bin/train --seq 08 --model.head.cbam False          an ablation; docs/ablations.md has all
+      bin/train --hosts 2 --host-index 0 --coordinator 10.0.0.1:1234    one of two hosts; docs/training.md
     """
 
     seq: str = "08"
@@ -61,6 +64,12 @@ class TrainCommand:
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     poses: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    hosts: int = 1
+    """How many hosts train together, each started with this same command and its own index."""
+    host_index: int = 0
+    """Which of them this one is, from 0; the first one writes the run."""
+    coordinator: str | None = None
+    """HOST:PORT of the first one, any free port, where they meet."""
     config: Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = dataclasses.field(
         default_factory=TrainConfig
     )
@@ -76,8 +85,10 @@ def parse(arguments: list[str] | None = None) -> TrainCommand:
 def train_and_test(command: TrainCommand) -> Path:
     """Do what the command says; returns the run's folder."""
     folder = run_folder(command)
-    params, test = train_only(command)
-    final_test(params, test, folder / "test", seed=command.config.seed)
+    with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
+        params, test = train_only(command)
+    if is_first_host():
+        final_test(params, test, folder / "test", seed=command.config.seed)
     return folder
 
 
@@ -99,8 +110,10 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
         for drive in (*drives, test):
             _require_labels(drive)
     pool, make_batch = batches(drives, config)
-    with event_writer(folder / EVENTS) if command.tensorboard else contextlib.nullcontext(_ignore) as record:
-        _claim(folder, command, resume=command.resume)
+    watched = command.tensorboard and is_first_host()
+    with event_writer(folder / EVENTS) if watched else contextlib.nullcontext(_ignore) as record:
+        if is_first_host():
+            _claim(folder, command, resume=command.resume)
         with stop_on_signal() as stopped:
             score = training_recall(drives, pool, config)
             state = train(
@@ -113,17 +126,19 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
                 places=lambda step: _places(drives, pool, config, step),
                 record=record,
             )
-    save(state.params, folder / "weights")
-    draw_learning_curves(folder)
-    _print_throughput(folder, config)
+    params = own_copy(state.params)
+    if is_first_host():
+        save(params, folder / "weights")
+        draw_learning_curves(folder)
+        _print_throughput(folder, config)
     if int(state.step) < config.steps:
         print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
         sys.exit(stopped.exit_status)
-    return state.params, test
+    return params, test
 
 
 def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Callable[[int], Batch]]:
-    """The tuples that drives hold, and the batch of each step, a function of the step alone."""
+    """The tuples that drives hold, and this host's part of the batch of each step, a function of the step alone."""
     pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
 
     def make_batch(step: int) -> Batch:
@@ -135,6 +150,7 @@ def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Ca
             max_points=config.max_points,
             share_negatives=config.share_negatives,
             categories=config.model.categories,
+            part=own_part(config.tuples),
         )
 
     return pool, make_batch
@@ -192,10 +208,11 @@ def require_same_settings(folder: Path, command: TrainCommand) -> None:
 
 
 def _settings(command: TrainCommand) -> dict[str, Any]:
-    """The effective configuration as it is written beside the results."""
+    """The effective configuration as it is written beside the results; on which hosts changes none of them."""
     plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
-    del plain["tensorboard"]  # how a run is watched; it may change
-    return json.loads(json.dumps(plain, default=str))
+    elsewhere = ("tensorboard", "hosts", "host_index", "coordinator")  # how a run is watched and where it is made
+    told = {name: value for name, value in plain.items() if name not in elsewhere}
+    return json.loads(json.dumps(told, default=str))
 
 
 def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:

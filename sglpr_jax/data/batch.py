@@ -40,21 +40,24 @@ def read_batch(
     max_points: int,
     share_negatives: bool,
     categories: int = 20,
+    part: slice = slice(None),
 ) -> Batch:
     """Read the frames of some tuples.
 
     With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
     of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
-    sorted into classes; with 0 they are not read.
+    sorted into classes; with 0 they are not read. `part` says which tuples to read; their negatives are still sought
+    among all of the batch.
     """
     flat = frames.reshape(-1)
-    places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in flat]
     far = pool.far_apart(frames[:, :1], flat[None, :])
     if not share_negatives:
         far &= _own_negatives(frames.shape, positives=pool.config.positives)
+    far = far[part]
+    places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in frames[part].reshape(-1)]
     if isinstance(drives[0], ImageSequence):
         images = np.stack([_read_image(*place) for place in places])
-        return Batch(np.zeros(len(flat), bool), far, pool.config.positives, images=images)
+        return Batch(np.zeros(len(places), bool), far, pool.config.positives, images=images)
     points, count, classes, labelled = _padded([_read_scan(*place, categories) for place in places], max_points)
     has_labels = categories > 0 and any(drive.has_labels for drive in drives)
     return Batch(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
@@ -66,7 +67,10 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def restore(self, config: TrainConfig) -> TrainState:
-        """The newest state. Raises ValueError when there is none or it belongs to another model."""
+        """The newest state, in host memory: the devices it was saved from may be others than those it goes to.
+
+        Raises ValueError when there is none or it belongs to another model.
+        """
         self._manager.wait_until_finished()
         step = self.latest_step()
         if step is None:
@@ -80,11 +84,15 @@ class Checkpoints:
                 f"{self._manager.directory}/{step}: not a checkpoint of this configuration: expected {name} of shape "
                 f"{expected.get(name, 'none (no such weight)')}, found {there.get(name, 'none (missing)')}"
             )
+        weights, moments = (
+            jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), tree)
+            for tree in (like.params.weights, like.optimizer)
+        )
         items = ocp.args.Composite(
-            weights=ocp.args.StandardRestore(like.params.weights), optimizer=ocp.args.StandardRestore(like.optimizer)
+            weights=ocp.args.StandardRestore(weights), optimizer=ocp.args.StandardRestore(moments)
         )
         found: Any = self._manager.restore(step, args=items)
-        return TrainState(jax.numpy.asarray(step, "int32"), Params(found.weights, config.model), found.optimizer)
+        return TrainState(np.int32(step), Params(found.weights, config.model), found.optimizer)
 
     def unlogged(self) -> list[dict[str, float]]:
         """The measurements that the newest state was saved with."""

@@ -66,8 +66,8 @@ class TrainConfig:
     share_negatives: bool = False
     """Let every other tuple's places that are far enough away be negatives too."""
     chunk: int = 0
-    """Images that go through the network at a time (0: all). It changes memory and speed; of the results only which
-    branches stochastic depth drops."""
+    """Images that go through the network at a time, on all devices together (0: all). It changes memory and speed; of
+    the results only which branches stochastic depth drops."""
     rotate: bool = True
     """Turn every place about z by its own random angle at every step."""
     max_points: int = 131072
@@ -83,9 +83,9 @@ class TrainConfig:
             object.__setattr__(self, "model", dataclasses.replace(self.model, categories=0))
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
-        if (self.chunk or self.images) % self.loss.segment_every:
+        if self.images_at_once % self.loss.segment_every:
             raise ValueError(
-                f"loss.segment_every must divide the {self.chunk or self.images} images of a chunk, "
+                f"loss.segment_every must divide the {self.images_at_once} images of a chunk, "
                 f"found {self.loss.segment_every}"
             )
 
@@ -93,3 +93,8 @@ class TrainConfig:
     def images(self) -> int:
         """Images a step."""
         return self.tuples * (1 + self.sampling.positives + self.sampling.negatives)
+
+    @property
+    def images_at_once(self) -> int:
+        """Images of a chunk."""
+        return self.chunk or self.images

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -16,6 +17,8 @@ from sglpr_jax.data.loader import read_ahead
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.checkpoint import Checkpoints
 from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.train.devices import data_mesh, own_copy, replicate, split
+from sglpr_jax.train.hosts import is_first_host, of_first_host, on_any_host
 from sglpr_jax.train.metrics_log import MetricsLog
 from sglpr_jax.train.state import TrainState, new_state
 from sglpr_jax.train.step import train_step
@@ -40,35 +43,40 @@ def train(
     places: Callable[[int], str] | None = None,
     record: RecordFn = lambda step, values: None,
 ) -> TrainState:
-    """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch.
+    """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch (the host's part).
 
-    Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest one, if there is one yet.
-    `record` is told what the metrics are told. Raises FloatingPointError, naming the step and its batch as `places`
-    does, when the loss is no longer finite, and OSError when metrics or a checkpoint cannot be written.
+    All devices share a step. Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest
+    one, if there is one yet. `record` is told what the metrics are told. Raises FloatingPointError, naming the step and
+    its batch as `places` does, when the loss is no longer finite; OSError when metrics or a checkpoint cannot be
+    written; ValueError where the devices cannot share a step (`data_mesh`).
     """
     folder.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as opened:
         checkpoints = opened.enter_context(contextlib.closing(Checkpoints(folder / CHECKPOINTS)))
         go_on = resume and checkpoints.latest_step() is not None
-        state = checkpoints.restore(config) if go_on else new_state(config)
+        mesh = data_mesh(config)
+        state = replicate(checkpoints.restore(config) if go_on else new_state(config), mesh)
         unlogged = checkpoints.unlogged() if go_on else []
         start = int(state.step)
-        log = opened.enter_context(contextlib.closing(MetricsLog(folder / METRICS_FILE, start_step=start)))
-        batches = opened.enter_context(contextlib.closing(read_ahead(make_batch, start=start, stop=config.steps)))
+        path = folder / METRICS_FILE if is_first_host() else None
+        log = opened.enter_context(contextlib.closing(MetricsLog(path, start_step=start)))
+        parts = read_ahead(lambda step: split(make_batch(step), mesh), start=start, stop=config.steps)
+        batches = opened.enter_context(contextlib.closing(parts))
         progress = opened.enter_context(_progress())
         bar = progress.add_task("train", total=config.steps, completed=start, terms="")
-        for state, measured in _steps(config, state, batches, stopped, places, unlogged):  # noqa: B020 - in and out
+        made = _steps(config, mesh, state, batches, stopped, places, unlogged)
+        for state, measured in made:
             step = int(state.step)
             if measured:
                 progress.update(bar, completed=step, terms=_terms(measured))
                 log.append(step, measured)
                 record(step, measured)
             if _scored(config, step):
-                scores = score(state.params)
+                scores = score(own_copy(state.params)) if is_first_host() else {"score": 0.0}
                 log.append(step, scores)
                 record(step, scores)
                 log.sync()
-                checkpoints.save(state, score=scores.get("score"))
+                checkpoints.save(state, score=of_first_host(scores["score"]))
         log.sync()
         checkpoints.save(state, unlogged=unlogged)
     return state
@@ -76,6 +84,7 @@ def train(
 
 def _steps(
     config: TrainConfig,
+    mesh: Mesh,
     state: TrainState,
     batches: Iterator[Batch],
     stopped: Callable[[], bool],
@@ -92,9 +101,10 @@ def _steps(
         asked = time.perf_counter()
         batch = next(batches)
         waited += time.perf_counter() - asked
-        state, metrics = train_step(state, batch, config=config)
+        with jax.set_mesh(mesh):
+            state, metrics = train_step(state, batch, config=config)
         unlogged.append({name: float(value) for name, value in jax.device_get(metrics).items()})
-        made, step, stop = made + 1, int(state.step), stopped()
+        made, step, stop = made + 1, int(state.step), on_any_host(stopped())
         _require_finite(unlogged[-1], step, places)
         if step % config.log_every == 0 or _scored(config, step):
             seconds = time.perf_counter() - since
@@ -126,7 +136,7 @@ def _progress() -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.fields[terms]}"),
         console=Console(stderr=True),
-        disable=not Console(stderr=True).is_terminal,
+        disable=not (Console(stderr=True).is_terminal and is_first_host()),
     )
 
 

@@ -13,10 +13,14 @@ from sglpr_jax.files import writing
 class MetricsLog:
     """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped.
 
-    Raises OSError, naming the file, where a line cannot be written.
+    Without a path nothing is written: of several hosts one keeps the log. Raises OSError, naming the file, where a line
+    cannot be written.
     """
 
-    def __init__(self, path: Path, *, start_step: int = 0):
+    def __init__(self, path: Path | None, *, start_step: int = 0):
+        self._file = None
+        if path is None:
+            return
         kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
         temporary = path.with_name(f".{path.name}.tmp")
         with writing(path):
@@ -31,14 +35,18 @@ class MetricsLog:
 
     def sync(self) -> None:
         """Have the lines on the disk itself, before a checkpoint that is ahead of them is."""
-        with writing(self._path):
-            os.fsync(self._file.fileno())
+        if self._file:
+            with writing(self._path):
+                os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        if self._file:
+            self._file.close()
 
     def _write(self, line: dict[str, Any]) -> None:
+        if not self._file:
+            return
         left = json.dumps(line).encode() + b"\n"
         with writing(self._path):
             while left:  # a disk that is nearly full takes a part

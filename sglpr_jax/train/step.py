@@ -19,6 +19,7 @@ from sglpr_jax.data.batch import Batch, views
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import Params, field_of_view, forward
 from sglpr_jax.train.config import LossConfig, TrainConfig
+from sglpr_jax.train.devices import keep_replicated, keep_split, on_own_rows
 from sglpr_jax.train.state import TrainState, optimizer
 
 Metrics = dict[str, Float[Array, ""]]
@@ -54,7 +55,8 @@ def train_step(state: TrainState, batch: Batch, *, config: TrainConfig) -> tuple
     weights = optax.apply_updates(state.params.weights, updates)
     norms = {"gradient_norm": gradient, "update_norm": updates, "weight_norm": weights}
     metrics |= {name: optax.tree.norm(tree) for name, tree in norms.items()}
-    return TrainState(state.step + 1, dataclasses.replace(state.params, weights=weights), optimizer_state), metrics
+    state = TrainState(state.step + 1, dataclasses.replace(state.params, weights=weights), optimizer_state)
+    return keep_replicated(state), metrics
 
 
 def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -> tuple[Any, Metrics]:
@@ -147,14 +149,13 @@ def triplet_loss(
 
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
     """The batch as the network will see it, cut into chunks along a new leading axis."""
-    images_per_chunk = config.chunk or config.images
     angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) * config.rotate
-    images, maps = views(batch, angles, config.model.grid)
+    images, maps = on_own_rows(functools.partial(views, grid=config.model.grid))(batch, angles)
     maps = None if maps is None else jnp.where(field_of_view(config.model), maps, UNLABELLED)
-    keys = jax.random.split(model_key, config.images // images_per_chunk)
+    keys = jax.random.split(model_key, config.images // config.images_at_once)
     whole = (images, maps, jnp.asarray(batch.labelled))
-    cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), whole)
-    return Chunk(*cut, key=keys)
+    cut = jax.tree.map(lambda x: x.reshape(-1, config.images_at_once, *x.shape[1:]), whole)
+    return Chunk(*keep_split(cut, axis=1), key=keys)  # or each chunk would lie on one device
 
 
 def _merge(summaries: Summary) -> Summary:
