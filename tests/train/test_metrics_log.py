@@ -1,7 +1,6 @@
 """Measurements survive interruptions: nothing is lost, nothing is there twice."""
 
 import json
-import resource
 
 import numpy as np
 import pytest
@@ -57,14 +56,6 @@ def test_a_run_from_the_start_begins_an_empty_file(tmp_path):
     write(path, [1, 2]).close()
     write(path, [1]).close()
     assert [line["step"] for line in read_metrics(path)] == [1]
-
-
-@pytest.fixture
-def small_files():
-    """`small_files(size)`: from now on the system lets no file of this process grow beyond that many bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_full_disk_is_an_error_that_names_the_file_and_what_was_cut_short_is_repaired(tmp_path, small_files):
