@@ -1,5 +1,6 @@
 """Test-wide settings: strict ranks, and where the development data lies."""
 
+import resource
 from pathlib import Path
 
 import jax
@@ -21,6 +22,14 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no development data at {SHARED} (licences forbid shipping it)")
     return SHARED
+
+
+@pytest.fixture
+def small_files():
+    """`small_files(size)`: from now on the system lets no file of this process grow beyond that many bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,8 @@ def cache_folder() -> Path:
 def run(command: Callable[[], object]) -> None:
     """Run a command line: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax logs pages about a failed write, which it raises too
+    if sys.unraisablehook is sys.__unraisablehook__:
+        sys.unraisablehook = _show_unraisable
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     try:
@@ -36,6 +38,12 @@ def run(command: Callable[[], object]) -> None:
         sys.exit(f"error: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _show_unraisable(unraisable) -> None:
+    """What Python does, but for what a failed checkpoint leaves behind: each of its writes finds nobody waiting."""
+    if str(unraisable.exc_value) != "Event loop is closed":
+        sys.__unraisablehook__(unraisable)
 
 
 def console() -> Console:

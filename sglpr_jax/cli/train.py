@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -186,10 +187,15 @@ def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
     if resume:
         require_same_settings(folder, command)
     folder.mkdir(parents=True, exist_ok=True)
-    for left in folder.glob(".*.tmp"):  # by a process that was killed
-        left.unlink()
+    _sweep(folder)
     write_json(path, _settings(command))
     note_environment(folder, seed=command.config.seed)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what a process that was killed was writing: files under their temporary names."""
+    for left in [*folder.rglob(".*.tmp"), *folder.rglob(".*.png"), *folder.glob(".weights-*")]:
+        shutil.rmtree(left) if left.is_dir() else left.unlink()
 
 
 def require_same_settings(folder: Path, command: TrainCommand) -> None:

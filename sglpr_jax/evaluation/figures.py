@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.files import writing
 from sglpr_jax.labels import LabelMap, label_map
 from sglpr_jax.metrics import PrecisionRecallCurve
 
@@ -35,8 +36,9 @@ def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
     """Write the figure, whole or not at all, in the format that the ending of `path` names."""
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     try:
-        figure.savefig(temporary, dpi=DOTS_PER_INCH)
-        os.replace(temporary, path)
+        with writing(path):
+            figure.savefig(temporary, dpi=DOTS_PER_INCH)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -15,6 +15,7 @@ import safetensors
 import safetensors.numpy
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.files import writing
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.sglpr import Params, init
 
@@ -23,15 +24,18 @@ WEIGHTS_FILE = "model.safetensors"
 
 
 def save(params: Params, folder: Path | str) -> Path:
-    """Write weights and configuration under a temporary name, then put them in the place of `folder`."""
+    """Write weights and configuration under a temporary name, then put them in the place of `folder`.
+
+    Raises OSError, naming `folder`, where they cannot be written.
+    """
     folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     # safetensors writes an array's memory as it lies, so a transposed view would come back scrambled.
     flat = {name: np.asarray(leaf, order="C") for name, leaf in _flatten(params.weights).items()}
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
+    with writing(folder), tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"
         new.mkdir()
-        safetensors.numpy.save_file(flat, new / WEIGHTS_FILE)
+        (new / WEIGHTS_FILE).write_bytes(safetensors.numpy.save(flat))  # save_file hides the OSError of a full disk
         (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
         if folder.exists():
             os.replace(folder, old)

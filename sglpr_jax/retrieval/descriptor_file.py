@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sglpr_jax.files import writing
+
 FORMAT = "sglpr-jax descriptors 2"
 """Stands in every file; its number grows when an older reader could no longer understand one."""
 FORMAT_1 = "sglpr-jax descriptors 1"
@@ -65,7 +67,7 @@ class DescriptorFile:
         present = {name: array for name, array in arrays.items() if array is not None}
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
-            with temporary.open("wb") as stream:
+            with writing(path), temporary.open("wb") as stream:
                 np.savez(stream, about=np.array(json.dumps(about)), ids=np.array(self.ids), **present)
             os.replace(temporary, path)
         finally:

@@ -30,9 +30,12 @@ class Checkpoints:
     def __init__(self, folder: Path):
         self._folder = folder.resolve()
         self._sweep()
-        policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=lambda m: m["score"], n=1)])
+        policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=_score, n=1)])
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=policy, cleanup_tmp_directories=True, todelete_subdir=_OUTDATED
+            best_fn=_score,  # without it scores are not written, and a resumed run keeps all it finds
+            preservation_policy=policy,
+            cleanup_tmp_directories=True,
+            todelete_subdir=_OUTDATED,
         )
         handlers = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
         self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=handlers)
@@ -71,7 +74,7 @@ class Checkpoints:
 
         Raises ValueError when there is none or it belongs to another model.
         """
-        self._manager.wait_until_finished()
+        self._wait()
         step = self.latest_step()
         if step is None:
             raise ValueError(f"{self._manager.directory}: expected a checkpoint to resume from, found none")
@@ -96,6 +99,7 @@ class Checkpoints:
 
     def unlogged(self) -> list[dict[str, float]]:
         """The measurements that the newest state was saved with."""
+        self._wait()
         found = self._manager.metadata(self.latest_step()).custom_metadata or {}
         return [dict(measured) for measured in found.get(_UNLOGGED, ())]
 
@@ -127,8 +131,12 @@ class Checkpoints:
             yield
         except (OSError, ValueError) as error:
             code = re.search(r"os_error_code='(\d+)'", str(error))
-            reason = os.strerror(int(code[1])) if code else str(error)
+            reason = os.strerror(int(code[1])) if code else getattr(error, "strerror", None) or error
             raise OSError(f"{self._folder}: expected to write a checkpoint, found: {reason}; {_INTACT}") from error
+
+
+def _score(metrics: Any) -> float:
+    return metrics["score"]
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:

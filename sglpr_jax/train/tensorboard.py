@@ -19,8 +19,8 @@ def event_writer(folder: Path) -> Iterator[Callable[[int, Mapping[str, float]], 
     """
     try:  # not its SummaryWriter: that writes from a thread, where an error is lost
         from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
-        from tensorboardX.proto.summary_pb2 import Summary
+        from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue] - generated
+        from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
     except ImportError as error:
         raise ImportError("event files need the extra tensorboard: pip install 'sglpr-jax[tensorboard]'") from error
     writer = None

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 
@@ -13,6 +14,8 @@ import sglpr_jax
 from sglpr_jax.cli import train as train_command
 from sglpr_jax.cli.presets import load_preset
 from sglpr_jax.cli.train import TrainCommand, parse
+from sglpr_jax.data.bev_images import open_sequence
+from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.models.params import weights_hash
 from sglpr_jax.train.metrics_log import read_metrics
 
@@ -84,6 +87,38 @@ def test_a_run_can_be_loaded_and_says_what_it_was(trained, preset, town):
     assert [line["step"] for line in lines if "loss" in line] == [1, 2, 3, 4]
     assert [line["step"] for line in lines if "score" in line] == [2, 4]
     assert {"triplet", "cross_entropy", "dice", "steps_per_second", "data_wait"} <= lines[0].keys()
+
+
+def test_a_run_shows_how_it_went_and_where(trained):
+    folder, ended = trained
+    with Image.open(folder / "learning-curves.png") as picture:
+        assert picture.size[1] > picture.size[0] > 200  # three panels below each other
+    environment = json.loads((folder / "environment.json").read_text())
+    assert environment["command"].startswith("train --seq 08") and environment["resumes"] == []
+    said = re.search(r"([\d.]+) steps/s, ([\d.]+) tuples/s, [\d.]+% of the time waiting for data", ended.error)
+    assert said and float(said[2]) == pytest.approx(2 * float(said[1]), rel=0.01)
+
+
+def test_a_loss_that_is_not_finite_names_the_step_and_the_frames(command, images, preset, tmp_path):
+    options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
+    ended = command("train", *options, "--optimizer.learning-rate", "1e38")
+    pool = TuplePool([open_sequence(images, "00").positions], load_preset(str(preset)).sampling)
+    frames = np.unique(pool.draw(seed=0, step=1, tuples=2))
+    named = " ".join(f"{frame:06d}" for frame in frames)
+    assert_one_line_error(ended, "step 2: ", "loss", "not finite", f"(batch: drive 00 frames {named})")
+    assert len(frames) > 4
+
+
+def test_event_files_are_written_when_asked_for_and_do_not_hinder_a_resume(
+    command, images, preset, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    out = tmp_path / "run"
+    options = ("--seq", "06", "--data", images, "--preset", preset, "--out", out)
+    assert command("train", *options, "--tensorboard").status == 0
+    (events,) = (out / "tensorboard").iterdir()
+    assert b"gradient_norm" in events.read_bytes() and b"score" in events.read_bytes()
+    assert command("train", *options, "--resume").status == 0
 
 
 def test_a_run_is_not_overwritten(command, trained, town, preset):

@@ -54,6 +54,16 @@ def test_a_trajectory_shows_each_decision_in_its_colour(tmp_path, two_laps):
     assert shows(picture, (0x2B, 0x5F, 0xC4))
 
 
+def test_learning_curves_have_a_panel_each_over_the_same_steps(tmp_path):
+    terms = {"loss": [(10, 0.5), (30, 0.2)], "dice": [(10, 0.9), (30, 0.8)]}
+    figure = figures.learning_curves({"loss": terms, "score": {}, "gradient norm": {"norm": [(30, 2.0)]}})
+    assert [axes.get_ylabel() for axes in figure.axes] == ["loss", "score", "gradient norm"]
+    assert legend(figure) == ["loss", "dice"]
+    assert [line.get_ydata().tolist() for line in figure.axes[0].lines] == [[0.5, 0.2], [0.9, 0.8]]
+    assert figure.axes[0].get_xlim() == figure.axes[2].get_xlim() and figure.axes[2].get_xlabel() == "step"
+    assert pixels(figure, tmp_path / "curves.png").std() > 10
+
+
 def test_a_learning_curve_stands_beside_its_references(tmp_path):
     figure = figures.learning_curve(
         {"raw": [(0, 0.1), (100, 0.6)], "rotated": [(0, 0.1), (100, 0.5)]},

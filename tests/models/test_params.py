@@ -30,6 +30,15 @@ def test_weights_and_configuration_come_back_bit_by_bit(params, tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == [CONFIG_FILE, WEIGHTS_FILE]
 
 
+def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_what_was_there(params, tmp_path, small_files):
+    folder = save(params, tmp_path / "weights")
+    small_files(10_000)
+    with pytest.raises(OSError, match=rf"{folder}: expected to write it, found: File too large"):
+        save(jax.tree.map(np.zeros_like, params), folder)
+    assert weights_hash(load(folder)) == weights_hash(params)
+    assert [path.name for path in tmp_path.iterdir()] == ["weights"]
+
+
 @pytest.mark.parametrize("preset", MODELS)
 def test_every_preset_s_configuration_survives_json(preset, tmp_path):
     config = model_preset(preset)

@@ -1,6 +1,8 @@
 """Checkpoints come back bit by bit, the newest and the best stay, and those of another model are refused."""
 
 import dataclasses
+import shutil
+from types import SimpleNamespace
 
 import chex
 import jax
@@ -51,6 +53,50 @@ def test_the_two_newest_and_the_best_are_kept(checkpoints, state, config, tmp_pa
     assert checkpoints.restore(config).step == 5
     checkpoints.close()
     assert sorted(folder.name for folder in (tmp_path / "checkpoints").iterdir()) == ["1", "4", "5"]
+
+
+def test_the_best_is_still_known_after_a_resume(checkpoints, state, tmp_path):
+    for step, score in enumerate([0.1, 0.9, 0.2, 0.3]):
+        checkpoints.save(state.replace(step=jnp.int32(step)), score=score)
+    checkpoints.close()
+    resumed = Checkpoints(tmp_path / "checkpoints")
+    for step, score in ((4, None), (5, 0.4)):
+        resumed.save(state.replace(step=jnp.int32(step)), score=score)
+    resumed.close()
+    assert sorted(folder.name for folder in (tmp_path / "checkpoints").iterdir()) == ["1", "4", "5"]
+
+
+def test_measurements_not_yet_logged_come_back_with_the_state(checkpoints, state):
+    measured = [{"loss": 0.1 + 0.2, "dice": 1e-7}, {"loss": 1 / 3, "dice": 0.0}]
+    checkpoints.save(state, unlogged=measured)
+    assert checkpoints.unlogged() == measured
+    checkpoints.save(state.replace(step=state.step + 1))
+    assert checkpoints.unlogged() == []
+
+
+def test_what_a_killed_process_left_half_written_or_half_deleted_is_swept(checkpoints, state, config, tmp_path):
+    checkpoints.save(state)
+    checkpoints.close()
+    folder = tmp_path / "checkpoints"
+    shutil.copytree(folder / "17", folder / "18.orbax-checkpoint-tmp")
+    shutil.copytree(folder / "17" / "weights", folder / "outdated" / "3" / "weights")
+    resumed = Checkpoints(folder)
+    chex.assert_trees_all_equal(resumed.restore(config), state)
+    resumed.close()
+    assert [path.name for path in folder.iterdir()] == ["17"]
+
+
+def test_a_disk_too_full_for_a_checkpoint_is_an_error_before_anything_is_written(
+    checkpoints, state, config, tmp_path, monkeypatch
+):
+    checkpoints.save(state)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+        message = rf"{tmp_path}/checkpoints: expected [\d,]+ bytes free .*, found 1,000; the last checkpoint is intact"
+        with pytest.raises(OSError, match=message):
+            checkpoints.save(state.replace(step=jnp.int32(18)))
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["17"]
+    chex.assert_trees_all_equal(checkpoints.restore(config), state)
 
 
 def test_a_step_is_saved_once(checkpoints, state, config):

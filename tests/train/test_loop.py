@@ -85,6 +85,21 @@ def test_stopped_and_resumed_is_uninterrupted(config, make_batch, fast_step, tmp
     assert logged(folders[1]) == logged(folders[0])
 
 
+def test_a_stop_between_two_lines_of_the_log_leaves_no_trace_in_it(config, make_batch, fake_step, tmp_path):
+    fake_step()
+    config = dataclasses.replace(config, steps=12, log_every=5, score_every=8)
+    folders = tmp_path / "whole", tmp_path / "resumed"
+    train(config, make_batch, folders[0], score=size_of_weights)
+    stops = []
+    while not stops or stops[-1] < config.steps:  # by twos: some between lines, some at one
+        state = train(config, make_batch, folders[1], score=size_of_weights, resume=bool(stops), stopped=after(2))
+        stops.append(int(state.step))
+    assert stops == [2, 4, 6, 8, 10, 12]
+    assert logged(folders[1]) == logged(folders[0])
+    losses = [(line["step"], line["loss"]) for line in logged(folders[0]) if "loss" in line]
+    assert losses == [(5, 3), (8, 7), (10, 9.5), (12, 11.5)]
+
+
 def test_measurements_are_means_since_the_last_line(config, make_batch, fake_step, tmp_path):
     fake_step()
     config = dataclasses.replace(config, steps=7, log_every=3, score_every=100)
@@ -105,6 +120,20 @@ def test_a_loss_that_is_not_finite_ends_the_run_at_its_step(config, make_batch, 
     chex.assert_trees_all_equal(found.params, params)
 
 
+def test_the_batch_of_a_broken_step_is_named(config, make_batch, fake_step, tmp_path):
+    fake_step(broken=3)
+    words = r"^step 3: loss not finite \(batch: the one read for 2\); the last checkpoint is intact$"
+    with pytest.raises(FloatingPointError, match=words):
+        train(config, make_batch, tmp_path, score=size_of_weights, places=lambda step: f"the one read for {step}")
+
+
+def test_all_that_is_measured_is_recorded(config, make_batch, fake_step, tmp_path):
+    fake_step()
+    told = []
+    train(config, make_batch, tmp_path, score=size_of_weights, record=lambda step, values: told.append((step, values)))
+    assert [{"step": step, **values} for step, values in told] == read_metrics(tmp_path / METRICS_FILE)
+
+
 def test_a_batch_that_cannot_be_read_ends_the_run_with_its_own_error(config, make_batch, fake_step, tmp_path):
     fake_step()
 
@@ -116,6 +145,9 @@ def test_a_batch_that_cannot_be_read_ends_the_run_with_its_own_error(config, mak
     with pytest.raises(ValueError, match=r"000007\.bin: not a whole scan"):
         train(config, make, tmp_path, score=size_of_weights)
     assert [line["step"] for line in logged(tmp_path)] == [1, 2, 2]
+    resumed = train(config, make_batch, tmp_path, score=size_of_weights, resume=True)
+    assert resumed.step == config.steps
+    assert [line["step"] for line in logged(tmp_path)] == [1, 2, 2, 3, 4, 4, 5, 6, 6]
 
 
 def test_the_score_decides_which_checkpoint_is_the_best(config, make_batch, fake_step, tmp_path):

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from sglpr_jax.train.metrics_log import MetricsLog, read_metrics
 
@@ -55,3 +56,27 @@ def test_a_run_from_the_start_begins_an_empty_file(tmp_path):
     write(path, [1, 2]).close()
     write(path, [1]).close()
     assert [line["step"] for line in read_metrics(path)] == [1]
+
+
+def test_a_full_disk_is_an_error_that_names_the_file_and_what_was_cut_short_is_repaired(tmp_path, small_files):
+    path = tmp_path / "metrics.jsonl"
+    log = write(path, [1, 2])
+    whole = path.read_bytes()
+    small_files(len(whole) + 10)
+    with pytest.raises(OSError, match=rf"{path}: expected to write it, found: File too large"):
+        log.append(3, {"loss": 0.3})
+    log.close()
+    assert len(path.read_bytes()) == len(whole) + 10  # a part of the third line
+    small_files(len(whole))
+    write(path, [], start_step=2).close()
+    assert path.read_bytes() == whole
+
+
+def test_a_full_disk_leaves_the_metrics_of_a_run_to_be_resumed_as_they_were(tmp_path, small_files):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 2, 3]).close()
+    whole = path.read_bytes()
+    small_files(10)
+    with pytest.raises(OSError, match=rf"{path}: expected to write it, found: File too large"):
+        write(path, [], start_step=3)
+    assert path.read_bytes() == whole
