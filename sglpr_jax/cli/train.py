@@ -25,7 +25,7 @@ from sglpr_jax.models.params import save
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.devices import own_copy
-from sglpr_jax.train.hosts import connected, is_first_host, own_part
+from sglpr_jax.train.hosts import connected, is_first_host, on_all_hosts, own_part
 from sglpr_jax.train.loop import METRICS_FILE, train
 from sglpr_jax.train.metrics_log import read_metrics
 
@@ -102,8 +102,7 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
         for drive in (*drives, test):
             _require_labels(drive)
     pool, make_batch = batches(drives, config)
-    if is_first_host():
-        _claim(folder, command, resume=command.resume)
+    on_all_hosts(lambda: is_first_host() and _claim(folder, command, resume=command.resume))
     with stop_on_signal() as stopped:
         score = training_recall(drives, pool, config)
         state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)

@@ -16,7 +16,7 @@ from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.checkpoint import Checkpoints
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.devices import data_mesh, own_copy, replicate, split
-from sglpr_jax.train.hosts import is_first_host, of_first_host, on_any_host
+from sglpr_jax.train.hosts import is_first_host, of_first_host, on_all_hosts, on_any_host
 from sglpr_jax.train.metrics_log import MetricsLog
 from sglpr_jax.train.state import TrainState, new_state
 from sglpr_jax.train.step import train_step
@@ -58,9 +58,9 @@ def train(
                 progress.update(bar, completed=int(state.step), terms=_terms(measured))
                 log.append(int(state.step), measured)
                 if int(state.step) % config.score_every == 0 or int(state.step) == config.steps:
-                    scores = score(own_copy(state.params)) if is_first_host() else {"score": 0.0}
+                    scores = _score_once(score, state.params)
                     log.append(int(state.step), scores)
-                    checkpoints.save(state, score=of_first_host(scores["score"]))
+                    checkpoints.save(state, score=scores["score"])
         checkpoints.save(state)
     finally:
         batches.close()
@@ -76,7 +76,7 @@ def _steps(
     since, measured, waited, stop = time.perf_counter(), [], 0.0, False
     while int(state.step) < config.steps and not stop:
         asked = time.perf_counter()
-        batch = next(batches)
+        batch = on_all_hosts(lambda: next(batches))
         waited += time.perf_counter() - asked
         with jax.set_mesh(mesh):
             state, metrics = train_step(state, batch, config=config)
@@ -88,6 +88,12 @@ def _steps(
             means = {name: float(np.mean([m[name] for m in measured])) for name in metrics}
             yield state, means | {"steps_per_second": len(measured) / seconds, "data_wait": waited / seconds}
             since, measured, waited = time.perf_counter(), [], 0.0
+
+
+def _score_once(score: ScoreFn, params: Params) -> dict[str, float]:
+    """The scores, taken by the first host; the others learn the one that tells checkpoints apart."""
+    own = on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {"score": 0.0})
+    return own | {"score": of_first_host(own["score"])}
 
 
 def _require_finite(metrics: dict[str, np.ndarray], step: int) -> None:
