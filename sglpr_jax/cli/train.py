@@ -27,7 +27,7 @@ from sglpr_jax.models.params import save
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.devices import own_copy
-from sglpr_jax.train.hosts import connected, is_first_host, own_part
+from sglpr_jax.train.hosts import connected, is_first_host, on_all_hosts, own_part
 from sglpr_jax.train.loop import METRICS_FILE, train
 from sglpr_jax.train.metrics_log import read_metrics
 from sglpr_jax.train.tensorboard import EVENTS, event_writer
@@ -113,8 +113,7 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
     pool, make_batch = batches(drives, config)
     watched = command.tensorboard and is_first_host()
     with event_writer(folder / EVENTS) if watched else contextlib.nullcontext(_ignore) as record:
-        if is_first_host():
-            _claim(folder, command, resume=command.resume)
+        on_all_hosts(lambda: is_first_host() and _claim(folder, command, resume=command.resume))
         with stop_on_signal() as stopped:
             score = training_recall(drives, pool, config)
             state = train(

@@ -7,7 +7,7 @@ to float32 rounding.
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -22,13 +22,13 @@ Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable)
 
 
-def data_mesh(config: TrainConfig, devices: Sequence[jax.Device] | None = None) -> Mesh:
+def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh:
     """The devices of a run in one row, host after host (default: of all there are).
 
     They must divide the tuples of a step and the images of a chunk. Of each host as many are used as do, the rest is
     left idle, which is said on stderr. Raises ValueError where not even one device of each host does.
     """
-    by_host: dict[int, list[jax.Device]] = {}
+    by_host: dict[int, list[Any]] = {}
     for device in jax.devices() if devices is None else devices:
         by_host.setdefault(device.process_index, []).append(device)
     there = min(map(len, by_host.values()))

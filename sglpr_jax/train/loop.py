@@ -18,7 +18,7 @@ from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.checkpoint import Checkpoints
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.devices import data_mesh, own_copy, replicate, split
-from sglpr_jax.train.hosts import is_first_host, of_first_host, on_any_host
+from sglpr_jax.train.hosts import is_first_host, of_first_host, on_all_hosts, on_any_host
 from sglpr_jax.train.metrics_log import MetricsLog
 from sglpr_jax.train.state import TrainState, new_state
 from sglpr_jax.train.step import train_step
@@ -72,11 +72,11 @@ def train(
                 log.append(step, measured)
                 record(step, measured)
             if _scored(config, step):
-                scores = score(own_copy(state.params)) if is_first_host() else {"score": 0.0}
+                scores = _score_once(score, state.params)
                 log.append(step, scores)
                 record(step, scores)
                 log.sync()
-                checkpoints.save(state, score=of_first_host(scores["score"]))
+                checkpoints.save(state, score=scores["score"])
         log.sync()
         checkpoints.save(state, unlogged=unlogged)
     return state
@@ -99,7 +99,7 @@ def _steps(
     since, waited, made, stop = time.perf_counter(), 0.0, 0, False
     while int(state.step) < config.steps and not stop:
         asked = time.perf_counter()
-        batch = next(batches)
+        batch = on_all_hosts(lambda: next(batches))
         waited += time.perf_counter() - asked
         with jax.set_mesh(mesh):
             state, metrics = train_step(state, batch, config=config)
@@ -119,6 +119,12 @@ def _steps(
 def _scored(config: TrainConfig, step: int) -> bool:
     """Whether a step is followed by a score and a checkpoint."""
     return step % config.score_every == 0 or step == config.steps
+
+
+def _score_once(score: ScoreFn, params: Params) -> dict[str, float]:
+    """The scores, taken by the first host; the others learn the one that tells checkpoints apart."""
+    own = on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {"score": 0.0})
+    return own | {"score": of_first_host(own["score"])}
 
 
 def _require_finite(metrics: dict[str, float], step: int, places: Callable[[int], str] | None) -> None:

@@ -121,6 +121,17 @@ def test_the_negatives_of_each_anchor_are_those_of_brute_force(drives, pool, sha
     assert batch.positives == 1
 
 
+@pytest.mark.parametrize("share_negatives", [False, True])
+def test_the_parts_of_two_hosts_are_the_whole_batch(drives, pool, share_negatives):
+    options = {"max_points": 9, "share_negatives": share_negatives}
+    whole = read_batch(drives, pool, FRAMES, **options)
+    parts = [read_batch(drives, pool, FRAMES, **options, part=slice(i, i + 1)) for i in range(2)]
+    assert parts[0].far.shape == (1, 8) and parts[0].points.shape == (4, 9, 3)
+    assert parts[1].classes is not None  # the second host reads the second drive alone, which has no labels
+    joined = jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
+    jax.tree.map(np.testing.assert_array_equal, joined, whole)
+
+
 def test_views_are_the_rasterised_turned_points(drives, pool):
     batch = read(drives, pool)
     angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 8).astype(np.float32)

@@ -1,0 +1,38 @@
+"""One device runs the program that it ran without a mesh; what several do, a process of its own shows."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from sglpr_jax.train.devices import data_mesh
+from sglpr_jax.train.state import new_state
+from sglpr_jax.train.step import train_step
+
+
+def test_eight_devices():
+    flags = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_force_host_platform_device_count=8"}
+    tests = Path(__file__).with_name("eight_devices.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tests)]
+    ended = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "7 passed" in ended.stdout
+
+
+def test_on_one_device_the_step_is_the_one_without_a_mesh(config, params, make_batch):
+    def traced():
+        return str(train_step.trace(new_state(config, params=params), make_batch(0), config=config).jaxpr)
+
+    without = traced()
+    with jax.set_mesh(data_mesh(config, jax.devices()[:1])):
+        assert traced() == without
+
+
+def test_hosts_that_do_not_divide_a_step_are_refused(config):
+    hosts = [SimpleNamespace(process_index=i) for i in range(3)]
+    with pytest.raises(ValueError, match=r"2 tuples of a step and the 8 images of a chunk .* found 3 hosts"):
+        data_mesh(config, hosts)
