@@ -4,28 +4,33 @@ import dataclasses
 import importlib.util
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from sglpr_jax.cli.datasets import dataset_root, leave_one_out
+from sglpr_jax.cli.datasets import all_drives, dataset_root, leave_one_out
 from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.presets import load_preset, preset_asked_for, preset_names
 from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
+from sglpr_jax.cli.training_batches import batches, positions_of, tuple_pool
 from sglpr_jax.cli.training_recall import training_recall
+from sglpr_jax.cli.validation import validation_score
 from sglpr_jax.data import Drive, ScanSequence
-from sglpr_jax.data.batch import Batch, read_batch
+from sglpr_jax.data.held_out import hold_out
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.evaluation import figures
 from sglpr_jax.models.params import save
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
-from sglpr_jax.train.loop import METRICS_FILE, train
+from sglpr_jax.train.describe_places import describe_places
+from sglpr_jax.train.loop import METRICS_FILE, best_params, train
 from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.train.mining import FOLDER as MINING
+from sglpr_jax.train.mining import DescribeFn, Mining
 
 CONFIG_FILE = "config.json"
 
@@ -38,6 +43,7 @@ class TrainCommand:
       bin/train --seq 08                                  on the simulated drives, preset small
       bin/train --seq 08 --data KITTI --preset paper
       bin/train --seq 08 --data KITTI --resume            goes on where the run was stopped
+      bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
       bin/train --seq 08 --model.head.cbam False          an ablation; docs/ablations.md has all
     """
@@ -46,6 +52,9 @@ class TrainCommand:
     """The drive to test on; it is never trained on."""
     data: Path | None = None
     """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated drives."""
+    also: tuple[Path, ...] = ()
+    """Further datasets, all of whose drives are trained on, with --also-tuples of a step's tuples: simulated scans with
+    labels, say, beside real images without."""
     preset: str = "small"
     """A file of configs/ by name, or a path to one of your own."""
     out: Path | None = None
@@ -84,51 +93,63 @@ def run_folder(command: TrainCommand) -> Path:
 def train_only(command: TrainCommand) -> tuple[Params, Drive]:
     """Train, and save the weights; returns them with the drive to test on. Exits with 130 where it is interrupted."""
     folder = run_folder(command)
-    root = dataset_root(command.data)
-    drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
     config = command.config
-    if config.model.categories_read:
-        for drive in (*drives, test):
-            _require_labels(drive)
-    pool, make_batch = batches(drives, config)
+    drives, also, test = _drives(command)
+    splits = [hold_out(positions_of(drive), config.validation, config.sampling) for drive in drives]
+    pool = tuple_pool(drives, config, frames=[split.training for split in splits])
+    mining = None
+    if config.sampling.mining == "hardest":
+        mining = Mining(_describe_unturned(drives, pool, config), len(pool), config, folder / MINING)
+    make_batch = batches(drives, pool, config, also=also, mining=mining)
+    if config.validation.share:
+        score = validation_score(drives, [split.validation for split in splits], config)
+    else:
+        score = training_recall(drives, pool, config)
     _claim(folder, command, resume=command.resume)
     with stop_on_signal() as stopped:
-        score = training_recall(drives, pool, config)
-        state = train(config, make_batch, folder, score=score, resume=command.resume, stopped=stopped)
-    save(state.params, folder / "weights")
+        refresh = mining.refresh if mining else None
+        state = train(config, make_batch, folder, score=score, refresh=refresh, resume=command.resume, stopped=stopped)
     if int(state.step) < config.steps:
+        save(state.params, folder / "weights")
         print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
         sys.exit(130)
+    params = best_params(folder, config) if config.select == "best" else state.params
+    save(params, folder / "weights")
     draw_learning_curve(folder)
-    return state.params, test
+    return params, test
 
 
-def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Callable[[int], Batch]]:
-    """The tuples that drives hold, and the batch of each step, a function of the step alone."""
-    pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
-
-    def make_batch(step: int) -> Batch:
-        frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
-        return read_batch(
-            drives,
-            pool,
-            frames,
-            max_points=config.max_points,
-            share_negatives=config.share_negatives,
-            categories=config.model.categories,
+def _drives(command: TrainCommand) -> tuple[list[Drive], list[Drive], Drive]:
+    """The drives to train on, those of --also, and the one to test on. ValueError where one cannot be used."""
+    root = dataset_root(command.data)
+    drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
+    also = [drive for folder in command.also for drive in all_drives(folder, poses=command.poses)]
+    if any(folder.resolve() == root.resolve() for folder in command.also):
+        raise ValueError(f"--also {root}: expected another dataset than the one whose drive {command.seq} is tested")
+    if bool(also) != bool(command.config.also_tuples):
+        raise ValueError(
+            "--also names datasets and --also-tuples how many tuples of a step are theirs: expected both or neither, "
+            f"found {len(command.also)} datasets and {command.config.also_tuples} tuples"
         )
+    if command.config.model.categories_read:
+        for drive in (*drives, *also, test):
+            _require_labels(drive)
+    return drives, also, test
 
-    return pool, make_batch
+
+def _describe_unturned(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig) -> DescribeFn:
+    return lambda params, places: describe_places(params, drives, pool, places, np.zeros(len(places)), config)
 
 
 def draw_learning_curve(folder: Path) -> None:
-    """Draw a run's loss and its score, recall@1 among its own places, over the steps."""
+    """Draw a run's loss and its score, of what is held out or of its own places, over the steps."""
     if not importlib.util.find_spec("matplotlib"):
         return
     lines = read_metrics(folder / METRICS_FILE)
-    names = {"loss": "loss", "score": "recall@1 of training places"}
+    held_out = any("recall_neighbours" in line for line in lines)
+    names = {"loss": "loss", "score": "score of held-out places" if held_out else "recall@1 of training places"}
     curves = {title: [(line["step"], line[name]) for line in lines if name in line] for name, title in names.items()}
-    figures.save(figures.learning_curve(curves, ylabel="loss, recall@1"), folder / "learning-curve.png")
+    figures.save(figures.learning_curve(curves, ylabel="loss, score"), folder / "learning-curve.png")
 
 
 def _claim(folder: Path, command: TrainCommand, *, resume: bool) -> None:
@@ -176,10 +197,6 @@ def _require_labels(drive: Drive) -> None:
             f"model.head.input reads labels: expected labels beside every scan of sequence {drive.name}, "
             f"found {labelled} of {len(drive)}"
         )
-
-
-def _positions(drive) -> np.ndarray:
-    return drive.positions
 
 
 def _description() -> str:

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.data.batch import Batch
-from sglpr_jax.data.loader import read_ahead
 from sglpr_jax.models.sglpr import Params
+from sglpr_jax.train.batches import Batches, RefreshFn
 from sglpr_jax.train.checkpoint import Checkpoints
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.metrics_log import MetricsLog
@@ -31,11 +31,13 @@ def train(
     folder: Path,
     *,
     score: ScoreFn,
+    refresh: RefreshFn | None = None,
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> TrainState:
     """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch.
 
+    `refresh(step, params)` is called before the first step and before each multiple of `sampling.refresh_steps`.
     Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest one, if there is one yet.
     Raises FloatingPointError, naming the step, when the loss is no longer finite.
     """
@@ -45,7 +47,8 @@ def train(
     state = checkpoints.restore(config) if go_on else new_state(config)
     start = int(state.step)
     log = MetricsLog(folder / METRICS_FILE, start_step=start)
-    batches = read_ahead(make_batch, start=start, stop=config.steps)
+    every = config.sampling.refresh_steps
+    batches = Batches(make_batch, start=start, stop=config.steps, refresh=refresh, refresh_steps=every)
     try:
         with _progress() as progress:
             bar = progress.add_task("train", total=config.steps, completed=start, terms="")
@@ -64,12 +67,22 @@ def train(
     return state
 
 
+def best_params(folder: Path, config: TrainConfig) -> Params:
+    """The weights with the best score of the run in `folder`."""
+    checkpoints = Checkpoints(folder / CHECKPOINTS)
+    try:
+        return checkpoints.best_params(config)
+    finally:
+        checkpoints.close()
+
+
 def _steps(
-    config: TrainConfig, state: TrainState, batches: Iterator[Batch], stopped: Callable[[], bool]
+    config: TrainConfig, state: TrainState, batches: Batches, stopped: Callable[[], bool]
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps."""
     since, measured, waited, stop = time.perf_counter(), [], 0.0, False
     while int(state.step) < config.steps and not stop:
+        batches.prepare(state.params)
         asked = time.perf_counter()
         batch = next(batches)
         waited += time.perf_counter() - asked

@@ -19,6 +19,7 @@ from sglpr_jax.data.batch import Batch, views
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import Params, field_of_view, forward
 from sglpr_jax.train.config import LossConfig, TrainConfig
+from sglpr_jax.train.place_order import in_batch_order, in_network_order
 from sglpr_jax.train.state import TrainState, optimizer
 
 Metrics = dict[str, Float[Array, ""]]
@@ -104,8 +105,8 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
     """Equation 8 of a whole batch, and its terms."""
-    triplet, metrics = triplet_loss(summary.descriptors, batch, config)
-    segmented = jnp.asarray(batch.labelled)[:: config.segment_every]
+    triplet, metrics = triplet_loss(in_batch_order(summary.descriptors, batch, config), batch, config)
+    segmented = in_network_order(jnp.asarray(batch.labelled), batch, config)[:: config.segment_every]
     terms = {}
     if summary.cross_entropy is not None:
         terms["cross_entropy"] = summary.cross_entropy / jnp.maximum(segmented.sum(), 1)
@@ -125,8 +126,9 @@ def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Floa
 def triplet_loss(
     descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Equation 5, averaged over the batch's tuples, and the share of tuples that still violate the margin."""
-    tuples = batch.far.shape[0]
+    """Equation 5, averaged over the tuples of `batch.far`, and the share of them that still violate the margin."""
+    tuples, places = batch.far.shape
+    descriptors = descriptors[:places]
     grouped = descriptors.reshape(tuples, -1, descriptors.shape[-1])
     anchors = grouped[:, :1]
     positives = grouped[:, 1 : 1 + batch.positives]
@@ -153,6 +155,7 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     maps = None if maps is None else jnp.where(field_of_view(config.model), maps, UNLABELLED)
     keys = jax.random.split(model_key, config.images // images_per_chunk)
     whole = (images, maps, jnp.asarray(batch.labelled))
+    whole = jax.tree.map(lambda x: in_network_order(x, batch, config.loss), whole)
     cut = jax.tree.map(lambda x: x.reshape(-1, images_per_chunk, *x.shape[1:]), whole)
     return Chunk(*cut, key=keys)
 
