@@ -44,7 +44,7 @@ class DescriptorCache:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: expected descriptors of places, found no such file")
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
                 return cls(file["places"], file["descriptors"])
         except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path}: expected descriptors of places, found no such archive ({error})") from error
