@@ -1,5 +1,7 @@
 """Two sources in one batch: real images without labels, say, and simulated scans with them."""
 
+import dataclasses
+
 import numpy as np
 
 from sglpr_jax.data.batch import Batch
@@ -16,4 +18,5 @@ def mix(main: Batch, also: Batch, *, triplets: bool, share_negatives: bool) -> B
         other = np.full((len(main.far), also.far.shape[1]), share_negatives)
         back = np.full((len(also.far), main.far.shape[1]), share_negatives)
         far = np.block([[main.far, other], [back, also.far]])
-    return main.replace(labelled=np.concatenate([main.labelled, also.labelled]), far=far, also=also)
+    labelled = np.concatenate([main.labelled, also.labelled])
+    return dataclasses.replace(main, labelled=labelled, far=far, also=also)

@@ -117,7 +117,7 @@ class TuplePool:
         """As many frame numbers as `draw` returns, but any places, where what counts is that they differ."""
         rng = np.random.default_rng([seed, step])
         shape = tuples, 1 + self.config.positives + self.config.negatives
-        return rng.choice(len(self), shape, replace=np.prod(shape) > len(self))
+        return rng.choice(len(self), shape, replace=bool(np.prod(shape) > len(self)))
 
     def _draw_anchored(self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None) -> list[int]:
         """An anchor and its positives; `cluster` are the anchors of the same cluster that were drawn before."""

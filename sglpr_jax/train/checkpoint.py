@@ -67,7 +67,8 @@ class Checkpoints:
         best = max(scores, key=lambda step: (scores[step], step))
         like = jax.eval_shape(lambda: new_state(config)).params.weights
         items = ocp.args.Composite(weights=ocp.args.StandardRestore(like))
-        return Params(self._manager.restore(best, args=items).weights, config.model)
+        found: Any = self._manager.restore(best, args=items)
+        return Params(found.weights, config.model)
 
     def close(self) -> None:
         """Wait until everything is written."""

@@ -16,7 +16,7 @@ from sglpr_jax.models.sglpr import Params
 
 HEAD = HeadConfig(tap="tokens", channels=(16,), kernels=(3,), strides=(1,), cbam_reduction=4, clusters=4)
 TINY = dataclasses.replace(
-    model_preset("tiny"), grid=Grid(resolution_m=3.2, height=16, width=16), depths=(2,), heads=(2,), drop_path=0.0
+    model_preset("tiny"), grid=Grid(resolution_m=3.2, height=16, width=16), depths=(1,), heads=(2,), drop_path=0.0
 )
 MODELS: dict[str, ModelConfig] = {
     "pixels": dataclasses.replace(TINY, head=dataclasses.replace(HEAD, tap="pixels", strides=(4,), kernels=(4,))),
@@ -58,12 +58,12 @@ def test_descriptors_and_logits_agree_and_are_float32(params, images):
     np.testing.assert_allclose(np.linalg.norm(rounded, axis=-1), 1, rtol=1e-6)
     exact, rounded = np.asarray(exact), np.asarray(rounded)
     off = np.linalg.norm(rounded - exact, axis=-1)
-    print(off.max() / EPSILON, np.linalg.norm(exact[:, None] - exact[None], axis=-1)[~np.eye(6, dtype=bool)].min())
-    assert 0 < off.max() < 12 * EPSILON
+    apart = np.linalg.norm(exact[:, None] - exact[None], axis=-1)
+    assert 0 < off.max() < 4 * EPSILON
+    assert off.max() < 0.5 * apart[~np.eye(len(exact), dtype=bool)].min()  # it does not mix places up
     if logits is not None:
         assert rounded_logits.dtype == jnp.float32
-        print(np.abs(rounded_logits - logits).max() / np.abs(logits).max() / EPSILON)
-        np.testing.assert_allclose(rounded_logits, logits, rtol=0, atol=12 * EPSILON * np.abs(logits).max())
+        np.testing.assert_allclose(rounded_logits, logits, rtol=0, atol=6 * EPSILON * np.abs(logits).max())
 
 
 def test_gradients_are_float32_finite_and_nearly_those_of_float32(params, images):
@@ -81,8 +81,8 @@ def test_gradients_are_float32_finite_and_nearly_those_of_float32(params, images
     assert 0.98 < cosine < 1 - 1e-9
 
 
-def test_an_empty_image_and_one_of_many_points_stay_finite(params):
-    extremes = jnp.stack([jnp.zeros((16, 16)), jnp.full((16, 16), 5000.0)])
+def test_an_empty_image_and_one_of_many_points_stay_finite(params, images):
+    extremes = images.at[0].set(0.0).at[1].set(5000.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(forward(in_bfloat16(params), extremes)))
 
 
