@@ -148,8 +148,20 @@ def leave_one_out(
     if not names or seq in names:
         raise ValueError(f"{root}: expected drives to train on other than {seq!r}, found {', '.join(names) or 'none'}")
     drives = [open_sequence(root, name, poses=poses) for name in names]
-    for drive in (*drives, test):
-        if drive.positions is None:
-            raise ValueError(f"{root}: sequence {drive.name} has no poses; training and testing need them")
+    _require_positions(root, [*drives, test])
     print(f"training on {', '.join(names)}; testing on {seq}, never seen", file=sys.stderr)
     return drives, test
+
+
+def all_drives(root: Path, *, poses: PoseChoice = "auto") -> list[Drive]:
+    """Every drive of a dataset that is trained on beside another. Errors as of `leave_one_out`."""
+    drives = [open_sequence(root, name, poses=poses) for name in sequence_names(root)]
+    _require_positions(root, drives)
+    print(f"training on {', '.join(drive.name for drive in drives)} of {root} too", file=sys.stderr)
+    return drives
+
+
+def _require_positions(root: Path, drives: Many[Drive]) -> None:
+    for drive in drives:
+        if drive.positions is None:
+            raise ValueError(f"{root}: sequence {drive.name} has no poses; training and testing need them")

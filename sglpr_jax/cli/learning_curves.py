@@ -11,7 +11,7 @@ from sglpr_jax.train.metrics_log import read_metrics
 PICTURE = "learning-curves.png"
 _PANELS = {
     "loss": ("loss", "triplet", "cross_entropy", "dice"),
-    "recall@1 of training places": ("score",),
+    "score: recall@1 of held-out or training places": ("score",),
     "gradient norm": ("gradient_norm",),
 }
 """What each panel shows, and the names of its measurements in the metrics."""

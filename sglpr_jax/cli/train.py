@@ -5,31 +5,36 @@ import dataclasses
 import json
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from sglpr_jax.cli.datasets import dataset_root, leave_one_out
+from sglpr_jax.cli.datasets import all_drives, dataset_root, leave_one_out
 from sglpr_jax.cli.environment import note_environment
 from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.learning_curves import draw_learning_curves
 from sglpr_jax.cli.presets import load_preset, preset_asked_for, preset_names
 from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
+from sglpr_jax.cli.training_batches import batches, named_places, positions_of, tuple_pool
 from sglpr_jax.cli.training_recall import training_recall
+from sglpr_jax.cli.validation import validation_score
 from sglpr_jax.data import Drive, ScanSequence
-from sglpr_jax.data.batch import Batch, read_batch
+from sglpr_jax.data.held_out import hold_out
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.models.params import save
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.train.describe_places import describe_places
 from sglpr_jax.train.devices import own_copy
-from sglpr_jax.train.hosts import connected, is_first_host, on_all_hosts, own_part
-from sglpr_jax.train.loop import METRICS_FILE, train
+from sglpr_jax.train.hosts import connected, is_first_host, on_all_hosts
+from sglpr_jax.train.loop import METRICS_FILE, best_params, train
 from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.train.mining import FOLDER as MINING
+from sglpr_jax.train.mining import DescribeFn, Mining
 from sglpr_jax.train.tensorboard import EVENTS, event_writer
 from sglpr_jax.train.throughput import throughput
 
@@ -44,6 +49,7 @@ class TrainCommand:
       bin/train --seq 08                                  on the simulated drives, preset small
       bin/train --seq 08 --data KITTI --preset paper
       bin/train --seq 08 --data KITTI --resume            goes on where the run was stopped
+      bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
       bin/train --seq 08 --model.head.cbam False          an ablation; docs/ablations.md has all
       bin/train --hosts 2 --host-index 0 --coordinator 10.0.0.1:1234    one of two hosts; docs/training.md
@@ -53,6 +59,9 @@ class TrainCommand:
     """The drive to test on; it is never trained on."""
     data: Path | None = None
     """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated drives."""
+    also: tuple[Path, ...] = ()
+    """Further datasets, all of whose drives are trained on, with --also-tuples of a step's tuples: simulated scans with
+    labels, say, beside real images without."""
     preset: str = "small"
     """A file of configs/ by name, or a path to one of your own."""
     out: Path | None = None
@@ -104,64 +113,67 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
     Exits where it is asked to stop, with what was made saved: with 0 after SIGTERM, with 130 after Ctrl-C.
     """
     folder = run_folder(command)
-    root = dataset_root(command.data)
-    drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
     config = command.config
-    if config.model.categories_read:
-        for drive in (*drives, test):
-            _require_labels(drive)
-    pool, make_batch = batches(drives, config)
+    drives, also, test = _drives(command)
+    splits = [hold_out(positions_of(drive), config.validation, config.sampling) for drive in drives]
+    pool = tuple_pool(drives, config, frames=[split.training for split in splits])
+    mining = None
+    if config.sampling.mining == "hardest":
+        mining = Mining(_describe_unturned(drives, pool, config), len(pool), config, folder / MINING)
+    if config.validation.share:
+        score = validation_score(drives, [split.validation for split in splits], config)
+    else:
+        score = training_recall(drives, pool, config)
     watched = command.tensorboard and is_first_host()
     with event_writer(folder / EVENTS) if watched else contextlib.nullcontext(_ignore) as record:
         on_all_hosts(lambda: is_first_host() and _claim(folder, command, resume=command.resume))
         with stop_on_signal() as stopped:
-            score = training_recall(drives, pool, config)
             state = train(
                 config,
-                make_batch,
+                batches(drives, pool, config, also=also, mining=mining),
                 folder,
                 score=score,
+                refresh=mining.refresh if mining else None,
                 resume=command.resume,
                 stopped=stopped,
-                places=lambda step: _places(drives, pool, config, step),
+                places=lambda step: named_places(drives, pool, config, step, mining=mining),
                 record=record,
             )
-    params = own_copy(state.params)
+    finished = int(state.step) == config.steps
+    best = finished and config.select == "best"
+    params = best_params(folder, config) if best else own_copy(state.params)
     if is_first_host():
         save(params, folder / "weights")
         draw_learning_curves(folder)
         _print_throughput(folder, config)
-    if int(state.step) < config.steps:
+    if not finished:
         print(f"stopped at step {int(state.step)} of {config.steps}; go on with --resume", file=sys.stderr)
         sys.exit(stopped.exit_status)
     return params, test
 
 
-def batches(drives: Sequence[Drive], config: TrainConfig) -> tuple[TuplePool, Callable[[int], Batch]]:
-    """The tuples that drives hold, and this host's part of the batch of each step, a function of the step alone."""
-    pool = TuplePool([_positions(drive) for drive in drives], config.sampling)
-
-    def make_batch(step: int) -> Batch:
-        frames = pool.draw(seed=config.seed, step=step, tuples=config.tuples)
-        return read_batch(
-            drives,
-            pool,
-            frames,
-            max_points=config.max_points,
-            share_negatives=config.share_negatives,
-            categories=config.model.categories,
-            part=own_part(config.tuples),
+def _drives(command: TrainCommand) -> tuple[list[Drive], list[Drive], Drive]:
+    """The drives to train on, those of --also, and the one to test on. ValueError where one cannot be used."""
+    root, config = dataset_root(command.data), command.config
+    if command.hosts > 1 and (command.also or config.sampling.mining != "none"):
+        raise ValueError(f"mined negatives and --also work on one host only, found --hosts {command.hosts}")
+    drives, test = leave_one_out(root, command.seq, train_seqs=command.train_seqs, poses=command.poses)
+    also = [drive for folder in command.also for drive in all_drives(folder, poses=command.poses)]
+    if any(folder.resolve() == root.resolve() for folder in command.also):
+        raise ValueError(f"--also {root}: expected another dataset than the one whose drive {command.seq} is tested")
+    if bool(also) != bool(config.also_tuples):
+        raise ValueError(
+            "--also names datasets and --also-tuples how many tuples of a step are theirs: expected both or neither, "
+            f"found {len(command.also)} datasets and {config.also_tuples} tuples"
         )
+    if config.model.categories_read:
+        for drive in (*drives, *also, test):
+            _require_labels(drive)
+    return drives, also, test
 
-    return pool, make_batch
 
-
-def _places(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig, step: int) -> str:
-    """The frames of a step's batch, for an error: the drives they are of and their names there."""
-    frames = np.unique(pool.draw(seed=config.seed, step=step, tuples=config.tuples))
-    of_drive = {drive.name: frames[pool.drive[frames] == number] for number, drive in enumerate(drives)}
-    named = {drive.name: " ".join(drive.ids[pool.frame[f]] for f in of_drive[drive.name]) for drive in drives}
-    return "; ".join(f"drive {name} frames {ids}" for name, ids in named.items() if ids)
+def _describe_unturned(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig) -> DescribeFn:
+    return lambda params, places: describe_places(params, drives, pool, places, np.zeros(len(places)), config)
 
 
 def _print_throughput(folder: Path, config: TrainConfig) -> None:
@@ -233,10 +245,6 @@ def _require_labels(drive: Drive) -> None:
             f"model.head.input reads labels: expected labels beside every scan of sequence {drive.name}, "
             f"found {labelled} of {len(drive)}"
         )
-
-
-def _positions(drive) -> np.ndarray:
-    return drive.positions
 
 
 def _description() -> str:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TuplePool
-from sglpr_jax.labels import to_classes
+from sglpr_jax.labels import UNLABELLED, to_classes
 
 
 @flax.struct.dataclass
@@ -21,6 +21,9 @@ class Batch:
     Either `images` (b, h, w), or `points` (b, n, 3) with `count` (b,) valid ones each and their `classes` (b, n) (None
     where no drive has labels). `labelled` (b,) says which places have labels, `far` (t, b) which places can serve an
     anchor as negatives, `positives` how many places after an anchor are its positives.
+
+    With `also`, a second batch, its places come after those here: `labelled` covers both, and `far` both or, where the
+    triplet loss does not count the second one, the first alone.
     """
 
     labelled: Any
@@ -30,6 +33,12 @@ class Batch:
     points: Any = None
     count: Any = None
     classes: Any = None
+    also: Any = None
+
+    @property
+    def places(self) -> int:
+        """How many places are held here, those of `also` not counted."""
+        return len(self.points if self.images is None else self.images)
 
 
 def read_batch(
@@ -72,6 +81,19 @@ def views(
 
     Runs on the device, inside jit.
     """
+    if batch.also is None:
+        return _views(batch, angles, grid)
+    parts = [_views(batch, angles[: batch.places], grid), _views(batch.also, angles[batch.places :], grid)]
+    images = jnp.concatenate([image for image, _ in parts])
+    if all(maps is None for _, maps in parts):
+        return images, None
+    unlabelled = [jnp.full(image.shape, UNLABELLED) if maps is None else maps for image, maps in parts]
+    return images, jnp.concatenate(unlabelled)
+
+
+def _views(
+    batch: Batch, angles: Float[Array, "b"], grid: Grid
+) -> tuple[Float[Array, "b h w"], Int[Array, "b h w"] | None]:
     if batch.images is not None:
         return centre_crop(rotate_image(batch.images, angles), height=grid.height, width=grid.width), None
     points = rotate_points(batch.points, angles)

@@ -2,11 +2,13 @@
 
 import dataclasses
 from collections.abc import Sequence as Many
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from sglpr_jax.data.descriptor_cache import DescriptorCache
 from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
 
 
@@ -27,6 +29,29 @@ class TupleConfig:
     places of one street are harder to tell apart than any two of a whole drive."""
     cluster_m: float = 100.0
     """How near: the distance to the first anchor of the row."""
+    mining: Literal["none", "hardest"] = "none"
+    """`none`: negatives at random, as in the paper. `hardest`: those that look most like the anchor (BEVPlace++); the
+    anchors of a cluster are then alike rather than near each other."""
+    hardest: int = 10
+    """Of the places beyond the negative distance so many, the nearest by descriptor, are drawn from."""
+    refresh_steps: int = 1000
+    """Steps after which the descriptors that mining compares are computed anew."""
+    mined_places: int = 0
+    """Places that are described then, other ones each time, and anchors of the tuples drawn; 0: all."""
+
+    def __post_init__(self):
+        if self.mining == "none":
+            return
+        if self.negatives == 0 and self.cluster == 1:
+            raise ValueError(
+                "sampling.mining chooses negatives or the other anchors of a cluster: expected sampling.negatives or "
+                "sampling.cluster above 0 and 1, found 0 and 1"
+            )
+        if min(self.hardest, self.refresh_steps) < 1:
+            raise ValueError(
+                "expected sampling.hardest and sampling.refresh_steps of 1 or more, found "
+                f"{self.hardest} and {self.refresh_steps}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,46 +75,80 @@ class Positives:
 class TuplePool:
     """All frames of several drives, counted through, and the tuples that can be drawn from them."""
 
-    def __init__(self, positions: Many[Float[np.ndarray, "_ 3"]], config: TupleConfig):
-        """Raises ValueError when no frame has a positive."""
+    def __init__(
+        self,
+        positions: Many[Float[np.ndarray, "_ 3"]],
+        config: TupleConfig,
+        *,
+        frames: Many[Int[np.ndarray, "_"]] | None = None,
+    ):
+        """`frames` are those of each drive that may be used; without it all. ValueError when none has a positive."""
         self.config = config
-        self.positions = np.concatenate(positions)
-        self.drive = np.repeat(np.arange(len(positions)), [len(p) for p in positions])
-        self.frame = np.concatenate([np.arange(len(p)) for p in positions])
+        frames = [np.arange(len(p)) for p in positions] if frames is None else frames
+        self.positions = np.concatenate([p[kept] for p, kept in zip(positions, frames, strict=True)])
+        self.drive = np.repeat(np.arange(len(positions)), [len(kept) for kept in frames])
+        self.frame = np.concatenate(frames)
         pairs = np.concatenate([self._pairs_within(d) for d in range(len(positions))])
-        same_visit = np.abs(pairs[:, 0] - pairs[:, 1]) <= config.revisit_gap
+        same_visit = np.abs(self.frame[pairs[:, 0]] - self.frame[pairs[:, 1]]) <= config.revisit_gap
         self.neighbours = self._group(pairs[same_visit])
         self.revisits = self._group(pairs[~same_visit])
         if not len(pairs):
             raise ValueError(f"no two frames lie within {config.positive_m} m of each other: nothing can be a positive")
 
-    def draw(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def draw(
+        self, *, seed: int, step: int, tuples: int, cache: DescriptorCache | None = None
+    ) -> Int[np.ndarray, "{tuples} k"]:
         """The pool's frame numbers of one batch, (anchor, positives, negatives) a row. A pure function.
 
-        Raises ValueError for an anchor that has no negatives.
+        With a `cache` the anchors are among its places, and negatives and clusters are mined. Raises ValueError for an
+        anchor that has no negatives.
         """
         rng = np.random.default_rng([seed, step])
         anchored: list[list[int]] = []
         for i in range(tuples):
-            first = anchored[i - i % self.config.cluster][0] if i % self.config.cluster else None
-            anchored.append(self._draw_anchored(rng, near=first))
-        return np.array([[*row, *self._draw_negatives(rng, row[0])] for row in anchored])
+            row = anchored[i - i % self.config.cluster :]
+            anchored.append(self._draw_anchored(rng, [anchor for anchor, *_ in row], cache))
+        return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in anchored])
 
-    def _draw_anchored(self, rng: np.random.Generator, *, near: int | None) -> list[int]:
+    def draw_places(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
+        """As many frame numbers as `draw` returns, but any places, where what counts is that they differ."""
+        rng = np.random.default_rng([seed, step])
+        shape = tuples, 1 + self.config.positives + self.config.negatives
+        return rng.choice(len(self), shape, replace=bool(np.prod(shape) > len(self)))
+
+    def _draw_anchored(self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None) -> list[int]:
+        """An anchor and its positives; `cluster` are the anchors of the same cluster that were drawn before."""
         other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
         source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
         anchors = source.anchors
-        if near is not None:
-            around = anchors[self._within(near, anchors, self.config.cluster_m)]
-            anchors = around if len(around) else anchors
+        if cache is not None:
+            anchors = _unless_empty(np.intersect1d(anchors, cache.places), anchors)
+        if cluster:
+            anchors = _unless_empty(self._alike_or_near(cluster, anchors, cache), anchors)
         anchor = int(rng.choice(anchors))
         return [anchor, *source.draw(rng, anchor, self.config.positives).tolist()]
 
-    def _draw_negatives(self, rng: np.random.Generator, anchor: int) -> Int[np.ndarray, "{self.config.negatives}"]:
-        choices = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self.drive))))
+    def _alike_or_near(
+        self, cluster: list[int], anchors: Int[np.ndarray, "_"], cache: DescriptorCache | None
+    ) -> Int[np.ndarray, "_"]:
+        """Which anchors fit a cluster: those near its first one or, mined, the likest ones far from all of it."""
+        if cache is None:
+            return anchors[self._within(cluster[0], anchors, self.config.cluster_m)]
+        far = self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)
+        return cache.nearest(cluster[0], anchors[far], self.config.hardest)
+
+    def _draw_negatives(
+        self, rng: np.random.Generator, anchor: int, cache: DescriptorCache | None
+    ) -> Int[np.ndarray, "{self.config.negatives}"]:
+        choices = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self))))
         size = self.config.negatives
         if size and not len(choices):
             raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
+        if cache is not None:
+            choices = _unless_empty(cache.nearest(anchor, choices, self.config.hardest), choices)
         return rng.choice(choices, size, replace=len(choices) < size)
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
@@ -110,3 +169,7 @@ class TuplePool:
     def _group(self, pairs: Int[np.ndarray, "pairs 2"]) -> Positives:
         pairs = pairs[np.lexsort(pairs.T[::-1])]
         return Positives(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(len(self.drive) + 1)))
+
+
+def _unless_empty(wanted: Int[np.ndarray, "_"], otherwise: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
+    return wanted if len(wanted) else otherwise

@@ -79,12 +79,13 @@ class WindowAttention(nn.Module):
         n, t, c = windows.shape
         qkv = Linear(3 * c, name="qkv")(windows)
         q, k, v = (part.reshape(n, t, self.heads, -1) for part in jnp.split(qkv, 3, axis=-1))
-        scores = jnp.einsum("nqhd,nkhd->nhqk", q * (c // self.heads) ** -0.5, k)
+        scaled = q * (c // self.heads) ** -0.5
+        scores = jnp.einsum("nqhd,nkhd->nhqk", scaled, k, preferred_element_type=jnp.float32)
         scores = scores + self._position_bias(t)[None]
         if blocked is not None:
             mask = jnp.where(blocked, BLOCKED, 0.0)[None, :, None]
             scores = (scores.reshape(-1, len(blocked), self.heads, t, t) + mask).reshape(n, self.heads, t, t)
-        mixed = jnp.einsum("nhqk,nkhd->nqhd", nn.softmax(scores), v)
+        mixed = jnp.einsum("nhqk,nkhd->nqhd", nn.softmax(scores).astype(v.dtype), v)
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:

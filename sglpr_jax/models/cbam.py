@@ -55,7 +55,7 @@ class SpatialGate(nn.Module):
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
         """One weight per pixel."""
         pooled = jnp.stack([largest(x, (-1,)), x.mean(-1)], axis=-1)
-        logits = nn.Conv(1, (7, 7), padding=3, kernel_init=torch_uniform, name="convolution")(pooled)
+        logits = nn.Conv(1, (7, 7), padding=3, dtype=x.dtype, kernel_init=torch_uniform, name="convolution")(pooled)
         return x * nn.sigmoid(logits)
 
 

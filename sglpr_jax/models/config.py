@@ -72,6 +72,9 @@ class ModelConfig:
     """Into how many categories labels are sorted (figure 9, docs/labels.md); 0: no segmentation head."""
     detail: int = 0
     """Width of a layer that shows the segmentation head the image beside the features. 0: none, as in the paper."""
+    compute: Literal["float32", "bfloat16"] = "float32"
+    """In what matrices are multiplied and images convolved. Weights, norms, softmax, NetVLAD's sums, the descriptor and
+    the losses are float32 all the same."""
     head: HeadConfig = HeadConfig()
 
     def __post_init__(self):

@@ -20,7 +20,8 @@ class Detail(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b h w c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w d"]:
+        image = image.astype(features.dtype)
         for i, (cells, channels) in enumerate(_LOCAL):
-            image = nn.relu(nn.Conv(channels, (cells, cells), name=f"local{i}")(image))
+            image = nn.relu(nn.Conv(channels, (cells, cells), dtype=image.dtype, name=f"local{i}")(image))
         both = jnp.concatenate([features, image], axis=-1)
         return gelu(Linear(self.width, name="mix")(both))

@@ -1,8 +1,11 @@
-"""The linear layer, layer norm and initial values that all modules share, set as the PyTorch reference has them."""
+"""The linear layer, layer norm and initial values that all modules share, set as the PyTorch reference has them.
+
+Weights are float32. Layers multiply in the type of their input, so that a network computes in the type of its image
+(`ModelConfig.compute`) but where a module asks for float32.
+"""
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import flax.linen as nn
 import jax
@@ -24,9 +27,9 @@ class Linear(nn.Module):
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
         """The same linear map of every vector of `c` channels."""
         c = x.shape[-1]
-        y = x.reshape(-1, c) @ self.param("kernel", self.kernel_init, (c, self.features))
+        y = x.reshape(-1, c) @ self.param("kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
         if self.use_bias:
-            y = y + self.param("bias", nn.initializers.zeros, (self.features,))[None]
+            y = y + self.param("bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)[None]
         return y.reshape(*x.shape[:-1], self.features)
 
 
@@ -42,7 +45,7 @@ def convolution(
         x = jnp.pad(x, ((0, 0), (0, 0), (border, border), (0, 0)), mode="wrap")
     padding = [(border, border), (0, 0) if circular else (border, border)]
     init = nn.initializers.he_normal()
-    return nn.Conv(channels, (kernel, kernel), stride, padding, kernel_init=init, name=name)(x)
+    return nn.Conv(channels, (kernel, kernel), stride, padding, dtype=x.dtype, kernel_init=init, name=name)(x)
 
 
 def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
@@ -50,8 +53,15 @@ def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
     return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
 
 
-LayerNorm = partial(nn.LayerNorm, epsilon=1e-5)
-"""Layer norm over channels with PyTorch's epsilon (Flax's default is 1e-6)."""
+class LayerNorm(nn.LayerNorm):
+    """Layer norm over channels with PyTorch's epsilon (Flax's default is 1e-6); within it everything is float32."""
+
+    epsilon: float = 1e-5
+
+    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
+        """Keeps the type of its input."""
+        return super().__call__(x).astype(x.dtype)
+
 
 torch_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 """PyTorch's default for convolutions, U(-1/sqrt(fan_in), 1/sqrt(fan_in))."""

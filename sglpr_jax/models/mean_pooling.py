@@ -1,6 +1,7 @@
 """Global average pooling: what stands in for NetVLAD where it is left out (table 4)."""
 
 import flax.linen as nn
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.layers import Linear
@@ -15,4 +16,4 @@ class MeanPooling(nn.Module):
     def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
         """The vector before its L2 normalisation."""
         weights_init = nn.initializers.normal(features.shape[-1] ** -0.5)
-        return Linear(self.output, kernel_init=weights_init, name="linear")(features.mean(1))
+        return Linear(self.output, kernel_init=weights_init, name="linear")(features.astype(jnp.float32).mean(1))

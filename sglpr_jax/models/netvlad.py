@@ -23,13 +23,14 @@ class NetVLAD(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
-        """The vector before its final L2 normalisation."""
+        """The vector before its final L2 normalisation; float32, as all that follows the sums over the features is."""
         d = features.shape[-1]
         weights_init = nn.initializers.normal(d**-0.5)
         logits = Linear(self.clusters, kernel_init=weights_init, name="assignment")(features)
-        assignment = nn.softmax(logits)
+        assignment = nn.softmax(logits.astype(jnp.float32))
         centres = self.param("centres", weights_init, (d, self.clusters))
-        residuals = jnp.einsum("bnd,bnk->bdk", features, assignment)
+        weights = assignment.astype(features.dtype)
+        residuals = jnp.einsum("bnd,bnk->bdk", features, weights, preferred_element_type=jnp.float32)
         residuals = residuals - assignment.sum(1)[:, None, :] * centres[None]
         vlad = l2_normalize(residuals, axis=1).reshape(len(features), -1)
         y = Linear(self.output, kernel_init=weights_init, name="hidden")(l2_normalize(vlad))

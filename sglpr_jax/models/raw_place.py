@@ -32,6 +32,7 @@ class RawPlace(nn.Module):
         x = jnp.concatenate(planes, axis=-1)
         if config.polar:
             x = to_polar(x, config.grid, *config.polar)
+        x = x.astype(config.compute)
         if config.head.tap == "tokens":
             x = PatchEmbed(config.embed_dim, config.patch, name="patch_embed")(x)
         return PlaceHead(config.head, config.polar is not None, name="place_head")(x)

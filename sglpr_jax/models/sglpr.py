@@ -53,6 +53,7 @@ class SGLPR(nn.Module):
         config, seen, circular = self.config, image, self.config.polar is not None
         if config.polar:
             seen = to_polar(image, config.grid, *config.polar)
+        seen = seen.astype(config.compute)
         maps = Stem(config.stem, circular, name="stem")(seen) if config.stem else []
         tokens, intermediates = SwinUnet(
             embed_dim=config.embed_dim,
@@ -87,12 +88,19 @@ class SGLPR(nn.Module):
         return lambda tokens, _: expand(tokens)
 
     def _logits(self, pixels: Float[Array, "b p q c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w k"]:
-        """The segmentation head. Few channels cross from the polar image to the grid: a linear layer comes first."""
+        """The segmentation head. Few channels cross from the polar image to the grid: a linear layer comes first.
+
+        The logits, and what is resampled, are float32.
+        """
         config = self.config
         to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
         crossing = Linear(config.detail, name="narrow")(pixels) if config.detail else to_logits(pixels)
-        on_grid = from_polar(crossing, config.grid) if config.polar else crossing
-        return to_logits(Detail(config.detail, name="detail")(on_grid, image)) if config.detail else on_grid
+        on_grid = crossing.astype(jnp.float32)
+        on_grid = from_polar(on_grid, config.grid) if config.polar else on_grid
+        if not config.detail:
+            return on_grid
+        detailed = Detail(config.detail, name="detail")(on_grid.astype(config.compute), image)
+        return to_logits(detailed).astype(jnp.float32)
 
 
 def prepare(

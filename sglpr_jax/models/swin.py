@@ -27,7 +27,14 @@ class PatchEmbed(nn.Module):
 
         size = (self.patch, self.patch)
         tokens = nn.Conv(
-            self.channels, size, size, "VALID", kernel_init=torch_uniform, bias_init=bias_init, name="projection"
+            self.channels,
+            size,
+            size,
+            "VALID",
+            dtype=image.dtype,
+            kernel_init=torch_uniform,
+            bias_init=bias_init,
+            name="projection",
         )(image)
         return LayerNorm(name="norm")(tokens)
 

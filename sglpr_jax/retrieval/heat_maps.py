@@ -42,7 +42,7 @@ def _maps(params: Params, bev: Num[Array, "h w"], labels: Int[Array, "h w"] | No
     outputs = forward(params, bev, labels, segment=0)
 
     def on_grid(features: Float[Array, "1 p q c"]) -> Float[Array, "h w"]:
-        strength = jnp.sqrt(jnp.mean(features**2, axis=-1, keepdims=True))
+        strength = jnp.sqrt(jnp.mean(features.astype(jnp.float32) ** 2, axis=-1, keepdims=True))
         if params.config.polar:
             whole = from_polar(strength, grid)[0, ..., 0]
         else:

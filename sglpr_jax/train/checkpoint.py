@@ -103,6 +103,18 @@ class Checkpoints:
         found = self._manager.metadata(self.latest_step()).custom_metadata or {}
         return [dict(measured) for measured in found.get(_UNLOGGED, ())]
 
+    def best_params(self, config: TrainConfig) -> Params:
+        """The weights of the best score among the checkpoints kept, the later of equal ones. ValueError without one."""
+        self._manager.wait_until_finished()
+        scores = {step: (self._manager.metrics(step) or {}).get("score", -1.0) for step in self._manager.all_steps()}
+        if not scores:
+            raise ValueError(f"{self._manager.directory}: expected a checkpoint with a score, found none")
+        best = max(scores, key=lambda step: (scores[step], step))
+        like = jax.eval_shape(lambda: new_state(config)).params.weights
+        items = ocp.args.Composite(weights=ocp.args.StandardRestore(like))
+        found: Any = self._manager.restore(best, args=items)
+        return Params(found.weights, config.model)
+
     def close(self) -> None:
         """Wait until everything is written. Raises OSError where it cannot be."""
         with self._writing():

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Literal
 
+from sglpr_jax.data.held_out import ValidationConfig
 from sglpr_jax.data.tuples import TupleConfig
 from sglpr_jax.models.config import ModelConfig
 
@@ -60,11 +61,18 @@ class TrainConfig:
     sampling: TupleConfig = TupleConfig()
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
+    validation: ValidationConfig = ValidationConfig()
+    select: Literal["last", "best"] = "last"
+    """Which weights a finished run hands out: its last ones, or those of the best score on what is held out."""
     steps: int = 40_000
     tuples: int = 1
     """Tuples a step."""
     share_negatives: bool = False
     """Let every other tuple's places that are far enough away be negatives too."""
+    also_tuples: int = 0
+    """How many of a step's tuples come from the datasets of --also."""
+    also_triplets: bool = False
+    """Let these count in the triplet loss. Without it they are places at random, for the segmentation alone."""
     chunk: int = 0
     """Images that go through the network at a time, on all devices together (0: all). It changes memory and speed; of
     the results only which branches stochastic depth drops."""
@@ -81,6 +89,12 @@ class TrainConfig:
         learns_semantics = self.model.segments and self.loss.segments
         if not (learns_semantics or self.model.head.reads_labels):
             object.__setattr__(self, "model", dataclasses.replace(self.model, categories=0))
+        if not 0 <= self.also_tuples < self.tuples:
+            raise ValueError(
+                f"also_tuples must be fewer than the {self.tuples} tuples of a step, found {self.also_tuples}"
+            )
+        if self.select == "best" and not self.validation.share:
+            raise ValueError("select best needs places held out to choose by: expected a validation.share, found 0")
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
         if self.images_at_once % self.loss.segment_every:

@@ -93,4 +93,7 @@ def _place(tree: Tree, sharding: NamedSharding) -> Tree:
 
 
 def _divides(devices: int, config: TrainConfig) -> bool:
+    """A batch of two sources is not split: its places are in an order of their own."""
+    if config.also_tuples:
+        return devices == 1
     return config.tuples % devices == 0 and config.images_at_once % devices == 0

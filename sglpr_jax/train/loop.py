@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.data.batch import Batch
-from sglpr_jax.data.loader import read_ahead
 from sglpr_jax.models.sglpr import Params
+from sglpr_jax.train.batches import Batches, RefreshFn
 from sglpr_jax.train.checkpoint import Checkpoints
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.devices import data_mesh, own_copy, replicate, split
@@ -38,6 +38,7 @@ def train(
     folder: Path,
     *,
     score: ScoreFn,
+    refresh: RefreshFn | None = None,
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
     places: Callable[[int], str] | None = None,
@@ -46,7 +47,8 @@ def train(
     """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch (the host's part).
 
     All devices share a step. Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest
-    one, if there is one yet. `record` is told what the metrics are told. Raises FloatingPointError, naming the step and
+    one, if there is one yet. `refresh(step, params)` is called before the first step and before each multiple of
+    `sampling.refresh_steps`. `record` is told what the metrics are told. Raises FloatingPointError, naming the step and
     its batch as `places` does, when the loss is no longer finite; OSError when metrics or a checkpoint cannot be
     written; ValueError where the devices cannot share a step (`data_mesh`).
     """
@@ -60,7 +62,13 @@ def train(
         start = int(state.step)
         path = folder / METRICS_FILE if is_first_host() else None
         log = opened.enter_context(contextlib.closing(MetricsLog(path, start_step=start)))
-        parts = read_ahead(lambda step: split(make_batch(step), mesh), start=start, stop=config.steps)
+        parts = Batches(
+            lambda step: split(make_batch(step), mesh),
+            start=start,
+            stop=config.steps,
+            refresh=refresh,
+            refresh_steps=config.sampling.refresh_steps,
+        )
         batches = opened.enter_context(contextlib.closing(parts))
         progress = opened.enter_context(_progress())
         bar = progress.add_task("train", total=config.steps, completed=start, terms="")
@@ -82,11 +90,20 @@ def train(
     return state
 
 
+def best_params(folder: Path, config: TrainConfig) -> Params:
+    """The weights with the best score of the run in `folder`."""
+    checkpoints = Checkpoints(folder / CHECKPOINTS)
+    try:
+        return checkpoints.best_params(config)
+    finally:
+        checkpoints.close()
+
+
 def _steps(
     config: TrainConfig,
     mesh: Mesh,
     state: TrainState,
-    batches: Iterator[Batch],
+    batches: Batches,
     stopped: Callable[[], bool],
     places: Callable[[int], str] | None,
     unlogged: list[dict[str, float]],
@@ -98,6 +115,7 @@ def _steps(
     """
     since, waited, made, stop = time.perf_counter(), 0.0, 0, False
     while int(state.step) < config.steps and not stop:
+        batches.prepare(own_copy(state.params))
         asked = time.perf_counter()
         batch = on_all_hosts(lambda: next(batches))
         waited += time.perf_counter() - asked

@@ -20,6 +20,7 @@ from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.sglpr import Params, field_of_view, forward
 from sglpr_jax.train.config import LossConfig, TrainConfig
 from sglpr_jax.train.devices import keep_replicated, keep_split, on_own_rows
+from sglpr_jax.train.place_order import in_batch_order, in_network_order
 from sglpr_jax.train.state import TrainState, optimizer
 
 Metrics = dict[str, Float[Array, ""]]
@@ -106,8 +107,8 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
     """Equation 8 of a whole batch, and its terms."""
-    triplet, metrics = triplet_loss(summary.descriptors, batch, config)
-    segmented = jnp.asarray(batch.labelled)[:: config.segment_every]
+    triplet, metrics = triplet_loss(in_batch_order(summary.descriptors, batch, config), batch, config)
+    segmented = in_network_order(jnp.asarray(batch.labelled), batch, config)[:: config.segment_every]
     terms = {}
     if summary.cross_entropy is not None:
         terms["cross_entropy"] = summary.cross_entropy / jnp.maximum(segmented.sum(), 1)
@@ -127,8 +128,9 @@ def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Floa
 def triplet_loss(
     descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Equation 5, averaged over the batch's tuples, and the share of tuples that still violate the margin."""
-    tuples = batch.far.shape[0]
+    """Equation 5, averaged over the tuples of `batch.far`, and the share of them that still violate the margin."""
+    tuples, places = batch.far.shape
+    descriptors = descriptors[:places]
     grouped = descriptors.reshape(tuples, -1, descriptors.shape[-1])
     anchors = grouped[:, :1]
     positives = grouped[:, 1 : 1 + batch.positives]
@@ -150,10 +152,12 @@ def triplet_loss(
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
     """The batch as the network will see it, cut into chunks along a new leading axis."""
     angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) * config.rotate
-    images, maps = on_own_rows(functools.partial(views, grid=config.model.grid))(batch, angles)
+    see = functools.partial(views, grid=config.model.grid)
+    images, maps = (see if batch.also is not None else on_own_rows(see))(batch, angles)  # a mixed one is on one device
     maps = None if maps is None else jnp.where(field_of_view(config.model), maps, UNLABELLED)
     keys = jax.random.split(model_key, config.images // config.images_at_once)
     whole = (images, maps, jnp.asarray(batch.labelled))
+    whole = jax.tree.map(lambda x: in_network_order(x, batch, config.loss), whole)
     cut = jax.tree.map(lambda x: x.reshape(-1, config.images_at_once, *x.shape[1:]), whole)
     return Chunk(*keep_split(cut, axis=1), key=keys)  # or each chunk would lie on one device
 

@@ -12,6 +12,7 @@ from PIL import Image
 
 import sglpr_jax
 from sglpr_jax.cli import train as train_command
+from sglpr_jax.cli import training_batches
 from sglpr_jax.cli.presets import load_preset
 from sglpr_jax.cli.train import TrainCommand, parse
 from sglpr_jax.data.bev_images import open_sequence
@@ -139,16 +140,16 @@ def test_a_run_is_resumed_with_its_own_settings_only(command, trained, town, pre
 
 def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, town, preset, tmp_path, monkeypatch):
     monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
-    read_batch = train_command.read_batch
+    read_batch = training_batches.read_batch
     out = tmp_path / "run"
     options = ("--data", town, "--preset", preset, "--out", out)
 
     def interrupted(*arguments, **named):
         os.kill(os.getpid(), signal.SIGINT)
-        monkeypatch.setattr(train_command, "read_batch", read_batch)
+        monkeypatch.setattr(training_batches, "read_batch", read_batch)
         return read_batch(*arguments, **named)
 
-    monkeypatch.setattr(train_command, "read_batch", interrupted)
+    monkeypatch.setattr(training_batches, "read_batch", interrupted)
     handler = signal.getsignal(signal.SIGINT)
     ended = command("train", *options)
     assert ended.status == 130

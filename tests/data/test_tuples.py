@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sglpr_jax.data.descriptor_cache import DescriptorCache
 from sglpr_jax.data.tuples import TupleConfig, TuplePool
 
 LAP = 60
@@ -153,3 +154,95 @@ def test_a_cluster_without_another_anchor_nearby_goes_elsewhere():
     pairs[:, 0] = np.repeat(np.arange(10) * 500.0, 2) + np.tile([0, 1], 10)
     pool = TuplePool([pairs], TupleConfig(negatives=0, cluster=2, cluster_m=0.5, revisit_gap=1))
     assert len(pool.draw(seed=0, step=0, tuples=10)) == 10
+
+
+def described(pool: TuplePool, places: np.ndarray | None = None) -> DescriptorCache:
+    places = np.arange(len(pool)) if places is None else places
+    return DescriptorCache(places, np.random.default_rng(3).normal(size=(len(places), 4)).astype(np.float32))
+
+
+def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
+    config = TupleConfig(negatives=5, mining="hardest", hardest=5, revisit_gap=LAP // 2)
+    pool = TuplePool([circuit(3), circuit(2, seed=1)], config)
+    cache = described(pool)
+    anchors, near, far = columns(pool.draw(seed=0, step=0, tuples=20, cache=cache), config)
+    assert (horizontal(pool, anchors, near) < 3).all()
+    for anchor, row in zip(anchors[:, 0], far, strict=True):
+        apart = (pool.drive != pool.drive[anchor]) | (horizontal(pool, np.array(anchor), np.arange(len(pool))) > 20)
+        distance = np.linalg.norm(cache.descriptors - cache.descriptors[anchor], axis=1)
+        expected = np.flatnonzero(apart)[np.argsort(distance[apart])[:5]]
+        assert set(row.tolist()) == set(expected.tolist())
+
+
+def test_negatives_are_drawn_from_more_of_the_hardest_than_are_needed():
+    config = TupleConfig(negatives=2, mining="hardest", hardest=6, revisit_gap=LAP // 2)
+    pool = TuplePool([circuit(3)], config)
+    cache = described(pool)
+    rows = np.concatenate([pool.draw(seed=0, step=step, tuples=40, cache=cache) for step in range(30)])
+    of_one = rows[rows[:, 0] == np.bincount(rows[:, 0]).argmax()]
+    far = np.flatnonzero(pool.far_apart(of_one[0, :1], np.arange(len(pool))))
+    hardest = set(cache.nearest(int(of_one[0, 0]), far, 6).tolist())
+    drawn = set(of_one[:, 2:].ravel().tolist())
+    assert len(of_one) > 8 and len(drawn) > 2 and drawn <= hardest
+
+
+def test_a_mined_batch_is_a_pure_function_of_seed_step_and_cache():
+    config = TupleConfig(negatives=3, mining="hardest", revisit_gap=LAP // 2)
+    pool = TuplePool([circuit(3)], config)
+    cache = described(pool)
+    rows = pool.draw(seed=1, step=2, tuples=4, cache=cache)
+    again = DescriptorCache(cache.places.copy(), cache.descriptors.copy())
+    np.testing.assert_array_equal(pool.draw(seed=1, step=2, tuples=4, cache=again), rows)
+    other = DescriptorCache(cache.places, cache.descriptors[::-1].copy())
+    assert (pool.draw(seed=1, step=2, tuples=4, cache=other) != rows).any()
+    assert (pool.draw(seed=1, step=2, tuples=4) != rows).any()
+
+
+def test_mined_clusters_look_alike_and_lie_far_apart():
+    config = TupleConfig(negatives=0, cluster=4, mining="hardest", hardest=5, revisit_gap=LAP // 2)
+    pool = TuplePool([circuit(3), circuit(2, seed=1)], config)
+    cache = described(pool)
+    for row in pool.draw(seed=0, step=0, tuples=40, cache=cache)[:, 0].reshape(10, 4):
+        apart = horizontal(pool, row[:, None], row[None]) + 100 * (pool.drive[row][:, None] != pool.drive[row][None])
+        assert (apart[~np.eye(4, dtype=bool)] > 20).all()
+        distance = np.linalg.norm(cache.descriptors - cache.descriptors[row[0]], axis=1)
+        # the source of positives may know fewer anchors, and others of the row take places: near the front all the same
+        assert (np.argsort(np.argsort(distance))[row[1:]] < 60).all()
+
+
+def test_where_only_some_places_are_described_the_anchors_and_negatives_are_among_them():
+    config = TupleConfig(negatives=2, mining="hardest", revisit_gap=LAP // 2)
+    pool = TuplePool([circuit(3)], config)
+    some = np.arange(0, 3 * LAP, 4)
+    rows = pool.draw(seed=0, step=0, tuples=20, cache=described(pool, some))
+    assert np.isin(rows[:, [0, 2, 3]], some).all() and not np.isin(rows[:, 1], some).all()
+
+
+def test_mining_without_anything_to_choose_is_refused():
+    with pytest.raises(ValueError, match=r"sampling\.negatives or sampling\.cluster"):
+        TupleConfig(negatives=0, mining="hardest")
+    with pytest.raises(ValueError, match=r"refresh_steps of 1 or more, found 10 and 0"):
+        TupleConfig(mining="hardest", refresh_steps=0)
+
+
+def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
+    kept = np.r_[0:40, 100:180]
+    config = TupleConfig(negatives=2, revisit_gap=LAP // 2)
+    drives = [circuit(3), circuit(1, seed=1)]
+    pool = TuplePool(drives, config, frames=[kept, np.arange(LAP)])
+    np.testing.assert_array_equal(pool.frame, np.r_[kept, 0:LAP])
+    np.testing.assert_array_equal(pool.positions, np.concatenate([drives[0][kept], drives[1]]))
+    rows = pool.draw(seed=0, step=0, tuples=200)
+    assert rows.max() < len(pool)
+    for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):
+        anchors = np.repeat(np.arange(len(pool)), np.diff(group.starts))
+        assert ((np.abs(pool.frame[anchors] - pool.frame[group.frames]) > LAP // 2) == other_visit).all()
+
+
+def test_places_at_random_differ_and_follow_seed_and_step():
+    pool = TuplePool([circuit(2)], TupleConfig(negatives=3))
+    rows = pool.draw_places(seed=0, step=5, tuples=6)
+    assert rows.shape == (6, 5) and len(set(rows.ravel())) == 30
+    np.testing.assert_array_equal(pool.draw_places(seed=0, step=5, tuples=6), rows)
+    assert (pool.draw_places(seed=0, step=6, tuples=6) != rows).any()
+    assert pool.draw_places(seed=0, step=0, tuples=100).shape == (100, 5)

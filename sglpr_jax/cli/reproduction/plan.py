@@ -8,7 +8,7 @@ import jax
 
 from sglpr_jax.cli.reproduction.experiments import EXPERIMENTS, VARIANTS
 from sglpr_jax.cli.reproduction.runs import Runs
-from sglpr_jax.cli.train import batches
+from sglpr_jax.cli.training_batches import batches, tuple_pool
 from sglpr_jax.train.state import new_state
 from sglpr_jax.train.step import train_step
 
@@ -52,7 +52,8 @@ def make_plan(runs: Runs, names: Sequence[str], seqs: Sequence[str]) -> Plan:
 def time_a_step(runs: Runs, variant: str, seq: str) -> float:
     """Seconds that a training step takes, measured on the run's own first batches; compiles what the run needs."""
     config = runs.command(variant, seq).config
-    state, make_batch = new_state(config), batches(runs.drives_but(seq), config)[1]
+    drives = runs.drives_but(seq)
+    state, make_batch = new_state(config), batches(drives, tuple_pool(drives, config), config)
     seconds = []
     for step in range(1 + TIMED_STEPS):
         since = time.perf_counter()

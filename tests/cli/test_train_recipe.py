@@ -1,0 +1,97 @@
+"""Mining, validation, bfloat16 and a second source, together through the real command line."""
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from sglpr_jax.cli import train as train_command
+from sglpr_jax.cli import training_batches
+from sglpr_jax.train.metrics_log import read_metrics
+
+from .conftest import assert_one_line_error, run_command
+
+RECIPE = (
+    "--sampling.mining", "hardest", "--sampling.refresh-steps", 3, "--sampling.hardest", 4, "--steps", 6,
+    "--validation.share", 0.2, "--select", "best", "--model.compute", "bfloat16", "--sampling.negative-m", 17,
+)  # fmt: skip
+LABELLED = ("--tuples", 3, "--also-tuples", 1, "--loss.segment-every", 2)
+
+
+@pytest.fixture(autouse=True)
+def _no_final_test(monkeypatch):
+    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+
+
+def weights_of(folder) -> dict[str, np.ndarray]:
+    return safetensors.numpy.load_file(folder / "weights" / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def mixed(town, images, preset, tmp_path_factory):
+    """A run on images without labels, whose semantics come from simulated scans."""
+    out = tmp_path_factory.mktemp("runs") / "mixed"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_command, "final_test", lambda *_, **__: None)
+        options = ("--seq", "06", "--data", images, "--also", town, "--preset", preset, "--out", out)
+        ended = run_command("train", *options, *RECIPE, *LABELLED)
+    assert ended.status == 0, ended.error
+    return out, options, ended
+
+
+def test_a_run_of_two_sources_learns_places_and_semantics(mixed, town):
+    out, _, ended = mixed
+    assert "training on 00; testing on 06" in ended.error and f"training on 00, 05, 08 of {town} too" in ended.error
+    lines = read_metrics(out / "metrics.jsonl")
+    steps = [line for line in lines if "loss" in line]
+    assert len(steps) == 6 and all(line["cross_entropy"] > 0 and line["dice"] > 0 for line in steps)
+    scores = [line for line in lines if "score" in line]
+    assert all(line["score"] == line["recall_neighbours"] for line in scores)  # the images have no revisit
+    assert sorted(path.name for path in (out / "mining").iterdir()) == ["0.npz", "3.npz"]
+    settings = json.loads((out / "config.json").read_text())
+    assert settings["also"] == [str(town)] and settings["config"]["also_tuples"] == 1
+    assert json.loads((out / "weights" / "config.json").read_text())["compute"] == "bfloat16"
+
+
+def test_a_stopped_run_of_the_recipe_goes_on_to_the_same_weights(mixed, command, tmp_path, monkeypatch):
+    whole, options, _ = mixed
+    out = tmp_path / "run"
+    options = (*options[:-1], out, *RECIPE, *LABELLED)
+    mix, mixed_batches = training_batches.mix, []
+
+    def interrupted(*arguments, **named):
+        mixed_batches.append(1)
+        if len(mixed_batches) == 4:  # the first batch after the refresh before step 3
+            os.kill(os.getpid(), signal.SIGINT)
+        return mix(*arguments, **named)
+
+    monkeypatch.setattr(training_batches, "mix", interrupted)
+    stopped = command("train", *options)
+    assert stopped.status == 130 and "stopped at step 4 of 6" in stopped.error
+    refreshed = (out / "mining" / "3.npz").read_bytes()
+    resumed = command("train", *options, "--resume")
+    assert resumed.status == 0, resumed.error
+    assert (out / "mining" / "3.npz").read_bytes() == refreshed
+    found, expected = weights_of(out), weights_of(whole)
+    assert found.keys() == expected.keys()
+    for name in expected:
+        np.testing.assert_array_equal(found[name], expected[name])
+
+
+def test_also_needs_its_tuples_and_may_not_be_the_tested_dataset(command, town, images, preset, tmp_path):
+    options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
+    assert_one_line_error(command("train", *options, "--also", town), "--also-tuples", "1 datasets and 0 tuples")
+    assert_one_line_error(command("train", *options, "--also-tuples", 1), "0 datasets and 1 tuples")
+    assert_one_line_error(command("train", *options, "--also", images), images, "expected another dataset")
+    assert_one_line_error(command("train", *options, "--also-tuples", 2), "fewer than the 2 tuples")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_best_weights_can_only_be_chosen_by_places_held_out(command, images, preset, tmp_path):
+    options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
+    assert_one_line_error(command("train", *options, "--select", "best"), "validation.share", "found 0")
+    nothing_left = command("train", *options, "--validation.share", 0.5, "--sampling.negative-m", 1000)
+    assert_one_line_error(nothing_left, "nothing can be a positive")
