@@ -43,10 +43,10 @@ def train(
     one, if there is one yet. Raises FloatingPointError, naming the step, when the loss is no longer finite; ValueError
     where the devices cannot share a step (`data_mesh`).
     """
+    mesh = data_mesh(config)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoints = Checkpoints(folder / CHECKPOINTS)
     go_on = resume and checkpoints.latest_step() is not None
-    mesh = data_mesh(config)
     state = replicate(checkpoints.restore(config) if go_on else new_state(config), mesh)
     start = int(state.step)
     log = MetricsLog(folder / METRICS_FILE if is_first_host() else None, start_step=start)
