@@ -70,7 +70,7 @@ def test_eight_devices_make_the_steps_of_one(config, params, make_batch, kind):
     for found, expected in zip(eight[1], one[1], strict=True):
         assert found.keys() == expected.keys() and found["triplet"] > 0
         for name in expected:
-            np.testing.assert_allclose(found[name], expected[name], rtol=1e-5)
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-4)
     assert_same_weights(eight[0], one[0])
 
 
