@@ -52,11 +52,11 @@ def train(
     its batch as `places` does, when the loss is no longer finite; OSError when metrics or a checkpoint cannot be
     written; ValueError where the devices cannot share a step (`data_mesh`).
     """
+    mesh = data_mesh(config)
     folder.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as opened:
         checkpoints = opened.enter_context(contextlib.closing(Checkpoints(folder / CHECKPOINTS)))
         go_on = resume and checkpoints.latest_step() is not None
-        mesh = data_mesh(config)
         state = replicate(checkpoints.restore(config) if go_on else new_state(config), mesh)
         unlogged = checkpoints.unlogged() if go_on else []
         start = int(state.step)

@@ -70,7 +70,7 @@ def test_eight_devices_make_the_steps_of_one(config, params, make_batch, kind):
     for found, expected in zip(eight[1], one[1], strict=True):
         assert found.keys() == expected.keys() and found["triplet"] > 0
         for name in expected:
-            np.testing.assert_allclose(found[name], expected[name], rtol=1e-5)
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-4)
     assert_same_weights(eight[0], one[0])
 
 
@@ -100,13 +100,12 @@ def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, mo
 
 
 def test_each_device_does_its_share(config, params, make_batch):
-    def cost(devices):
-        mesh = data_mesh(config, jax.devices()[:devices])
-        state = replicate(new_state(config, params=params), mesh)
-        with jax.set_mesh(mesh):
-            return STEP.lower(state, split(make_batch(0), mesh), config=config).compile().cost_analysis()["flops"]
-
-    assert cost(8) < cost(1) / 6
+    mesh = data_mesh(config)
+    state = replicate(new_state(config, params=params), mesh)
+    with jax.set_mesh(mesh):
+        lowered = STEP.lower(state, split(make_batch(0), mesh), config=config)
+    whole, share = (each.cost_analysis()["flops"] for each in (lowered, lowered.compile()))
+    assert whole / 10 < share < whole / 6
 
 
 def test_as_many_devices_as_divide_the_step(config, capsys):
