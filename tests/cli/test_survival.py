@@ -14,8 +14,9 @@ import pytest
 
 from sglpr_jax.train.metrics_log import read_metrics
 
-KILLS = 24
+KILLS = 21
 STEPS = 60
+SCORE_EVERY = 3
 TIMES = {"steps_per_second", "data_wait"}
 TIMEOUT_S = 240
 
@@ -56,6 +57,15 @@ class Runs:
         kept = self.metrics.read_bytes().count(b"\n")
         self.wait_for(process, lambda: self.metrics.read_bytes().count(b"\n") >= kept + lines)
 
+    def wait_for_checkpoint(self, process: subprocess.Popen, *, steps: int) -> None:
+        """Wait until there is a whole checkpoint of so many steps more."""
+        wanted = self.last_step() + steps
+        self.wait_for(process, lambda: self.last_step() >= wanted)
+
+    def last_step(self) -> int:
+        """The step of the newest whole checkpoint; 0 where there is none."""
+        return max((int(path.name) for path in self.checkpoints.glob("*") if path.name.isdigit()), default=0)
+
     def half_written(self) -> set[str]:
         """The checkpoints that have not got their names yet."""
         return {path.name for path in self.checkpoints.glob("*.orbax-checkpoint-tmp")}
@@ -71,7 +81,7 @@ class Runs:
 @pytest.fixture(scope="module")
 def options(images, preset) -> tuple[object, ...]:
     """Lines of the log and checkpoints fall apart, so that stops come between them."""
-    every = ("--steps", STEPS, "--log-every", 2, "--score-every", 3)
+    every = ("--steps", STEPS, "--log-every", 2, "--score-every", SCORE_EVERY)
     return ("--seq", "06", "--data", images, "--preset", preset, *every)
 
 
@@ -96,14 +106,14 @@ def assert_equal(runs: Runs, uninterrupted: Runs) -> None:
 def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninterrupted, tmp_path):
     runs = Runs(tmp_path / "run", options)
     rng = np.random.default_rng(0)
-    in_a_write = 0
+    in_a_write, steps = 0, set()
     for kill in range(KILLS):
         process = runs.start()
         if kill % 3 == 0:  # while it starts: imports, compilation, restoring
-            time.sleep(rng.uniform(0, 4))
-        elif kill % 3 == 1:  # while it makes steps
-            runs.wait_for_lines(process, rng.integers(1, 5))
-            time.sleep(rng.uniform(0, 0.05))
+            time.sleep(rng.uniform(0, 3))
+        elif kill % 3 == 1:  # after it has come a little further
+            runs.wait_for_checkpoint(process, steps=SCORE_EVERY * rng.integers(1, 3))
+            time.sleep(rng.uniform(0, 0.1))
         else:  # while it writes a checkpoint
             runs.wait_for_lines(process, 1)
             runs.wait_for(process, lambda: bool(runs.half_written()))
@@ -112,10 +122,13 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninte
         process.kill()
         process.wait()
         in_a_write += bool(runs.half_written())
-        if kill == KILLS // 2:
+        steps.add(runs.last_step())
+        if kill == KILLS // 2:  # as if these had been killed while they were written
             with runs.metrics.open("a") as file:
                 file.write('{"step": 59, "lo')
-    assert in_a_write >= KILLS // 6
+            (runs.folder / ".config.json.1.tmp").write_text("{")
+            (runs.folder / ".weights-1" / "new").mkdir(parents=True)
+    assert in_a_write >= KILLS // 6 and len(steps) >= KILLS // 3, (in_a_write, steps)
     assert runs.finish() == 0, runs.errors.read_text()
     assert_equal(runs, uninterrupted)
     starts = json.loads((runs.folder / "environment.json").read_text())
@@ -130,14 +143,14 @@ def test_signals_and_a_full_disk_stop_a_run_that_then_goes_on(options, uninterru
         process.send_signal(number)
         assert process.wait(TIMEOUT_S) == status
         assert "go on with --resume" in runs.errors.read_text()
-        last = max(int(path.name) for path in runs.checkpoints.iterdir())
+        last = runs.last_step()
         assert f"stopped at step {last} of {STEPS}" in runs.errors.read_text()
 
     assert runs.finish(file_kib=8) == 1
     error = runs.errors.read_text()
     assert error.splitlines()[-1].startswith(f"error: {runs.folder}")
     assert "File too large" in error and "Traceback" not in error
-    assert max(int(path.name) for path in runs.checkpoints.iterdir() if path.name.isdigit()) == last
+    assert runs.last_step() == last
 
     assert runs.finish() == 0, runs.errors.read_text()
     assert_equal(runs, uninterrupted)
