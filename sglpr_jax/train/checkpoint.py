@@ -18,8 +18,9 @@ class Checkpoints:
     """The checkpoints in one folder; weights and optimiser are separate items, so that either can be read alone."""
 
     def __init__(self, folder: Path):
-        policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=lambda m: m["score"], n=1)])
-        options = ocp.CheckpointManagerOptions(preservation_policy=policy, cleanup_tmp_directories=True)
+        policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=_score, n=1)])
+        # Without `best_fn` scores are not written down, and a resumed run would not know its best checkpoint.
+        options = ocp.CheckpointManagerOptions(preservation_policy=policy, best_fn=_score, cleanup_tmp_directories=True)
         handlers = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
         self._manager = ocp.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
 
@@ -73,6 +74,10 @@ class Checkpoints:
     def close(self) -> None:
         """Wait until everything is written."""
         self._manager.close()
+
+
+def _score(metrics: Any) -> float:
+    return metrics["score"]
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
