@@ -1,6 +1,7 @@
 """Descriptors of places as they were some steps ago: what hard negatives are chosen by."""
 
 import dataclasses
+import functools
 import os
 import zipfile
 from pathlib import Path
@@ -24,9 +25,14 @@ class DescriptorCache:
         candidates = candidates[np.isin(candidates, self.places, assume_unique=True)]
         if anchor not in self.places:
             return candidates[:0]
-        to_anchor = self._of(candidates) - self._of(np.array([anchor]))
-        order = np.argsort(np.square(to_anchor).sum(1), kind="stable")
-        return candidates[order[:size]]
+        rows, row = np.searchsorted(self.places, candidates), np.searchsorted(self.places, anchor)
+        # |a - b|^2 less |a|^2: one product of a matrix and a vector, where differences would copy the whole cache.
+        square = self._squares - 2 * (self.descriptors @ self.descriptors[row])
+        return candidates[np.argsort(square[rows], kind="stable")[:size]]
+
+    @functools.cached_property
+    def _squares(self) -> Float32[np.ndarray, "n"]:
+        return np.square(self.descriptors).sum(1)
 
     def save(self, path: Path) -> None:
         """Write the file whole or not at all."""
@@ -48,6 +54,3 @@ class DescriptorCache:
                 return cls(file["places"], file["descriptors"])
         except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path}: expected descriptors of places, found no such archive ({error})") from error
-
-    def _of(self, places: Int[np.ndarray, "m"]) -> Float32[np.ndarray, "m d"]:
-        return self.descriptors[np.searchsorted(self.places, places)]

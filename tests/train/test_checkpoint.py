@@ -120,3 +120,25 @@ def test_nothing_to_resume_from_is_an_error(checkpoints, config, tmp_path):
     assert checkpoints.latest_step() is None
     with pytest.raises(ValueError, match=rf"{tmp_path}/checkpoints: expected a checkpoint to resume from, found none"):
         checkpoints.restore(config)
+
+
+def test_the_best_weights_are_those_of_the_highest_score_after_a_resume_too(checkpoints, state, config, tmp_path):
+    def plus(step: int):
+        return jax.tree.map(lambda leaf: leaf + step, state.params.weights)
+
+    for step, score in ((2, 0.4), (4, 0.9), (6, 0.7), (8, None)):
+        params = state.params.replace(weights=plus(step))
+        checkpoints.save(TrainState(jnp.int32(step), params, state.optimizer), score=score)
+    chex.assert_trees_all_equal(checkpoints.best_params(config).weights, plus(4))
+    resumed = Checkpoints(tmp_path / "checkpoints")
+    resumed.save(TrainState(jnp.int32(10), state.params, state.optimizer), score=0.8)
+    found = resumed.best_params(config)
+    resumed.close()
+    chex.assert_trees_all_equal(found.weights, plus(4))
+    assert found.config == config.model
+    assert sorted(int(folder.name) for folder in (tmp_path / "checkpoints").iterdir()) == [4, 8, 10]
+
+
+def test_without_a_checkpoint_there_are_no_best_weights(checkpoints, config):
+    with pytest.raises(ValueError, match="expected a checkpoint with a score, found none"):
+        checkpoints.best_params(config)
