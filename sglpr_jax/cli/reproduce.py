@@ -27,7 +27,6 @@ What = Literal[
     "all", "table1", "table2", "table3", "table4", "table5", "table6", "table7",
     "figure5", "figure6", "figure7", "figure8", "figure9", "normalisation",
 ]  # fmt: skip
-PUBLISHED_NOTE = "published: the paper's numbers, on the real {}"
 PAPER_SEQUENCES = ("00", "02", "05", "06", "07", "08")
 
 
@@ -98,13 +97,15 @@ def reproduce(command: ReproduceCommand) -> Path:
 def _make_table(name: str, command: ReproduceCommand, runs: Runs, seqs: Sequence[str]) -> None:
     """Print a table, and write it as JSON and Markdown."""
     title = f"{name}: {EXPERIMENTS[name].title}"
-    columns, about = list(seqs), f"data {runs.data}, preset {runs.preset}, {runs.config.steps} steps"
+    columns, about = list(seqs), f"here: preset {Path(runs.preset).stem}, {runs.config.steps} steps"
     if name == "table3":
         columns, rows = across_sessions_rows(runs, seqs[0], _sessions(command), command.baselines)
-        caption = f"here: {about}, drive {seqs[0]} left out; Recall@1 within 5 m; {PUBLISHED_NOTE.format('NCLT')}"
+        caption = f"{about}, without drive {seqs[0]}; Recall@1 within 5 m"
     else:
         rows = f1max_rows(name, runs, seqs, command.baselines)
-        caption = f"here: {about}, leave-one-out; top-1 F1max, 3 m / 20 m; {PUBLISHED_NOTE.format('KITTI')}"
+        caption = f"{about}, leave-one-out; top-1 F1max, 3 m / 20 m"
+    if any(row.source == tables.PUBLISHED for row in rows):
+        caption += "; published: the paper's numbers, on the real dataset"
     console().print(tables.rich_table(title, rows, columns, caption=caption))
     write_text(command.out / f"{name}.md", tables.markdown(title, rows, columns, caption=caption))
     write_json(command.out / f"{name}.json", tables.as_json(rows, columns))

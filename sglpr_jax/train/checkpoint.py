@@ -151,10 +151,6 @@ def _score(metrics: Any) -> float:
     return metrics["score"]
 
 
-def _score(metrics: Any) -> float:
-    return metrics["score"]
-
-
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
     """The shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
