@@ -148,7 +148,7 @@ def test_signals_and_a_full_disk_stop_a_run_that_then_goes_on(options, uninterru
 
     assert runs.finish(file_kib=8) == 1
     error = runs.errors.read_text()
-    assert error.splitlines()[-1].startswith(f"error: {runs.folder}")
+    assert error.splitlines()[-1].startswith(f"error: {runs.folder}"), error
     assert "File too large" in error and "Traceback" not in error
     assert runs.last_step() == last
 

@@ -177,6 +177,7 @@ def test_the_tables_of_elevations():
     assert {name: len(sensor.elevations_deg) for name, sensor in SENSORS.items()} == {
         "hdl64e": 64,
         "hdl32e": 32,
+        "hdl32e-nclt": 32,
         "vlp16": 16,
     }
     np.testing.assert_allclose(np.diff(SENSORS["vlp16"].elevations_deg), -2)
