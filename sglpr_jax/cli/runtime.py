@@ -27,7 +27,8 @@ def cache_folder() -> Path:
 
 def run(command: Callable[[], object]) -> None:
     """Run a command line: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax logs pages about a failed write, which it raises too
+    for chatty in ("absl", "asyncio"):  # pages about a checkpoint that failed, which orbax raises too
+        logging.getLogger(chatty).setLevel(logging.CRITICAL)
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _show_unraisable
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
