@@ -1,7 +1,7 @@
 """The small model with convolutions in front: places and a semantic map within the hour on two CPU cores.
 
 Reproduces nothing of the paper; it is the preset `small` with a stem (docs/decisions.md), which learns the semantic map
-several times faster, and with few images a step, all of them segmented.
+better, and with few images a step, all of them segmented.
 
 Expect: mean IoU over .22 on an unseen simulated drive, where the commonest class has .02; see docs/results.md.
 Command: bin/train --seq 08 --data TOWNS --preset small-stem

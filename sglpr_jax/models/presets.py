@@ -32,7 +32,7 @@ MODELS: dict[str, ModelConfig] = {
     "paper-11m": dataclasses.replace(_PAPER, grid=Grid(resolution_m=0.1)),
     # Trains on two CPU cores within the hour; its window is that of the ready-made KITTI images (+-25.6 m).
     "small": _SMALL,
-    # With convolutions in front, which learn the semantic map faster; a step takes 1.6 times as long.
+    # With convolutions in front, which learn the semantic map better (docs/results.md); a step takes longer.
     "small-stem": dataclasses.replace(_SMALL, stem=(16, 32, 64)),
     # Smaller still, for bin/demo.
     "demo": dataclasses.replace(_SMALL, embed_dim=32, heads=(1, 2, 4)),
