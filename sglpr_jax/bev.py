@@ -121,6 +121,21 @@ def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Fl
     return turned.reshape(*batch, height, width)
 
 
+def even_cells(image: Float[Array, "*b h w"]) -> Float[Array, "*b h+h%2 w+w%2"]:
+    """A ready-made density image on the cells of eq. 1: its middle row and column become two of half the count.
+
+    There they are as wide as two others, for the recipe truncates coordinates. Left as they are, they are a bright
+    cross that points where the vehicle does, and the sensor is not at the middle of an even crop. Images of an even
+    number of cells stay as they are.
+    """
+    for axis in (-2, -1):
+        middle, odd = divmod(image.shape[axis], 2)
+        if odd:
+            before, half, after = jnp.split(image, (middle, middle + 1), axis=axis)
+            image = jnp.concatenate([before, half / 2, half / 2, after], axis=axis)
+    return image
+
+
 def centre_crop(image: Float[Array, "*b h w"], *, height: int, width: int) -> Float[Array, "*b {height} {width}"]:
     """The middle `height` x `width` cells of larger images; the odd cell of an uneven margin is cut at the far side."""
     if image.shape[-2] < height or image.shape[-1] < width:

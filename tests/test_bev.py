@@ -11,6 +11,7 @@ import pytest
 from sglpr_jax.bev import (
     Grid,
     centre_crop,
+    even_cells,
     count_outside,
     rasterize,
     rasterize_labels,
@@ -275,6 +276,24 @@ def test_image_batches_vmap_and_jit_agree():
     one_by_one = np.stack([rotate_image(images[b], turns[b]) for b in np.ndindex(2, 3)]).reshape(images.shape)
     np.testing.assert_allclose(batched, one_by_one, atol=1e-4)
     np.testing.assert_allclose(jax.jit(jax.vmap(jax.vmap(rotate_image)))(images, turns), one_by_one, atol=1e-4)
+
+
+def test_the_wide_middle_of_an_odd_image_becomes_two_cells_of_half_the_count():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-2.0, 2.0, (500, 2))
+    wide, edges = np.trunc(points / 0.5).astype(int) + 3, np.arange(-2.0, 2.1, 0.5)
+    image = np.zeros((2, 7, 7), np.float32)
+    np.add.at(image, (0, 6 - wide[:, 1], wide[:, 0]), 1.0)  # as density images count: truncated, row against y
+    found = np.asarray(even_cells(jnp.asarray(image)))
+    assert found.shape == (2, 8, 8) and not found[1].any()
+    counts = np.histogram2d(-points[:, 1], points[:, 0], [edges, edges])[0]  # the cells of eq. 1
+    outer = [0, 1, 2, 5, 6, 7]
+    np.testing.assert_array_equal(found[0][np.ix_(outer, outer)], counts[np.ix_(outer, outer)])
+    np.testing.assert_array_equal(found[0, 3:5].sum(0)[outer], counts[3:5].sum(0)[outer])
+    np.testing.assert_array_equal(found[0, 3], found[0, 4])
+    assert found[0].sum() == 500
+    np.testing.assert_array_equal(even_cells(jnp.asarray(found)), found)
+    np.testing.assert_allclose(jax.jit(jax.vmap(even_cells))(jnp.asarray(image)), found)
 
 
 def test_the_centre_is_cropped():

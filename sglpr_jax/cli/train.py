@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import tyro
 
@@ -25,8 +26,8 @@ from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.data.held_out import hold_out
 from sglpr_jax.data.kitti import PoseChoice
 from sglpr_jax.data.tuples import TuplePool
-from sglpr_jax.models.params import save
-from sglpr_jax.models.sglpr import Params
+from sglpr_jax.models.params import graft, load, save
+from sglpr_jax.models.sglpr import Params, init
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.describe_places import describe_places
 from sglpr_jax.train.devices import own_copy
@@ -68,6 +69,9 @@ class TrainCommand:
     """The run's folder. None: runs/PRESET-SEQ."""
     resume: bool = False
     """Go on from the run's newest checkpoint."""
+    start: Path | None = None
+    """Weights to begin with, a run's folder or a folder with config.json and model.safetensors, in place of fresh ones.
+    What they lack, such as the segmentation head, is fresh."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
     tensorboard: bool = False
@@ -134,6 +138,7 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
                 folder,
                 score=score,
                 refresh=mining.refresh if mining else None,
+                start_from=_start(command),
                 resume=command.resume,
                 stopped=stopped,
                 places=lambda step: named_places(drives, pool, config, step, mining=mining),
@@ -170,6 +175,13 @@ def _drives(command: TrainCommand) -> tuple[list[Drive], list[Drive], Drive]:
         for drive in (*drives, *also, test):
             _require_labels(drive)
     return drives, also, test
+
+
+def _start(command: TrainCommand) -> Params | None:
+    """The weights that a new run begins with, where it is told any."""
+    if command.start is None or command.resume:
+        return None
+    return graft(load(command.start), init(jax.random.key(command.config.seed), config=command.config.model))
 
 
 def _describe_unturned(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig) -> DescribeFn:

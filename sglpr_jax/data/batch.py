@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
+from sglpr_jax.bev import Grid, centre_crop, even_cells, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.labels import UNLABELLED, to_classes
@@ -95,7 +95,7 @@ def _views(
     batch: Batch, angles: Float[Array, "b"], grid: Grid
 ) -> tuple[Float[Array, "b h w"], Int[Array, "b h w"] | None]:
     if batch.images is not None:
-        return centre_crop(rotate_image(batch.images, angles), height=grid.height, width=grid.width), None
+        return centre_crop(rotate_image(even_cells(batch.images), angles), height=grid.height, width=grid.width), None
     points = rotate_points(batch.points, angles)
     maps = None
     if batch.classes is not None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
 
-from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
+from sglpr_jax.bev import Grid, centre_crop, even_cells, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
@@ -139,6 +139,7 @@ def read_views(
         if categories:
             raise ValueError(f"sequence {sequence.name}: expected scans with labels, found ready-made images")
         image = jnp.asarray(sequence.image(row))
+        image = image if grid is None else even_cells(image)
         image = image if angle is None else rotate_image(image, angle)
         return (image if grid is None else centre_crop(image, height=grid.height, width=grid.width),)
     if grid is None:
