@@ -52,10 +52,10 @@ class RingConfig:
 
     average: int = 2
     """Edge of the squares of polar pixels whose means the first block sees: without, the resampling skips cells."""
-    widths: tuple[int, ...] = (16, 32, 64, 96, 128, 128)
-    strides: tuple[int, ...] = (2, 2, 1, 2, 1, 1)
+    widths: tuple[int, ...] = (16, 32, 64, 96, 128, 160, 160)
+    strides: tuple[int, ...] = (2, 2, 1, 2, 1, 1, 1)
     """Of each block, along the radius."""
-    means: tuple[int, ...] = (1, 1, 2, 1, 1, 1)
+    means: tuple[int, ...] = (1, 1, 2, 1, 2, 1, 1)
     """How many neighbouring sectors become one after each block."""
 
     def __post_init__(self):
