@@ -11,8 +11,8 @@ import pytest
 from sglpr_jax.bev import (
     Grid,
     centre_crop,
-    even_cells,
     count_outside,
+    even_cells,
     rasterize,
     rasterize_labels,
     rotate_image,

@@ -18,16 +18,16 @@ ROTATION_SEED = 0
 TRAINED = "sglpr"
 
 
-def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> None:
-    """Embed, score, print and draw; everything that is printed is also written into `folder`."""
+def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int, references: bool = True) -> None:
+    """Embed, score, print and draw; everything that is printed is also written into `folder`.
+
+    Without `references` the trained network stands alone.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    untrained = init(jax.random.key(seed + 1), config=params.config)
-    methods = {
-        TRAINED: network(params),
-        "untrained": network(untrained),
-        "thumbnail": reference("thumbnail", sequence, params.config.grid),
-        "polar-fft": reference("polar-fft", sequence, params.config.grid),
-    }
+    methods: dict[str, Method] = {TRAINED: network(params)}
+    if references:
+        methods["untrained"] = network(init(jax.random.key(seed + 1), config=params.config))
+        methods |= {name: reference(name, sequence, params.config.grid) for name in ("thumbnail", "polar-fft")}
     report: dict = {"sequence": sequence.name}
     for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
         results = _score(methods, sequence, folder, title, rotation_seed)

@@ -74,6 +74,8 @@ class TrainCommand:
     What they lack, such as the segmentation head, is fresh."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
+    references: bool = True
+    """At the end score untrained weights, the thumbnail and polar-FFT beside the trained ones (--no-references: not)."""
     tensorboard: bool = False
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     poses: PoseChoice = "auto"
@@ -102,7 +104,7 @@ def train_and_test(command: TrainCommand) -> Path:
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
         params, test = train_only(command)
     if is_first_host():
-        final_test(params, test, folder / "test", seed=command.config.seed)
+        final_test(params, test, folder / "test", seed=command.config.seed, references=command.references)
     return folder
 
 
@@ -239,7 +241,13 @@ def require_same_settings(folder: Path, command: TrainCommand) -> None:
 def _settings(command: TrainCommand) -> dict[str, Any]:
     """The effective configuration as it is written beside the results; on which hosts changes none of them."""
     plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
-    elsewhere = ("tensorboard", "hosts", "host_index", "coordinator")  # how a run is watched and where it is made
+    elsewhere = (
+        "references",
+        "tensorboard",
+        "hosts",
+        "host_index",
+        "coordinator",
+    )  # how a run is watched and where it is made
     told = {name: value for name, value in plain.items() if name not in elsewhere}
     return json.loads(json.dumps(told, default=str))
 

@@ -119,7 +119,9 @@ class ModelConfig:
             raise ValueError("a ring net sees a polar image: expected model.polar (rings, sectors), found none")
         for size, step in zip(self.image_size, self._steps, strict=True):
             if size % step:
-                raise ValueError(f"the backbone's image must be a multiple of {self._steps} cells, found {self.image_size}")
+                raise ValueError(
+                    f"the backbone's image must be a multiple of {self._steps} cells, found {self.image_size}"
+                )
 
     @property
     def _steps(self) -> tuple[int, int]:

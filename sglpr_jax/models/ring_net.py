@@ -5,6 +5,8 @@ by means, which no sector is left out of. So a turn by a whole number of the las
 exact up to the resampling of the image.
 """
 
+import itertools
+
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -73,7 +75,7 @@ class RingDecoder(nn.Module):
     @nn.compact
     def __call__(self, maps: list[Array]) -> Float[Array, "b p q _"]:
         """As many channels as the first block has."""
-        finer_maps = [fine for fine, coarse in zip(maps[:-1], maps[1:], strict=True) if fine.shape[:3] != coarse.shape[:3]]
+        finer_maps = [fine for fine, coarse in itertools.pairwise(maps) if fine.shape[:3] != coarse.shape[:3]]
         x = maps[-1]
         for i, seen in enumerate(reversed(finer_maps)):
             width = max(seen.shape[-1], maps[1].shape[-1])

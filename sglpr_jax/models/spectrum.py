@@ -1,4 +1,4 @@
-"""Pooling by the amplitudes of a map's Fourier transform along its sectors: a shift, a turn of the scan, leaves them."""
+"""Pooling by the amplitudes of a map's Fourier transform along its sectors, which a turn of the scan leaves as is."""
 
 import flax.linen as nn
 import jax.numpy as jnp

@@ -48,10 +48,11 @@ def train(
     """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch (the host's part).
 
     All devices share a step. Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest
-    one, if there is one yet. A new run begins with `start_from`, or with fresh weights. `refresh(step, params)` is called before the first step and before each multiple of
-    `sampling.refresh_steps`. `record` is told what the metrics are told. Raises FloatingPointError, naming the step and
-    its batch as `places` does, when the loss is no longer finite; OSError when metrics or a checkpoint cannot be
-    written; ValueError where the devices cannot share a step (`data_mesh`).
+    one, if there is one yet. A new run begins with `start_from`, or with fresh weights. `refresh(step, params)` is
+    called before the first step and before each multiple of `sampling.refresh_steps`. `record` is told what the
+    metrics are told. Raises FloatingPointError, naming the step and its batch as `places` does, when the loss is no
+    longer finite; OSError when metrics or a checkpoint cannot be written; ValueError where the devices cannot share a
+    step (`data_mesh`).
     """
     mesh = data_mesh(config)
     folder.mkdir(parents=True, exist_ok=True)
