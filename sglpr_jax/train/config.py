@@ -21,8 +21,8 @@ class LossConfig:
     temperature: float = 0.0
     """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
     one_threshold: float = 0.0
-    """Share of the triplet loss in which an anchor's negatives are those of the whole batch (`losses.one_threshold`), as
-    one threshold on distances that all places share needs it. 0 in the paper."""
+    """Share of the triplet loss in which an anchor's negatives are those of the whole batch (`losses.one_threshold`): one
+    threshold on distances for all places needs it. 0 in the paper."""
     ce_weight: float = 0.4
     dice_weight: float = 0.6
     segment_every: int = 1
