@@ -75,7 +75,7 @@ class TrainCommand:
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
     references: bool = True
-    """At the end score untrained weights, the thumbnail and polar-FFT beside the trained (--no-references: not)."""
+    """At the end score untrained weights, the thumbnail and polar-FFT beside it (--no-references: not)."""
     tensorboard: bool = False
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     poses: PoseChoice = "auto"

@@ -21,7 +21,7 @@ class LossConfig:
     temperature: float = 0.0
     """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
     one_threshold: float = 0.0
-    """Share of the triplet loss in which an anchor's negatives are those of the whole batch (`losses.one_threshold`): one
+    """Share of the triplet loss in which the negatives of all anchors are an anchor's (`losses.one_threshold`): one
     threshold on distances for all places needs it. 0 in the paper."""
     ce_weight: float = 0.4
     dice_weight: float = 0.6
