@@ -8,7 +8,7 @@ import jax
 from sglpr_jax.cli.methods import Method, network, reference
 from sglpr_jax.cli.runtime import console, progress_bar, write_json
 from sglpr_jax.cli.segment import score_semantics
-from sglpr_jax.data import Drive, ScanSequence
+from sglpr_jax.data import Drive
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.report import comparison, evaluate, table, to_json
@@ -35,7 +35,7 @@ def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int, refe
         _print(results, f"sequence {sequence.name}, {title}")
         if importlib.util.find_spec("matplotlib"):
             _draw(results, sequence, folder, title)
-    if params.config.segments and isinstance(sequence, ScanSequence) and sequence.has_labels:
+    if params.config.segments and sequence.has_labels:
         report["segmentation"] = score_semantics(params, sequence, folder)
     write_json(folder / "results.json", report)
     console().print(f"written to {folder}")

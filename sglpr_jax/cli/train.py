@@ -22,9 +22,10 @@ from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
 from sglpr_jax.cli.training_batches import batches, named_places, positions_of, tuple_pool
 from sglpr_jax.cli.training_recall import training_recall
 from sglpr_jax.cli.validation import validation_score
-from sglpr_jax.data import Drive, ScanSequence
+from sglpr_jax.data import Drive
 from sglpr_jax.data.held_out import hold_out
 from sglpr_jax.data.kitti import PoseChoice
+from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.models.params import graft, load, save
 from sglpr_jax.models.sglpr import Params, init
@@ -61,8 +62,11 @@ class TrainCommand:
     data: Path | None = None
     """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated drives."""
     also: tuple[Path, ...] = ()
-    """Further datasets, all of whose drives are trained on, with --also-tuples of a step's tuples: simulated scans with
-    labels, say, beside real images without."""
+    """Further datasets, all of whose drives are trained on, with --also-tuples of a step's tuples: simulated scans or
+    images with labels, say, beside real images without."""
+    pseudo_labels: Path | None = None
+    """Label maps NN/<id>.png that bin/segment made of the images of --data, for its drives without labels of their own;
+    never for the one tested."""
     preset: str = "small"
     """A file of configs/ by name, or a path to one of your own."""
     out: Path | None = None
@@ -173,6 +177,8 @@ def _drives(command: TrainCommand) -> tuple[list[Drive], list[Drive], Drive]:
             "--also names datasets and --also-tuples how many tuples of a step are theirs: expected both or neither, "
             f"found {len(command.also)} datasets and {config.also_tuples} tuples"
         )
+    if command.pseudo_labels is not None:
+        drives = _pseudo_labelled(drives, command.pseudo_labels, config)
     if config.model.categories_read:
         for drive in (*drives, *also, test):
             _require_labels(drive)
@@ -184,6 +190,15 @@ def _start(command: TrainCommand) -> Params | None:
     if command.start is None or command.resume:
         return None
     return graft(load(command.start), init(jax.random.key(command.config.seed), config=command.config.model))
+
+
+def _pseudo_labelled(drives: Sequence[Drive], folder: Path, config: TrainConfig) -> list[Drive]:
+    if not config.model.segments:
+        raise ValueError("--pseudo-labels are for the segmentation head: expected losses that train one, found none")
+    labelled = with_pseudo_labels(drives, folder)
+    maps = sum(path is not None for drive in labelled for path in drive.label_paths)
+    print(f"{maps} of {sum(map(len, labelled))} images have labels, with those of {folder}", file=sys.stderr)
+    return labelled
 
 
 def _describe_unturned(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig) -> DescribeFn:
@@ -259,7 +274,7 @@ def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
 
 
 def _require_labels(drive: Drive) -> None:
-    labelled = sum(path is not None for path in drive.label_paths) if isinstance(drive, ScanSequence) else 0
+    labelled = sum(path is not None for path in drive.label_paths)
     if labelled < len(drive):
         raise ValueError(
             f"model.head.input reads labels: expected labels beside every scan of sequence {drive.name}, "

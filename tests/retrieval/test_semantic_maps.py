@@ -1,14 +1,24 @@
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from PIL import Image
 
 from sglpr_jax.bev import rasterize, rasterize_labels
-from sglpr_jax.models.sglpr import field_of_view, init, segment
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.data.label_maps import label_map_pixels
+from sglpr_jax.data.sequence import ImageSequence
+from sglpr_jax.models.sglpr import Params, field_of_view, init, segment
+from sglpr_jax.retrieval.semantic_maps import read_semantic_map, semantic_map
 
 
-def test_a_map_holds_the_likeliest_known_class_where_points_are():
-    params = init(jax.random.key(0), preset="tiny")
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return init(jax.random.key(0), preset="tiny")
+
+
+def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 9, (700, 3)).astype(np.float32)
     classes = rng.integers(0, 20, 700).astype(np.int32)
@@ -24,3 +34,38 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are():
     unlabelled = semantic_map(params, points)
     np.testing.assert_array_equal(unlabelled.predicted, found.predicted)
     assert not unlabelled.truth.any()
+
+
+def image_sequence(image: np.ndarray, label_path: Path | None) -> ImageSequence:
+    return ImageSequence(
+        "06", ("0",), None, None, None, (Path("0.png"),), 0.4, lambda path: image, label_paths=(label_path,)
+    )
+
+
+def test_the_map_of_an_image_is_that_of_its_middle_where_it_is_not_empty(params, tmp_path):
+    grid = params.config.grid
+    rng = np.random.default_rng(0)
+    image = rng.poisson(0.3, (grid.height + 3, grid.width + 6)).astype(np.float32)
+    Image.fromarray(label_map_pixels(np.full(image.shape, 50))).save(tmp_path / "0.png")
+    found = read_semantic_map(params, image_sequence(image, tmp_path / "0.png"), 0)
+    middle = image[1 : 1 + grid.height, 3 : 3 + grid.width]
+    seen = (middle > 0) & field_of_view(params.config)[0]
+    logits = np.asarray(segment(params, jnp.asarray(middle)))[..., 1:]
+    np.testing.assert_array_equal(found.counts, middle)
+    np.testing.assert_array_equal(found.predicted, np.where(seen, logits.argmax(-1) + 1, 0))
+    np.testing.assert_array_equal(found.truth, np.where(seen, 13, 0))  # building
+    assert not read_semantic_map(params, image_sequence(image, None), 0).truth.any()
+
+
+def test_cells_the_network_is_not_sure_of_are_left_unlabelled(params):
+    points = np.random.default_rng(0).normal(0, 9, (700, 3)).astype(np.float32)
+    every = semantic_map(params, points)
+    logits = np.asarray(segment(params, jnp.asarray(every.counts)), np.float64)[..., 1:]
+    exponentials = np.exp(logits - logits.max(-1, keepdims=True))
+    confidence = 1 / exponentials.sum(-1)
+    least = np.quantile(confidence[every.seen], 0.5) + 1e-6
+    found = semantic_map(params, points, min_confidence=least)
+    clear = np.abs(confidence - least) > 1e-5
+    expected = np.where(confidence >= least, every.predicted, 0)
+    np.testing.assert_array_equal(found.predicted[clear], expected[clear])
+    assert 0 < found.seen.sum() < every.seen.sum()
