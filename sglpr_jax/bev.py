@@ -6,12 +6,16 @@ against the row v. Functions on clouds take any leading batch axes; a padded clo
 
 import dataclasses
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.ndimage import map_coordinates
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
+
+ImageKind = Literal["points", "density"]
+"""What the cells of a scan's image count: its points (equation 1), or voxels, as in the ready-made images of KITTI."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +125,7 @@ def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Fl
     return turned.reshape(*batch, height, width)
 
 
-def centre_crop(image: Float[Array, "*b h w"], *, height: int, width: int) -> Float[Array, "*b {height} {width}"]:
+def centre_crop(image: Num[Array, "*b h w"], *, height: int, width: int) -> Num[Array, "*b {height} {width}"]:
     """The middle `height` x `width` cells of larger images; the odd cell of an uneven margin is cut at the far side."""
     if image.shape[-2] < height or image.shape[-1] < width:
         raise ValueError(f"a crop of {height} x {width} cells needs a larger image, found {image.shape[-2:]}")

@@ -35,8 +35,8 @@ class SegmentCommand:
     Example: bin/segment --weights runs/small-08 --data KITTI --seq 08 --out maps/
     """
 
-    weights: Path
-    """A training run's folder, or a folder with config.json and model.safetensors."""
+    weights: str
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     data: Path
     """A dataset in KITTI's layout, or a folder of scans (.bin, .pcd)."""
     out: Path

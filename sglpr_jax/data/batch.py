@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.bev import Grid, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
+from sglpr_jax.bev import Grid, ImageKind, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
+from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.labels import UNLABELLED, to_classes
@@ -49,13 +50,15 @@ def read_batch(
     max_points: int,
     share_negatives: bool,
     categories: int = 20,
+    image: ImageKind = "points",
     part: slice = slice(None),
 ) -> Batch:
     """Read the frames of some tuples.
 
     With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
     of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
-    sorted into classes; with 0 they are not read. `part` says which tuples to read; their negatives are still sought
+    sorted into classes; with 0 they are not read. `image` "density" makes an image like the ready-made ones of all
+    points of a scan, which can have no labels then. `part` says which tuples to read; their negatives are still sought
     among all of the batch.
     """
     flat = frames.reshape(-1)
@@ -66,6 +69,9 @@ def read_batch(
     places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in frames[part].reshape(-1)]
     if isinstance(drives[0], ImageSequence):
         images = np.stack([_read_image(*place) for place in places])
+        return Batch(np.zeros(len(places), bool), far, pool.config.positives, images=images)
+    if image == "density":
+        images = np.stack([_density_image(*place, categories) for place in places])
         return Batch(np.zeros(len(places), bool), far, pool.config.positives, images=images)
     points, count, classes, labelled = _padded([_read_scan(*place, categories) for place in places], max_points)
     has_labels = categories > 0 and any(drive.has_labels for drive in drives)
@@ -120,6 +126,16 @@ def _read_scan(drive: Drive, frame: int, categories: int) -> tuple[np.ndarray, n
         raise ValueError(f"expected all drives of a batch to be scans, found images in {drive.name}")
     labels = drive.labels(frame) if categories else None
     return drive.points(frame), None if labels is None else to_classes(labels, categories=categories)
+
+
+def _density_image(drive: Drive, frame: int, categories: int) -> np.ndarray:
+    points, classes = _read_scan(drive, frame, categories)
+    if classes is not None:
+        raise ValueError(
+            f"scans become density images here (model.image), which have no labels in training: expected scans without "
+            f"labels, found some in {drive.name}; train without the segmentation losses, or on point counts"
+        )
+    return density_bev(points)
 
 
 def _padded(scans: list[tuple[np.ndarray, np.ndarray | None]], max_points: int) -> tuple[np.ndarray, ...]:

@@ -9,7 +9,7 @@ In such an image the row runs backwards and the column to the right; eq. 1 has x
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from sglpr_jax.data.pose_files import read_poses, rows_of
@@ -61,4 +61,9 @@ def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
         raise ValueError(f"{path}: expected an 8-bit grey PNG, found no such image ({error})") from error
     if mode != "L":
         raise ValueError(f"{path}: expected an 8-bit grey PNG (mode L), found mode {mode}")
+    return counts_of(grey)
+
+
+def counts_of(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "w h"]:
+    """The counts 0..10 that the grey values of an image say, in eq. 1's orientation."""
     return np.ascontiguousarray(np.rot90(grey, -1)) * np.float32(MAX_COUNT / 255)

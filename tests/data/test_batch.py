@@ -9,6 +9,7 @@ import pytest
 
 from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image
 from sglpr_jax.data.batch import read_batch, views
+from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
@@ -176,6 +177,20 @@ def test_images_are_turned_whole_and_then_cropped():
     turned, _ = views(batch, jnp.full(4, 0.7), GRID)
     whole = rotate_image(jnp.asarray(batch.images), jnp.full(4, 0.7))
     np.testing.assert_allclose(turned, whole[:, 2:18, 2:18], atol=1e-5)
+
+
+def test_scans_become_density_images_of_all_their_points(drives, pool):
+    bare, frames = drives[1], np.array([[0, 1, 12, 13]])
+    alone = TuplePool([bare.positions], TupleConfig(negatives=2))
+    batch = read_batch([bare], alone, frames, max_points=2, share_negatives=False, image="density")
+    assert batch.points is None and not batch.labelled.any() and batch.places == 4
+    np.testing.assert_array_equal(batch.images, [density_bev(clouds(1)[frame]) for frame in frames[0]])
+    assert batch.images.sum() > 0
+    np.testing.assert_allclose(views(batch, jnp.zeros(4), GRID)[0], batch.images[:, 67:83, 67:83], atol=1e-4)
+    with pytest.raises(ValueError, match=r"model.image.*expected scans without labels, found some in 00"):
+        read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, image="density")
+    unread = read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
+    assert unread.images.shape == (8, 151, 151)
 
 
 def test_scans_and_images_do_not_mix(drives, pool):
