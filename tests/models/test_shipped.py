@@ -15,13 +15,16 @@ from sglpr_jax.models import shipped
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import CONFIG_FILE, WEIGHTS_FILE, for_places, load, save
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params, describe, init
+from sglpr_jax.models.sglpr import Params, describe
 from sglpr_jax.models.shipped import shipped_weights, weights_folder
 
 CARD_FILE = "README.md"
 FILES = [CARD_FILE, CONFIG_FILE, WEIGHTS_FILE]
 LARGEST_BYTES = 15e6
 CARD = {"Licence": "Apache-2.0", "Training data": "None.", "Command": "`none`", "Numbers": "Recall@1 0.0"}
+
+HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
+MODEL = dataclasses.replace(model_preset("tiny"), grid=Grid(3.2, 16, 16), depths=(1,), heads=(2,), detail=8, head=HEAD)
 
 
 def assert_fit_to_ship(folder: Path) -> None:
@@ -50,7 +53,7 @@ def sections(card: str) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def params(random_params) -> Params:
-    return random_params(model_preset("tiny"))
+    return random_params(MODEL)
 
 
 @pytest.fixture
@@ -151,25 +154,11 @@ def test_a_weight_too_large_for_half_precision_is_named(params, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("changes", "dropped"),
-    [
-        ({}, {"segmentation_head"}),
-        (
-            {"head": HeadConfig(tap="tokens", channels=(8,), kernels=(3,), strides=(1,), cbam_reduction=4, clusters=4)},
-            None,
-        ),
-    ],
-)
-def test_what_only_the_segmentation_head_reads_is_dropped_and_descriptors_stay(
-    random_params, changes, dropped, tmp_path
-):
-    whole = random_params(dataclasses.replace(model_preset("tiny"), detail=8, **changes))
-    dropped = (
-        {"segmentation_head", "narrow", "detail"} if dropped else {"segmentation_head", "narrow", "detail", "expand"}
-    )
+@pytest.mark.parametrize(("tap", "also_dropped"), [("pixels", set()), ("tokens", {"expand"})])
+def test_what_the_segmentation_head_alone_reads_is_dropped(random_params, tap, also_dropped, tmp_path):
+    whole = random_params(dataclasses.replace(MODEL, head=dataclasses.replace(HEAD, tap=tap)))
     places = for_places(whole)
-    assert set(whole.weights) - set(places.weights) == dropped
+    assert set(whole.weights) - set(places.weights) == {"segmentation_head", "narrow", "detail"} | also_dropped
     assert not places.config.segments
     images = images_of(whole)
     np.testing.assert_array_equal(describe(places, images), describe(whole, images))
@@ -177,15 +166,15 @@ def test_what_only_the_segmentation_head_reads_is_dropped_and_descriptors_stay(
     assert for_places(places) is places
 
 
-def test_a_head_that_reads_labels_keeps_its_categories():
-    head = HeadConfig(input="labels", channels=(8,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
-    params = init(jax.random.key(0), config=dataclasses.replace(model_preset("tiny"), head=head))
+def test_a_head_that_reads_labels_keeps_its_categories(random_params):
+    head = dataclasses.replace(HEAD, input="labels")
+    params = random_params(dataclasses.replace(MODEL, head=head))
     assert for_places(params) is params
 
 
 def test_a_model_for_density_images_has_their_cells(params, tmp_path):
     config = params.config
-    with pytest.raises(ValueError, match=r"151 x 151 cells of 0.4 m: expected .*, found 32 x 32 cells of 1.6 m"):
+    with pytest.raises(ValueError, match=r"151 x 151 cells of 0.4 m: expected .*, found 16 x 16 cells of 3.2 m"):
         dataclasses.replace(config, image="density")
     with pytest.raises(ValueError, match=r"found 160 x 32 cells of 0.4 m"):
         dataclasses.replace(config, image="density", grid=Grid(0.4, 160, 32))
