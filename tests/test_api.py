@@ -23,7 +23,16 @@ INPUTS_NOT_OPTIONS = {
 
 def test_all_is_sorted_out_and_complete():
     assert len(set(sglpr_jax.__all__)) == len(sglpr_jax.__all__)
-    assert {"load", "shipped_weights", "density_bev", "init", "describe", "rasterize", "rasterize_labels", "Grid"} <= set(sglpr_jax.__all__)
+    assert {
+        "load",
+        "shipped_weights",
+        "density_bev",
+        "init",
+        "describe",
+        "rasterize",
+        "rasterize_labels",
+        "Grid",
+    } <= set(sglpr_jax.__all__)
 
 
 @pytest.mark.parametrize(("name", "member"), CALLABLES, ids=lambda x: x if isinstance(x, str) else "")
