@@ -31,7 +31,7 @@ ROTATION_SEED = 0
 class Semantics:
     """Mean IoU on real labelled scans, beside the commonest class, and each cell's commonest class in the simulator."""
 
-    weights: Path
+    weights: str
     out: Path
     """Folder of semantics.json and of the picture (it shows a real scan, which KITTI's licence keeps private)."""
     prior: Path
@@ -48,7 +48,7 @@ class Semantics:
 class Places:
     """Every protocol on real ready-made images, raw and turned, beside untrained weights and polar-FFT."""
 
-    weights: Path
+    weights: str
     out: Path
     """The JSON file to write."""
     images: Path

@@ -6,12 +6,16 @@ against the row v. Functions on clouds take any leading batch axes; a padded clo
 
 import dataclasses
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int, Num, Shaped
+
+ImageKind = Literal["points", "density"]
+"""What the cells of a scan's image count: its points (equation 1), or voxels, as in the ready-made images of KITTI."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +136,7 @@ def _turned(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order:
     return turned.reshape(*batch, height, width)
 
 
+@jax.jit
 def even_cells(image: Num[Array, "*b h w"]) -> Num[Array, "*b h+h%2 w+w%2"]:
     """A ready-made density image on the cells of eq. 1: its middle row and column become two of half the count.
 

@@ -23,7 +23,16 @@ INPUTS_NOT_OPTIONS = {
 
 def test_all_is_sorted_out_and_complete():
     assert len(set(sglpr_jax.__all__)) == len(sglpr_jax.__all__)
-    assert {"load", "init", "describe", "rasterize", "rasterize_labels", "Grid"} <= set(sglpr_jax.__all__)
+    assert {
+        "load",
+        "shipped_weights",
+        "density_bev",
+        "init",
+        "describe",
+        "rasterize",
+        "rasterize_labels",
+        "Grid",
+    } <= set(sglpr_jax.__all__)
 
 
 @pytest.mark.parametrize(("name", "member"), CALLABLES, ids=lambda x: x if isinstance(x, str) else "")
@@ -55,7 +64,8 @@ def test_the_readmes_lines(tmp_path):
 
     loaded = sglpr_jax.load(tmp_path / "run")
     points = sglpr_jax.read_scan(tmp_path / "000000.bin")
-    bev = sglpr_jax.rasterize(points, grid=loaded.config.grid)
+    bev = sglpr_jax.scan_image(points, loaded.config)
+    np.testing.assert_array_equal(bev, sglpr_jax.rasterize(points, grid=loaded.config.grid))
     descriptor = sglpr_jax.describe(loaded, bev)
 
     assert descriptor.shape == (256,) and descriptor.dtype == jnp.float32

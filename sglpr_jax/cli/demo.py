@@ -45,9 +45,9 @@ def demo(command: DemoCommand) -> Path:
     train_and_test(TrainCommand(seq=TESTED, data=town, preset="demo", out=trained, config=config))
     print("\nthe same by hand: bin/embed, then bin/evaluate", file=sys.stderr)
     descriptors = embed_sequence(
-        EmbedCommand(data=town, seq=TESTED, weights=trained, out=command.out / f"{TESTED}.npz")
+        EmbedCommand(data=town, seq=TESTED, weights=str(trained), out=command.out / f"{TESTED}.npz")
     )
-    evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=trained))
+    evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=str(trained)))
     pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])
     print("pictures:", *pictures, sep="\n  ")
     print(f"all on one page: {command.out / TESTED / PAGE}")

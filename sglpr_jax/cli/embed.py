@@ -19,7 +19,7 @@ class EmbedCommand:
 
     Examples:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
-      bin/embed --weights runs/small-08 --data my_scans/ --out mine.npz --skip-bad
+      bin/embed --weights simulated --data my_scans/ --out mine.npz --skip-bad
       bin/embed --method scan-context --data KITTI --seq 08 --out reference.npz
     """
 
@@ -27,8 +27,8 @@ class EmbedCommand:
     """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
     out: Path
     """The descriptor file to write (.npz)."""
-    weights: Path | None = None
-    """A training run's folder, or a folder with config.json and model.safetensors."""
+    weights: str | None = None
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     method: MethodName = "sglpr"
     """The network, or a reference that needs no weights; scan-context to solid need points, ssc labels too."""
     seq: str | None = None

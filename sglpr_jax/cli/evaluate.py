@@ -72,8 +72,9 @@ class EvaluateCommand:
     """A dataset with the frames as scans or images: the page then shows them."""
     seq: str | None = None
     """The sequence: which of --data, and in which FILE has no name of its own, whose published split counts."""
-    weights: Path | None = None
-    """A training run's folder: with --data the page then shows semantic maps and feature heat maps."""
+    weights: str | None = None
+    """The name of shipped weights or a training run's folder: with --data the page then shows semantic maps and feature
+    heat maps."""
 
 
 def evaluate_file(command: EvaluateCommand) -> Path:

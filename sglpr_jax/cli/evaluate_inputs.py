@@ -32,7 +32,7 @@ class PoseOptions:
         return None
 
 
-def open_dataset(data: Path | None, seq: str | None, weights: Path | None) -> tuple[Drive | None, Params | None]:
+def open_dataset(data: Path | None, seq: str | None, weights: str | None) -> tuple[Drive | None, Params | None]:
     """Open what the page shows pictures of; ValueError for weights without data."""
     if data is not None:
         return open_sequence(data, seq), None if weights is None else load(weights)

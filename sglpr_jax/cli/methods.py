@@ -2,12 +2,11 @@
 
 import dataclasses
 import functools
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data import Drive, ImageSequence
 from sglpr_jax.evaluation.baselines import BASELINES, Baseline
 from sglpr_jax.models.params import load, weights_hash
@@ -25,7 +24,7 @@ BEV_IMAGE_RADIUS = 62.0
 class ImageMethod:
     """A way to describe images: the function, the window it wants (None: images whole), and what to write about it.
 
-    With `categories` the function wants maps of so many classes too.
+    With `categories` the function wants maps of so many classes too. `image` says what raw scans are made into.
     """
 
     describe: DescribeFn
@@ -33,6 +32,7 @@ class ImageMethod:
     about: dict[str, Any]
     weights_hash: str = ""
     categories: int = 0
+    image: ImageKind = "points"
 
     def embed(self, sequence: Drive, **options: Any) -> DescriptorFile:
         """Describe a whole sequence; options are those of `retrieval.embed.embed`.
@@ -45,7 +45,8 @@ class ImageMethod:
                 f"scans, found none in sequence {sequence.name}"
             )
         options |= {"config": {"data": sequence.name, **self.about}, "weights_hash": self.weights_hash}
-        return embed(self.describe, sequence, self.grid, categories=self.categories, **options)
+        options |= {"categories": self.categories, "image": self.image}
+        return embed(self.describe, sequence, self.grid, **options)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,12 +78,12 @@ class ScanMethod:
 Method = ImageMethod | ScanMethod
 
 
-def method_named(name: MethodName, weights: Path | None, sequence: Drive) -> Method:
+def method_named(name: MethodName, weights: str | None, sequence: Drive) -> Method:
     """The network with these weights, or a reference; ValueError for the network without weights."""
     if name != "sglpr":
         return reference(name, sequence, model_preset("small").grid)
     if weights is None:
-        raise ValueError("expected --weights (a training run's folder), found none")
+        raise ValueError("expected --weights (a name, or a training run's folder), found none")
     return network(load(weights))
 
 
@@ -91,7 +92,7 @@ def network(params: Params) -> ImageMethod:
     config = params.config
     about = {"method": "sglpr", "model": dataclasses.asdict(config)}
     describe_views = functools.partial(describe, params)
-    return ImageMethod(describe_views, config.grid, about, weights_hash(params), config.categories_read)
+    return ImageMethod(describe_views, config.grid, about, weights_hash(params), config.categories_read, config.image)
 
 
 def reference(name: str, sequence: Drive, grid: Grid) -> Method:

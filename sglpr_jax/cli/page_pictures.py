@@ -58,7 +58,8 @@ def _image(sequence: Drive, row: int, grid: Grid) -> np.ndarray:
 
 
 def _heat(sequence: Drive, params: Params, row: int) -> HeatPicture:
-    views = read_views(sequence, row, params.config.grid, categories=params.config.categories_read)
+    config = params.config
+    views = read_views(sequence, row, config.grid, categories=config.categories_read, image=config.image)
     return HeatPicture(np.asarray(views[0]), heat_maps(params, *views))
 
 

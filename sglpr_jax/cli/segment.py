@@ -41,8 +41,8 @@ class SegmentCommand:
       bin/segment --weights runs/simulated --data IMAGES --seq 06 --min-confidence 0.8 --out pseudo/06
     """
 
-    weights: Path
-    """A training run's folder, or a folder with config.json and model.safetensors."""
+    weights: str
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     data: Path
     """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
     out: Path

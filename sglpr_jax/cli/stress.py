@@ -44,8 +44,8 @@ class StressCommand:
     """Folder for results.json, config.json, stress.png and the descriptors; made if need be."""
     seq: str | None = None
     """Which sequence; may be left out where there is only one."""
-    weights: Path | None = None
-    """A training run's folder: the network is among the methods."""
+    weights: str | None = None
+    """The name of shipped weights or a training run's folder: the network is among the methods."""
     method: tuple[MethodName, ...] = ()
     """References that need no weights, as in bin/embed."""
     protocols: tuple[str, ...] = ()
@@ -135,7 +135,7 @@ def _methods(command: StressCommand, sequence: Drive) -> dict[str, Method]:
     names: list[MethodName] = ["sglpr"] if command.weights is not None else []
     names = list(dict.fromkeys([*names, *command.method]))
     if not names:
-        raise ValueError("expected --weights (a training run's folder) or --method, found neither")
+        raise ValueError("expected --weights (a name, or a training run's folder) or --method, found neither")
     return {name: method_named(name, command.weights, sequence) for name in names}
 
 

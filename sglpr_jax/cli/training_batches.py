@@ -38,6 +38,7 @@ def batches(
         "max_points": config.max_points,
         "share_negatives": config.share_negatives,
         "categories": config.model.categories,
+        "image": config.model.image,
     }
 
     tuples = main_tuples(config)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.bev import (
     Grid,
+    ImageKind,
     centre_crop,
     even_cells,
     rasterize,
@@ -19,6 +20,7 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
+from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.labels import UNLABELLED, to_classes
@@ -61,13 +63,15 @@ def read_batch(
     max_points: int,
     share_negatives: bool,
     categories: int = 20,
+    image: ImageKind = "points",
     part: slice = slice(None),
 ) -> Batch:
     """Read the frames of some tuples.
 
     With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
     of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
-    sorted into classes; with 0 they are not read. `part` says which tuples to read; their negatives are still sought
+    sorted into classes; with 0 they are not read. `image` "density" makes an image like the ready-made ones of all
+    points of a scan. `part` says which tuples to read; their negatives are still sought
     among all of the batch.
     """
     flat = frames.reshape(-1)
@@ -77,8 +81,9 @@ def read_batch(
     far = far[part]
     places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in frames[part].reshape(-1)]
     has_labels = categories > 0 and any(drive.has_labels for drive in drives)
-    if isinstance(drives[0], ImageSequence):
-        images, maps, labelled = _stacked([_read_image(*place, categories) for place in places])
+    if isinstance(drives[0], ImageSequence) or image == "density":
+        read = _read_image if isinstance(drives[0], ImageSequence) else _density_image
+        images, maps, labelled = _stacked([read(*place, categories) for place in places])
         return Batch(labelled, far, pool.config.positives, images=images, maps=maps if has_labels else None)
     points, count, classes, labelled = _padded([_read_scan(*place, categories) for place in places], max_points)
     return Batch(
@@ -146,6 +151,11 @@ def _stacked(places: list[tuple[np.ndarray, np.ndarray | None]]) -> tuple[np.nda
     maps = [np.full(image.shape, UNLABELLED, np.int32) if classes is None else classes for image, classes in places]
     labelled = np.array([classes is not None for _, classes in places])
     return np.stack([image for image, _ in places]), np.stack(maps), labelled
+
+
+def _density_image(drive: Drive, frame: int, categories: int) -> tuple[np.ndarray, np.ndarray | None]:
+    points, classes = _read_scan(drive, frame, categories)
+    return density_bev(points), None if classes is None else density_label_bev(points, classes)
 
 
 def _padded(scans: list[tuple[np.ndarray, np.ndarray | None]], max_points: int) -> tuple[np.ndarray, ...]:

@@ -8,7 +8,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from sglpr_jax.data.grey_png import read_grey_png
 from sglpr_jax.data.pose_files import read_poses, rows_of
@@ -53,4 +53,9 @@ def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
 
     Raises FileNotFoundError, and ValueError where the file is no whole 8-bit grey image.
     """
-    return np.ascontiguousarray(read_grey_png(path, bits=8)) * np.float32(MAX_COUNT / 255)
+    return as_counts(read_grey_png(path, bits=8))
+
+
+def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The counts 0..10 that grey values 0..255 stand for."""
+    return np.ascontiguousarray(grey) * np.float32(MAX_COUNT / 255)

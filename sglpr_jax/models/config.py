@@ -4,7 +4,8 @@ import dataclasses
 import math
 from typing import Literal
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.bev import Grid, ImageKind
+from sglpr_jax.data.density_image import check_density_grid
 from sglpr_jax.labels import Categories, label_map
 
 
@@ -71,6 +72,9 @@ class ModelConfig:
     """A Swin-Unet, or a ring net, with a place head and a segmentation head, over images of `grid`."""
 
     grid: Grid = Grid()
+    image: ImageKind = "points"
+    """What raw scans are made into: the point counts of equation 1, or density images as the ready-made ones of KITTI
+    are (`density_bev`), for a model trained on those. Ready-made images are taken as they are."""
     counts: Literal["raw", "log1p", "clipped"] = "log1p"
     """How point counts become network input: as they are, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"
@@ -108,6 +112,8 @@ class ModelConfig:
             raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
         if len(self.depths) != len(self.heads):
             raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
+        if self.image == "density":
+            check_density_grid(self.grid)
         if self.polar and self.field != "circle":
             raise ValueError(f"a polar image covers a circle: expected field 'circle', found {self.field!r}")
         if self.stem and self.patch % 2 ** (len(self.stem) - 1):

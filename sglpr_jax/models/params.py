@@ -18,20 +18,23 @@ from sglpr_jax.bev import Grid
 from sglpr_jax.files import writing
 from sglpr_jax.models.config import HeadConfig, ModelConfig, RingConfig
 from sglpr_jax.models.sglpr import Params, init
+from sglpr_jax.models.shipped import weights_folder
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 
 
-def save(params: Params, folder: Path | str) -> Path:
+def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
     """Write weights and configuration under a temporary name, then put them in the place of `folder`.
 
-    Raises OSError, naming `folder`, where they cannot be written.
+    With `half` as float16, in half the room. Raises OSError, naming `folder`, where they cannot be written, ValueError
+    for a weight too large for float16.
     """
     folder = Path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     # safetensors writes an array's memory as it lies, so a transposed view would come back scrambled.
     flat = {name: np.asarray(leaf, order="C") for name, leaf in _flatten(params.weights).items()}
+    flat = {name: _halved(name, leaf) for name, leaf in flat.items()} if half else flat
     with writing(folder), tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as scratch:
         new, old = Path(scratch) / "new", Path(scratch) / "old"
         new.mkdir()
@@ -43,13 +46,14 @@ def save(params: Params, folder: Path | str) -> Path:
     return folder
 
 
-def load(folder: Path | str) -> Params:
-    """Read what `save` wrote.
+def load(weights: Path | str) -> Params:
+    """Weights that ship with the package, by name (`shipped_weights()`), or what `save` wrote, by folder; float32.
 
-    A training run's directory works too: its `weights` folder is read. Raises FileNotFoundError when a file is
-    missing, ValueError when it is damaged or the weights are not those of the configuration.
+    A training run's directory works too: its `weights` folder is read. A name goes before a folder of the same name,
+    which is "./NAME". Raises FileNotFoundError when there is neither or a file is missing, ValueError when it is
+    damaged or the weights are not those of the configuration.
     """
-    folder = Path(folder)
+    folder = weights_folder(weights)
     if (folder / "weights").is_dir():
         folder = folder / "weights"
     for name in (CONFIG_FILE, WEIGHTS_FILE):
@@ -76,6 +80,16 @@ def graft(given: Params, fresh: Params) -> Params:
             wanted = flat[name].shape if name in flat else "no such weight"
             raise ValueError(f"cannot begin with these weights: {name} has shape {value.shape}, expected {wanted}")
     return dataclasses.replace(fresh, weights=flax.traverse_util.unflatten_dict(flat | values, sep="/"))
+
+
+def for_places(params: Params) -> Params:
+    """The part that `describe` computes with, to hand out: no segmentation head and nothing that feeds it alone."""
+    if not params.config.segments:
+        return params
+    config = dataclasses.replace(params.config, categories=0)
+    flat = _flatten(params.weights)
+    kept = {name: flat[name] for name in _shapes(config)}
+    return Params(flax.traverse_util.unflatten_dict(kept, sep="/"), config)
 
 
 def config_from_dict(values: dict[str, Any], *, source: Path | str) -> ModelConfig:
@@ -107,6 +121,13 @@ def _flatten(weights: Any) -> dict[str, Any]:
     return flax.traverse_util.flatten_dict(weights, sep="/")
 
 
+def _halved(name: str, leaf: np.ndarray) -> np.ndarray:
+    largest = np.finfo(np.float16).max
+    if np.abs(leaf).max(initial=0) > largest:
+        raise ValueError(f"{name}: expected weights up to {largest} to be written as float16, found larger ones")
+    return leaf.astype(np.float16)
+
+
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
@@ -122,9 +143,8 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _match(flat: dict[str, np.ndarray], config: ModelConfig, *, source: Path) -> Any:
-    """The tree of weights, after checking it against the shapes that the configuration asks for."""
-    fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
-    expected = {name: leaf.shape for name, leaf in _flatten(fresh.weights).items()}
+    """The tree of weights, in float32, after checking it against the shapes that the configuration asks for."""
+    expected = _shapes(config)
     found = {name: leaf.shape for name, leaf in flat.items()}
     if expected != found:
         name = sorted(set(expected.items()) ^ set(found.items()))[0][0]
@@ -132,4 +152,11 @@ def _match(flat: dict[str, np.ndarray], config: ModelConfig, *, source: Path) ->
             f"{source}: not the weights of its configuration: {name} should have shape "
             f"{expected.get(name, 'none (no such weight)')}, found {found.get(name, 'none (missing)')}"
         )
-    return flax.traverse_util.unflatten_dict(flat, sep="/")
+    single = {name: np.asarray(leaf, np.float32) for name, leaf in flat.items()}
+    return flax.traverse_util.unflatten_dict(single, sep="/")
+
+
+def _shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """The shape of every weight that the configuration asks for."""
+    fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
+    return {name: leaf.shape for name, leaf in _flatten(fresh.weights).items()}

@@ -8,19 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
 
-from sglpr_jax.bev import (
-    Grid,
-    centre_crop,
-    even_cells,
-    rasterize,
-    rasterize_labels,
-    rotate_image,
-    rotate_labels,
-    rotate_points,
-)
+from sglpr_jax.bev import Grid, ImageKind, centre_crop, even_cells, rotate_image, rotate_labels
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.scan_views import scan_views, turned
 
 DescribeFn = Callable[..., Float[Any, "b d"]]
 """Images of point counts (b, h, w) and, where asked for, maps of classes (b, h, w) in; one descriptor each out."""
@@ -29,9 +21,6 @@ DescribeScanFn = Callable[[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] |
 
 OnBadScan = Callable[[str, Exception], None]
 T = TypeVar("T")
-
-_POINTS_STEP = 16384
-"""Clouds are padded to a multiple of this, so that few sizes are compiled."""
 
 
 def embed(
@@ -42,6 +31,7 @@ def embed(
     config: dict[str, Any],
     weights_hash: str = "",
     categories: int = 0,
+    image: ImageKind = "points",
     rotation_seed: int | None = None,
     batch: int = 16,
     on_bad_scan: OnBadScan | None = None,
@@ -49,17 +39,18 @@ def embed(
 ) -> DescriptorFile:
     """Describe the image of every scan of a sequence.
 
-    `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. With `categories` the
-    labels beside the scans are read too, and `describe` gets each scan's map of so many classes. With `rotation_seed`
-    every scan is first turned about z by its own random angle. A scan that cannot be read raises its error, or, given
-    `on_bad_scan(id, error)`, is left out. `on_progress` is told how many scans are done.
+    `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. `image` says what raw
+    scans are made into. With `categories` the labels beside the scans are read too, and `describe` gets each scan's map
+    of so many classes. With `rotation_seed` every scan is first turned about z by its own random angle. A scan that
+    cannot be read raises its error, or, given `on_bad_scan(id, error)`, is left out. `on_progress` is told how many
+    scans are done.
     """
     angles = _angles(len(sequence), rotation_seed)
     rows, views, descriptors = [], [], []
 
     def read(row: int) -> tuple[Array, ...]:
         angle = None if angles is None else jnp.float32(angles[row])
-        return read_views(sequence, row, grid, categories=categories, angle=angle)
+        return read_views(sequence, row, grid, categories=categories, image=image, angle=angle)
 
     for row, view in _readable(sequence, read, on_bad_scan):
         rows.append(row)
@@ -95,7 +86,7 @@ def embed_scans(
     rows, descriptors = [], []
     for row, (points, classes) in _readable(sequence, lambda row: _read_scan(sequence, row, labels), on_bad_scan):
         rows.append(row)
-        descriptors.append(describe(points if angles is None else _turned(points, angles[row]), classes)[None])
+        descriptors.append(describe(points if angles is None else turned(points, angles[row]), classes)[None])
         on_progress(row + 1)
     return _file(sequence, rows, descriptors, config={**config, "rotation_seed": rotation_seed}, distance=distance)
 
@@ -131,14 +122,25 @@ def _file(sequence: Drive, rows: list[int], descriptors: list[np.ndarray], **abo
 
 
 def read_image(
-    sequence: Drive, row: int, grid: Grid | None, *, angle: Float[Array, ""] | None = None
+    sequence: Drive,
+    row: int,
+    grid: Grid | None,
+    *,
+    image: ImageKind = "points",
+    angle: Float[Array, ""] | None = None,
 ) -> Float[Array, "h w"]:
     """The image of one scan, turned by `angle` radians if given. Raises ValueError where scans come without a grid."""
-    return read_views(sequence, row, grid, angle=angle)[0]
+    return read_views(sequence, row, grid, image=image, angle=angle)[0]
 
 
 def read_views(
-    sequence: Drive, row: int, grid: Grid | None, *, categories: int = 0, angle: Float[Array, ""] | None = None
+    sequence: Drive,
+    row: int,
+    grid: Grid | None,
+    *,
+    categories: int = 0,
+    image: ImageKind = "points",
+    angle: Float[Array, ""] | None = None,
 ) -> tuple[Array, ...]:
     """The image of one scan and, with `categories`, its map of so many classes, both turned by `angle` radians.
 
@@ -154,16 +156,8 @@ def read_views(
         return views if grid is None else tuple(centre_crop(v, height=grid.height, width=grid.width) for v in views)
     if grid is None:
         raise ValueError("scans need a grid to be rasterised on, found none")
-    points = sequence.points(row)
-    count = jnp.int32(len(points))
-    padding = -len(points) % _POINTS_STEP
-    padded = jnp.asarray(np.pad(points, ((0, padding), (0, 0))))
-    padded = padded if angle is None else rotate_points(padded, angle)
-    image = rasterize(padded, grid=grid, count=count).astype(jnp.float32)
-    if not categories:
-        return (image,)
-    classes = jnp.asarray(np.pad(_classes(sequence, row, categories), (0, padding)))
-    return image, rasterize_labels(padded, classes, grid=grid, count=count)
+    classes = _classes(sequence, row, categories) if categories else None
+    return scan_views(sequence.points(row), grid, image=image, classes=classes, angle=angle)
 
 
 def _read_scan(
@@ -183,13 +177,6 @@ def _classes(sequence: Drive, row: int, categories: int) -> Int32[np.ndarray, ".
     if raw is None:
         raise ValueError(f"scan {sequence.ids[row]} of sequence {sequence.name}: expected labels, found none")
     return to_classes(raw, categories=categories)
-
-
-def _turned(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndarray, "n 3"]:
-    """What `rotate_points` returns, without compiling for every number of points."""
-    x, y, z = points.astype(np.float64).T
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)
 
 
 def _describe_padded(describe: DescribeFn, views: list[tuple[Array, ...]], batch: int) -> Float[np.ndarray, "b d"]:

@@ -5,21 +5,19 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Float32, Int
 
-from sglpr_jax.bev import centre_crop, even_cells, rasterize, rasterize_labels
+from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.sequence import Drive, ScanSequence
 from sglpr_jax.labels import UNLABELLED, to_classes
 from sglpr_jax.models.sglpr import Params, field_of_view, segment
-
-_POINTS_STEP = 16384
-"""Clouds are padded to a multiple of this, so that few sizes are compiled."""
+from sglpr_jax.retrieval.scan_views import scan_views
 
 
 class SemanticMap(NamedTuple):
     """What a scan shows, cell by cell (h, w)."""
 
-    counts: Num[np.ndarray, "h w"]
+    counts: Float[np.ndarray, "h w"]
     predicted: Int[np.ndarray, "h w"]
     """Class ids; 0 where no point fell, the network does not look or is not sure enough."""
     truth: Int[np.ndarray, "h w"]
@@ -33,7 +31,7 @@ class SemanticMap(NamedTuple):
 
 def semantic_map(
     params: Params,
-    points: Float[np.ndarray, "n 3"],
+    points: Float32[np.ndarray, "n 3"],
     classes: Int[np.ndarray, " n"] | None = None,
     *,
     min_confidence: float = 0.0,
@@ -42,11 +40,9 @@ def semantic_map(
 
     Cells whose likeliest class is less probable than `min_confidence` are left unlabelled.
     """
-    padding = -len(points) % _POINTS_STEP
     classes = np.zeros(len(points), np.int32) if classes is None else classes
-    padded = np.pad(points, ((0, padding), (0, 0))), np.pad(classes, (0, padding))
-    found = _maps_of_scan(params, *padded, jnp.int32(len(points)), jnp.float32(min_confidence))
-    return SemanticMap(*jax.device_get(found))
+    views = scan_views(points, params.config.grid, image=params.config.image, classes=classes)
+    return _semantic_map(params, *views, min_confidence)
 
 
 def read_semantic_map(params: Params, sequence: Drive, row: int, *, min_confidence: float = 0.0) -> SemanticMap:
@@ -54,42 +50,26 @@ def read_semantic_map(params: Params, sequence: Drive, row: int, *, min_confiden
 
     A ready-made image is cut to the model's grid, and its pixels above 0 are the cells that hold a point.
     """
-    raw = sequence.labels(row)
+    raw, grid = sequence.labels(row), params.config.grid
     classes = None if raw is None else to_classes(raw, categories=params.config.categories)
     if isinstance(sequence, ScanSequence):
         return semantic_map(params, sequence.points(row), classes, min_confidence=min_confidence)
     image = sequence.image(row)
-    truth = np.zeros(image.shape, np.int32) if classes is None else classes
-    return SemanticMap(*jax.device_get(_maps_of_image(params, image, truth, jnp.float32(min_confidence))))
+    whole = image, np.zeros(image.shape, np.int32) if classes is None else classes
+    views = (centre_crop(even_cells(jnp.asarray(view)), height=grid.height, width=grid.width) for view in whole)
+    return _semantic_map(params, *views, min_confidence)
+
+
+def _semantic_map(params: Params, counts: Array, truth: Array, min_confidence: float) -> SemanticMap:
+    return SemanticMap(*jax.device_get((counts, *_maps(params, counts, truth, jnp.float32(min_confidence)))))
 
 
 @jax.jit
-def _maps_of_scan(
-    params: Params,
-    points: Float[Array, "n 3"],
-    classes: Int[Array, " n"],
-    count: Int[Array, ""],
-    min_confidence: Float[Array, ""],
-) -> tuple[Array, Array, Array]:
-    grid = params.config.grid
-    truth = rasterize_labels(points, classes, grid=grid, count=count)
-    return _maps(params, rasterize(points, grid=grid, count=count), truth, min_confidence)
-
-
-@jax.jit
-def _maps_of_image(
-    params: Params, image: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
-) -> tuple[Array, Array, Array]:
-    grid = params.config.grid
-    counts, truth = (centre_crop(even_cells(x), height=grid.height, width=grid.width) for x in (image, truth))
-    return _maps(params, counts, truth, min_confidence)
-
-
 def _maps(
-    params: Params, counts: Num[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
-) -> tuple[Num[Array, "h w"], Int[Array, "h w"], Int[Array, "h w"]]:
+    params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
+) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
     seen = (counts > 0) & field_of_view(params.config)[0]
     known = segment(params, counts)[..., UNLABELLED + 1 :]  # a cell with points in it is not "unlabelled"
     predicted = known.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
     sure = jax.nn.softmax(known).max(-1) >= min_confidence
-    return counts, jnp.where(seen & sure, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)
+    return jnp.where(seen & sure, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)

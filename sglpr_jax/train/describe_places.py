@@ -35,6 +35,7 @@ def describe_places(
             max_points=config.max_points,
             share_negatives=True,
             categories=config.model.categories_read,
+            image=config.model.image,
         )
         described.append(np.asarray(_describe(params, batch, jnp.asarray(angles[rows], jnp.float32))))
     return np.concatenate(described)[: len(places)].astype(np.float32)

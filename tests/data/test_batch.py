@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image, rotate_labels
+from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels
 from sglpr_jax.data.batch import read_batch, views
+from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.label_maps import label_map_pixels
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TupleConfig, TuplePool
@@ -229,6 +230,26 @@ def test_maps_are_turned_and_cropped_with_their_images(pool, tmp_path):
     np.testing.assert_array_equal(maps, rotate_labels(jnp.asarray(batch.maps), angles)[:, 2:18, 3:19])
     same_angle = np.asarray(images)[np.asarray(maps) == 1].mean()
     assert same_angle > 5.5 > 4.5 > np.asarray(images)[np.asarray(maps) == 0].mean()
+
+
+def test_scans_become_density_images_of_all_their_points(drives, pool):
+    bare, frames = drives[1], np.array([[0, 1, 12, 13]])
+    alone = TuplePool([bare.positions], TupleConfig(negatives=2))
+    batch = read_batch([bare], alone, frames, max_points=2, share_negatives=False, image="density")
+    assert batch.points is None and not batch.labelled.any() and batch.places == 4
+    np.testing.assert_array_equal(batch.images, [density_bev(clouds(1)[frame]) for frame in frames[0]])
+    assert batch.images.sum() > 0
+    middle = even_cells(jnp.asarray(batch.images))[:, 68:84, 68:84]
+    np.testing.assert_allclose(views(batch, jnp.zeros(4), GRID)[0], middle, atol=1e-4)
+    labelled = read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, image="density")
+    for row, frame in enumerate(FRAMES.reshape(-1)):
+        drive, number = drives[int(pool.drive[frame])], int(pool.frame[frame])
+        assert labelled.labelled[row] == (drive.labels(number) is not None)
+        if labelled.labelled[row]:
+            classes = to_classes(drive.labels(number))
+            np.testing.assert_array_equal(labelled.maps[row], density_label_bev(drive.points(number), classes))
+    unread = read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
+    assert unread.images.shape == (8, 151, 151)
 
 
 def test_scans_and_images_do_not_mix(drives, pool):

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.data.bev_images import read_image
-from sglpr_jax.data.density_image import density_image, density_label_map
+from sglpr_jax.data.density_image import density_bev, density_image, density_label_bev, density_label_map
 
 
 def cloud(*points: tuple[float, float, float]) -> np.ndarray:
@@ -92,6 +92,25 @@ def test_labels_lie_on_the_image():
     np.testing.assert_array_equal(labels > 0, density_image(points) > 0)  # so few points are their voxels' centroids
 
 
+@pytest.mark.parametrize("n", [0, 1, 5, 20_000])
+def test_the_image_for_models_is_the_ready_made_one_that_would_be_read(n, tmp_path):
+    points = np.random.default_rng(n).normal(scale=[9, 9, 1], size=(n, 3)).astype(np.float32)
+    Image.fromarray(density_image(points)).save(tmp_path / "a.png")
+    found = density_bev(points)
+    np.testing.assert_array_equal(found, read_image(tmp_path / "a.png"))
+    assert found.shape == (151, 151) and found.dtype == np.float32 and found.max() == (10 if n else 0)
+
+
+def test_labels_for_models_lie_on_their_image():
+    points = cloud((20.1, -10.1, 0.0), (3.1, 8.1, 0.0))
+    labels = density_label_bev(points, np.array([5, 6]))
+    assert {tuple(map(int, cell)): int(labels[tuple(cell)]) for cell in np.argwhere(labels)} == {
+        (100, 125): 5,  # eq. 1: x to the right, y up
+        (55, 82): 6,
+    }
+    np.testing.assert_array_equal(labels > 0, density_bev(points) > 0)
+
+
 def test_the_real_images_are_reproduced_pixel_for_pixel(shared):
     scans = sorted((shared / "data/kitti_odometry/sequences/00/velodyne").glob("*.bin"))
     assert scans
@@ -99,3 +118,26 @@ def test_the_real_images_are_reproduced_pixel_for_pixel(shared):
         points = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
         expected = np.asarray(Image.open(shared / f"data/kitti_bev/00/imgs/{path.stem}.png"))
         np.testing.assert_array_equal(density_image(points), expected, err_msg=path.stem)
+
+
+def test_real_scans_without_a_ready_made_image_follow_the_recipe(shared):
+    scans = sorted((shared / "data/kitti_odometry/sequences/08/velodyne").glob("*.bin"))
+    assert len(scans) == 3
+    for path in scans:
+        points = np.fromfile(path, "<f4").reshape(-1, 4)[:, :3]
+        np.testing.assert_array_equal(density_image(points), _by_sorting(points), err_msg=path.stem)
+
+
+def _by_sorting(points: np.ndarray) -> np.ndarray:
+    """The recipe with numpy.unique, for as many points as a real scan has."""
+    kept = points[(np.abs(points[:, :2]) < 25).all(1) & (points[:, 2] > -1.2)]
+    for steps in range(2, 100):
+        voxels = np.floor(kept * np.float32(1 / (0.05 * steps)))
+        _, voxel, count = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
+        if len(count) <= 6000:
+            break
+    centroids = np.stack([np.bincount(voxel.ravel(), axis) / count for axis in kept.T[:2]])
+    counts = np.zeros((151, 151), int)
+    np.add.at(counts, tuple(75 - np.trunc(centroids / 0.4).astype(int)), 1)
+    counts = counts.clip(max=10)
+    return np.round(counts / counts.max() * 255).astype(np.uint8)

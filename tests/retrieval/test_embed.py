@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
+from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
+from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.label_maps import label_map_pixels
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
 from sglpr_jax.labels import to_classes
@@ -123,6 +124,29 @@ def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch):
     found = embed(describe, scans, GRID, config={}, batch=batch)
     np.testing.assert_array_equal(found.descriptors, embed(flatten, scans, GRID, config={}).descriptors)
     assert shapes == {(batch, GRID.height, GRID.width)}
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_scans_become_density_images_of_the_turned_points(scans, seed):
+    cells = Grid(resolution_m=0.4, height=64, width=64)
+    found = embed(flatten, scans, cells, config={}, image="density", rotation_seed=seed)
+    for row, (cloud, angle) in enumerate(zip(clouds(), drawn_angles(3), strict=True)):
+        cos, sin = np.cos(np.float64(angle)), np.sin(np.float64(angle))
+        x, y, z = cloud.astype(np.float64).T
+        turned = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)
+        image = np.asarray(even_cells(density_bev(cloud if seed is None else turned)))
+        np.testing.assert_array_equal(found.descriptors[row], image[44:108, 44:108].reshape(-1))
+        assert image.sum() > 0
+
+
+def test_ready_made_images_are_taken_as_they_are_by_any_model(pictures):
+    as_points, as_density = (embed(flatten, pictures, GRID, config={}, image=image) for image in ("points", "density"))
+    np.testing.assert_array_equal(as_points.descriptors, as_density.descriptors)
+
+
+def test_only_cells_of_density_images_make_density_images(scans):
+    with pytest.raises(ValueError, match=r"151 x 151 cells of 0.4 m: expected .* found 16 x 16 cells of 1.0 m"):
+        embed(flatten, scans, GRID, config={}, image="density")
 
 
 def test_progress_ends_with_all_scans(scans):

@@ -68,7 +68,8 @@ def feature_heat_maps(runs: Runs, seq: str, drives: Sequence[Drive]) -> Pictures
     pictures = {}
     for drive in drives:
         row = len(drive) // 2
-        image = np.asarray(read_image(drive, row, runs.config.model.grid))
+        model = runs.config.model
+        image = np.asarray(read_image(drive, row, model.grid, image=model.image))
         maps = {
             f"{name}: {layer}": values
             for name, params in models.items()

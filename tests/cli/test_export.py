@@ -1,0 +1,77 @@
+"""bin/export writes what describes places; every tool takes its weights by name too."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.models import shipped
+
+from .conftest import assert_one_line_error
+
+load = sglpr_jax.DescriptorFile.load
+
+
+@pytest.fixture(scope="module")
+def weights(random_params, tmp_path_factory) -> Path:
+    """Weights of a small model with a segmentation head."""
+    tiny = sglpr_jax.model_preset("tiny")
+    head = dataclasses.replace(tiny.head, channels=(16,), kernels=(4,), strides=(4,))
+    grid = sglpr_jax.Grid(resolution_m=3.2, height=16, width=16)
+    config = dataclasses.replace(tiny, grid=grid, depths=(1,), heads=(2,), head=head)
+    return sglpr_jax.save(random_params(config), tmp_path_factory.mktemp("runs") / "weights")
+
+
+@pytest.fixture
+def exported(command, weights, tmp_path, monkeypatch) -> Path:
+    """These weights, exported under the name `simulated` into a package folder of their own."""
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
+    folder = shipped.FOLDER / "simulated"
+    ended = command("export", "--weights", weights, "--out", folder, "--half")
+    assert ended.status == 0, ended.error
+    assert f"{folder}: 0." in ended.out and "MB of weights" in ended.out
+    return folder
+
+
+def test_exported_weights_embed_by_name_as_the_whole_ones_do(command, exported, weights, town, tmp_path):
+    for name in ("simulated", weights):
+        options = ("--weights", name, "--data", town, "--seq", "08", "--out", tmp_path / f"{Path(name).name}.npz")
+        ended = command("embed", *options)
+        assert ended.status == 0, ended.error
+    found, whole = (load(tmp_path / f"{name}.npz").descriptors for name in ("simulated", "weights"))
+    assert 0 < np.abs(found - whole).max() < 1e-2
+
+
+def test_exported_weights_have_no_segmentation_head(command, exported, town, tmp_path):
+    ended = command("segment", "--weights", "simulated", "--data", town, "--seq", "08", "--out", tmp_path / "maps")
+    assert_one_line_error(ended, "simulated: expected weights with a segmentation head, found none")
+
+
+def test_float32_weights_with_the_head_are_those_of_before(command, weights, tmp_path):
+    ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--keep-segmentation")
+    assert ended.status == 0, ended.error
+    for file in ("model.safetensors", "config.json"):
+        assert (tmp_path / "out" / file).read_bytes() == (weights / file).read_bytes()
+
+
+def test_a_folder_that_is_there_is_left_alone(command, exported, weights):
+    (exported / "README.md").write_text("a card")
+    ended = command("export", "--weights", weights, "--out", exported)
+    assert_one_line_error(ended, exported, "expected a folder that does not exist yet")
+    assert (exported / "README.md").read_text() == "a card"
+
+
+def test_an_image_that_does_not_fit_the_grid_is_refused(command, weights, tmp_path):
+    ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--image", "density")
+    assert_one_line_error(ended, "151 x 151 cells of 0.4 m", "found 16 x 16 cells of 3.2 m")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("tool", ["embed", "segment", "stress", "evaluate", "export"])
+def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path, tool):
+    file = (tmp_path / "08.npy",) if tool == "evaluate" else ()
+    data = () if tool == "export" else ("--data", town, "--seq", "08")
+    ended = command(tool, *file, "--weights", "simulatd", *data, "--out", tmp_path / "out.npz")
+    assert_one_line_error(ended, "simulatd: expected a folder", "(simulated), found neither")

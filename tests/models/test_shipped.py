@@ -1,0 +1,182 @@
+"""Weights by name, and that every set which ships with the package is whole, small, documented and works."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models import shipped
+from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.params import CONFIG_FILE, WEIGHTS_FILE, for_places, load, save
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.sglpr import Params, describe
+from sglpr_jax.models.shipped import shipped_weights, weights_folder
+
+CARD_FILE = "README.md"
+FILES = [CARD_FILE, CONFIG_FILE, WEIGHTS_FILE]
+LARGEST_BYTES = 15e6
+CARD = {"Licence": "Apache-2.0", "Training data": "None.", "Command": "`none`", "Numbers": "Recall@1 0.0"}
+
+HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
+MODEL = dataclasses.replace(model_preset("tiny"), grid=Grid(3.2, 16, 16), depths=(1,), heads=(2,), detail=8, head=HEAD)
+
+
+def assert_fit_to_ship(folder: Path) -> None:
+    """The files are there and small, the card says what it must, and an image has a descriptor of unit length."""
+    assert sorted(path.name for path in folder.iterdir()) == FILES, folder
+    for path in folder.iterdir():
+        assert path.stat().st_size <= LARGEST_BYTES, f"{path} is larger than 15 MB"
+    said = sections((folder / CARD_FILE).read_text())
+    for title in CARD:
+        assert said.get(title), f"{folder / CARD_FILE}: expected a section '## {title}' with text in it"
+    assert "`" in said["Command"], f"{folder / CARD_FILE}: expected the command itself"
+    assert re.search(r"\d", said["Numbers"]), f"{folder / CARD_FILE}: expected numbers"
+    params = load(folder)
+    grid = params.config.grid
+    images = np.random.default_rng(0).poisson(0.3, (2, grid.height, grid.width)).astype(np.float32)
+    descriptors = np.asarray(describe(params, jnp.asarray(images)))
+    assert np.isfinite(descriptors).all()
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-4)
+
+
+def sections(card: str) -> dict[str, str]:
+    """The text under each second-level heading."""
+    parts = re.split(r"^## +(.+?) *$", card, flags=re.MULTILINE)
+    return {title: text.strip() for title, text in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+@pytest.fixture(scope="module")
+def params(random_params) -> Params:
+    return random_params(MODEL)
+
+
+@pytest.fixture
+def placeholder(params, tmp_path, monkeypatch) -> Path:
+    """A set of weights `placeholder`, which is all that ships."""
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
+    folder = save(for_places(params), shipped.FOLDER / "placeholder", half=True)
+    (folder / CARD_FILE).write_text("# A card\n" + "".join(f"\n## {title}\n\n{text}\n" for title, text in CARD.items()))
+    return folder
+
+
+def test_every_set_that_ships_is_fit_to():
+    assert shipped_weights(), f"{shipped.FOLDER}: expected at least one set of weights"
+    for name in shipped_weights():
+        assert_fit_to_ship(shipped.FOLDER / name)
+
+
+def test_the_placeholder_is_fit_to_ship(placeholder):
+    assert_fit_to_ship(placeholder)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_set_without_one_of_its_files_is_not_fit_to_ship(placeholder, name):
+    (placeholder / name).unlink()
+    with pytest.raises(AssertionError):
+        assert_fit_to_ship(placeholder)
+
+
+@pytest.mark.parametrize("title", CARD)
+def test_a_set_whose_card_leaves_something_out_is_not_fit_to_ship(placeholder, title):
+    card = placeholder / CARD_FILE
+    card.write_text(card.read_text().replace(CARD[title], ""))
+    with pytest.raises(AssertionError, match=title):
+        assert_fit_to_ship(placeholder)
+
+
+def test_a_file_that_is_too_large_is_not_fit_to_ship(placeholder):
+    with (placeholder / CARD_FILE).open("a") as card:
+        card.truncate(int(LARGEST_BYTES) + 1)
+    with pytest.raises(AssertionError, match=r"README.md is larger than 15 MB"):
+        assert_fit_to_ship(placeholder)
+
+
+def test_weights_that_are_not_finite_are_not_fit_to_ship(placeholder):
+    card, loaded = (placeholder / CARD_FILE).read_text(), load(placeholder)
+    save(jax.tree.map(lambda leaf: leaf * np.float32(np.nan), loaded), placeholder)
+    (placeholder / CARD_FILE).write_text(card)
+    with pytest.raises(AssertionError):
+        assert_fit_to_ship(placeholder)
+
+
+def test_a_name_means_the_shipped_weights_and_a_path_a_folder(placeholder, params, tmp_path, monkeypatch):
+    assert shipped_weights() == ("placeholder",)
+    monkeypatch.chdir(tmp_path)
+    own = save(params, tmp_path / "placeholder")
+    for name in ("placeholder", Path("placeholder")):
+        assert weights_folder(name) == placeholder
+        assert load(name).config.categories == 0
+    for path in ("./placeholder", "placeholder/", str(own), own):
+        assert load(path).config.categories == 20
+    save(params, tmp_path / "other")
+    chex.assert_trees_all_equal(load("other"), load(own))
+
+
+def test_what_is_neither_a_name_nor_a_folder_lists_the_names(placeholder, tmp_path, monkeypatch):
+    for unknown in ("simulatd", str(tmp_path / "none"), placeholder / WEIGHTS_FILE):
+        with pytest.raises(FileNotFoundError, match=rf"{unknown}: .* \(placeholder\), found neither"):
+            load(unknown)
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "empty")
+    assert shipped_weights() == ()
+    with pytest.raises(FileNotFoundError, match=r"simulated: .*\(there are none\), found neither"):
+        load("simulated")
+
+
+def images_of(params: Params) -> jax.Array:
+    grid = params.config.grid
+    return jnp.asarray(np.random.default_rng(1).poisson(0.5, (6, grid.height, grid.width)), jnp.float32)
+
+
+def test_half_precision_is_half_as_large_and_describes_places_all_but_the_same(params, tmp_path):
+    whole, half = (save(params, tmp_path / str(half), half=half) for half in (False, True))
+    size, half_size = ((folder / WEIGHTS_FILE).stat().st_size for folder in (whole, half))
+    assert 0.45 < half_size / size < 0.6  # names and shapes take their room
+    loaded = load(half)
+    assert {leaf.dtype for leaf in jax.tree.leaves(loaded.weights)} == {np.dtype(np.float32)}
+    expected = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16).astype(np.float32), params)
+    chex.assert_trees_all_equal(loaded, expected)
+    images = images_of(params)
+    difference = np.abs(describe(loaded, images) - describe(params, images)).max()
+    assert 0 < difference < 1e-2
+
+
+def test_a_weight_too_large_for_half_precision_is_named(params, tmp_path):
+    kernel = params.weights["segmentation_head"]["kernel"].at[0, 0].set(70_000.0)
+    large = Params({**params.weights, "segmentation_head": {"kernel": kernel}}, params.config)
+    with pytest.raises(ValueError, match=r"segmentation_head/kernel: expected weights up to 65504"):
+        save(large, tmp_path / "weights", half=True)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("tap", "also_dropped"), [("pixels", set()), ("tokens", {"expand"})])
+def test_what_the_segmentation_head_alone_reads_is_dropped(random_params, tap, also_dropped, tmp_path):
+    whole = random_params(dataclasses.replace(MODEL, head=dataclasses.replace(HEAD, tap=tap)))
+    places = for_places(whole)
+    assert set(whole.weights) - set(places.weights) == {"segmentation_head", "narrow", "detail"} | also_dropped
+    assert not places.config.segments
+    images = images_of(whole)
+    np.testing.assert_array_equal(describe(places, images), describe(whole, images))
+    chex.assert_trees_all_equal(load(save(places, tmp_path / "weights")), jax.tree.map(np.asarray, places))
+    assert for_places(places) is places
+
+
+def test_a_head_that_reads_labels_keeps_its_categories(random_params):
+    head = dataclasses.replace(HEAD, input="labels")
+    params = random_params(dataclasses.replace(MODEL, head=head))
+    assert for_places(params) is params
+
+
+def test_a_model_for_density_images_has_their_cells(params, tmp_path):
+    config = params.config
+    with pytest.raises(ValueError, match=r"151 x 151 cells of 0.4 m: expected .*, found 16 x 16 cells of 3.2 m"):
+        dataclasses.replace(config, image="density")
+    with pytest.raises(ValueError, match=r"found 160 x 32 cells of 0.4 m"):
+        dataclasses.replace(config, image="density", grid=Grid(0.4, 160, 32))
+    density = dataclasses.replace(config, image="density", grid=Grid(0.4, 32, 32))
+    assert load(save(Params(params.weights, density), tmp_path / "weights")).config == density
