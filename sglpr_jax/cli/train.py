@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from sglpr_jax.cli.datasets import all_drives, dataset_root, leave_one_out
+from sglpr_jax.cli.datasets import all_drives, dataset_root, leave_one_out, pack_drives
 from sglpr_jax.cli.environment import note_environment
 from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.learning_curves import draw_learning_curves
@@ -70,6 +70,8 @@ class TrainCommand:
     """Go on from the run's newest checkpoint."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
+    cache: Path | None = None
+    """A folder in which the drives that are trained on are packed, each once, to be read faster; docs/training.md."""
     tensorboard: bool = False
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     poses: PoseChoice = "auto"
@@ -115,6 +117,9 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
     folder = run_folder(command)
     config = command.config
     drives, also, test = _drives(command)
+    if command.cache is not None:
+        cache = command.cache
+        drives, also = on_all_hosts(lambda: (pack_drives(drives, cache), pack_drives(also, cache)))
     splits = [hold_out(positions_of(drive), config.validation, config.sampling) for drive in drives]
     pool = tuple_pool(drives, config, frames=[split.training for split in splits])
     mining = None
@@ -227,7 +232,13 @@ def require_same_settings(folder: Path, command: TrainCommand) -> None:
 def _settings(command: TrainCommand) -> dict[str, Any]:
     """The effective configuration as it is written beside the results; on which hosts changes none of them."""
     plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
-    elsewhere = ("tensorboard", "hosts", "host_index", "coordinator")  # how a run is watched and where it is made
+    elsewhere = (
+        "cache",
+        "tensorboard",
+        "hosts",
+        "host_index",
+        "coordinator",
+    )  # how it is read, watched, and made where
     told = {name: value for name, value in plain.items() if name not in elsewhere}
     return json.loads(json.dumps(told, default=str))
 
