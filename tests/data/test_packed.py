@@ -49,6 +49,7 @@ def test_points_and_labels_are_those_of_the_files(drive, tmp_path):
     assert told == [1, 2, 3]
     require_same_scans(found, drive)
     np.testing.assert_array_equal(found.positions, drive.positions)
+    assert not found.points(0).flags.writeable
     shutil.rmtree(drive.scan_paths[0].parents[1])
     np.testing.assert_array_equal(found.points(1), 200 + np.arange(20, dtype=np.float32).reshape(5, 4)[:, :3])
 
