@@ -13,9 +13,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import math
-import mmap
-import os
 import shutil
 import time
 import uuid
@@ -27,35 +24,13 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
+from sglpr_jax.data.stacked import Stacked, StackWriter, map_stacked, sync
 from sglpr_jax.files import writing
 
 FORMAT = "sglpr-jax packed drive 1"
 ABOUT_FILE = "pack.json"
 ABANDONED_S = 3600
 """A half-made pack to which nothing was added for so long is nobody's: its process was killed."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Stacked:
-    """Arrays one after another in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
-
-    What is asked for is a view, to read only.
-    """
-
-    file: mmap.mmap
-    rows: np.ndarray
-    offsets: tuple[int, ...]
-
-    def __getitem__(self, i: int) -> np.ndarray:
-        start, stop = self.offsets[i : i + 2]
-        if stop > start:
-            self._announce(*(row * self.rows.strides[0] for row in (start, stop)))
-        return self.rows[start:stop]
-
-    def _announce(self, start: int, stop: int) -> None:
-        """Have the disk read these bytes at once: the system by itself reads 128 KiB at each first touch."""
-        page = start - start % mmap.PAGESIZE
-        self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -131,7 +106,7 @@ def _make(target: Path, drive: Drive, source: dict[str, Any], on_progress: Calla
         arrays = _write_arrays(temporary, drive, on_progress)
         with writing(target), (temporary / ABOUT_FILE).open("w") as stream:
             json.dump({**source, "arrays": arrays}, stream)
-            _sync(stream)
+            sync(stream)
         with writing(target):
             _publish(temporary, target)
     finally:
@@ -157,43 +132,14 @@ def _sweep(target: Path) -> None:
 def _write_arrays(folder: Path, drive: Drive, on_progress: Callable[[int], None]) -> dict[str, Any]:
     """Write the arrays of all scans or images, and return how they lie."""
     with contextlib.ExitStack() as opened:
-        files: dict[str, _Writer] = {}
+        files: dict[str, StackWriter] = {}
         for i in range(len(drive)):
             for name, array in _arrays(drive, i).items():
                 if name not in files:
-                    files[name] = opened.enter_context(contextlib.closing(_Writer(folder / f"{name}.bin", array)))
+                    files[name] = opened.enter_context(contextlib.closing(StackWriter(folder / f"{name}.bin", array)))
                 files[name].append(array, of=f"scan {drive.ids[i]} of sequence {drive.name}")
             on_progress(i + 1)
         return {name: file.finish() for name, file in files.items()}
-
-
-class _Writer:
-    """Writes arrays one after another into a new file; all have rows like those of `first`."""
-
-    def __init__(self, path: Path, first: np.ndarray):
-        self._path, self._dtype, self._row, self._offsets = path, first.dtype, first.shape[1:], [0]
-        with writing(path):
-            self._stream = path.open("xb")
-
-    def append(self, array: np.ndarray, *, of: str) -> None:
-        if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
-            raise ValueError(
-                f"{of}: expected {self._dtype} with rows of shape {self._row}, as the first one has, to be packed with "
-                f"it, found {array.dtype} {array.shape[1:]}"
-            )
-        with writing(self._path):
-            self._stream.write(np.ascontiguousarray(array).data)
-        self._offsets.append(self._offsets[-1] + len(array))
-
-    def finish(self) -> dict[str, Any]:
-        """Have all on the disk, and say how it lies there."""
-        with writing(self._path):
-            _sync(self._stream)
-        return {"dtype": self._dtype.str, "row": self._row, "offsets": self._offsets}
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):  # of what was never flushed, because of an error that is on its way
-            self._stream.close()
 
 
 def _arrays(drive: Drive, i: int) -> dict[str, np.ndarray]:
@@ -206,28 +152,12 @@ def _arrays(drive: Drive, i: int) -> dict[str, np.ndarray]:
     return points | {"labels": np.zeros(0, np.uint16) if labels is None else labels.astype(np.uint16)}
 
 
-def _sync(stream: Any) -> None:
-    """Have the file on the disk before the rename is, or a power cut could leave a pack with a hole."""
-    stream.flush()
-    os.fsync(stream.fileno())
-
-
 def _open(folder: Path) -> dict[str, Stacked]:
     try:
         lie = json.loads((folder / ABOUT_FILE).read_text())["arrays"]
-        return {name: _map(folder / f"{name}.bin", **about) for name, about in lie.items()}
+        return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
     except (ValueError, KeyError, TypeError, OSError) as error:
         raise ValueError(
             f"{folder}: expected a packed drive, found a damaged one ({error}); once it is removed the drive is packed "
             "anew"
         ) from error
-
-
-def _map(path: Path, *, dtype: str, row: list[int], offsets: list[int]) -> Stacked:
-    shape = (offsets[-1], *row)
-    expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
-    if expected != found:
-        raise ValueError(f"{path.name}: expected {expected} bytes, found {found}")
-    with path.open("rb") as stream:
-        file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    return Stacked(file, np.frombuffer(file, dtype).reshape(shape), tuple(offsets))
