@@ -1,4 +1,4 @@
-"""What the benchmarks run on: the model of a preset, random weights, random scans."""
+"""What the benchmarks run on: the model of a preset, random weights, random scans and batches."""
 
 import dataclasses
 
@@ -6,9 +6,11 @@ import jax
 import numpy as np
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.data.batch import Batch
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import Params, init
+from sglpr_jax.train.config import TrainConfig
 
 CLOUD_SPREAD = 0.29
 """Standard deviation of x and y as a part of the window's width: 84 % of the points fall inside."""
@@ -42,3 +44,15 @@ def random_scans(*shape: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     spread = CLOUD_SPREAD * grid.resolution_m * np.array([grid.width, grid.height, 0.0]) + [0, 0, 1]
     points = spread * rng.standard_normal((*shape, 3))
     return points.astype(np.float32), rng.integers(1, 20, shape, dtype=np.int32)
+
+
+def random_batch(config: TrainConfig, points: int, *, labels: bool = True) -> Batch:
+    """A step's tuples of random clouds with `points` points each, all with labels or none."""
+    clouds, classes = random_scans(config.images, points, grid=config.model.grid)
+    positives, places = config.sampling.positives, config.images // config.tuples
+    tuple_of, place_of = np.divmod(np.arange(config.images), places)
+    own = tuple_of == np.arange(config.tuples)[:, None]
+    far = np.where(own, place_of > positives, config.share_negatives)
+    count = np.full(config.images, points, np.int32)
+    labelled = np.full(config.images, labels)
+    return Batch(labelled, far, positives, points=clouds, count=count, classes=classes if labels else None)

@@ -106,16 +106,17 @@ def report(
     other: str,
     packages: Sequence[str],
     threads: int,
+    ours: str = "JAX",
 ) -> None:
     """Print a table of (name, our seconds, the other's seconds), and what is needed to repeat it."""
-    table = Table("", f"{other}, ms", "JAX, ms", f"JAX / {other}", "spread", title=title)
-    for name, ours, theirs in rows:
-        ratios = ours / theirs
+    table = Table("", f"{other}, ms", f"{ours}, ms", f"{ours} / {other}", "spread", title=title)
+    for name, our_seconds, their_seconds in rows:
+        ratios = our_seconds / their_seconds
         low, high = np.quantile(ratios, SPREAD)
-        milliseconds = (f"{1e3 * np.median(seconds):.4g}" for seconds in (theirs, ours))
+        milliseconds = (f"{1e3 * np.median(seconds):.4g}" for seconds in (their_seconds, our_seconds))
         table.add_row(name, *milliseconds, f"{np.median(ratios):.3f}", f"{low:.3f} to {high:.3f}")
     Console().print(table)
-    print(f"Medians of {len(rows[0][1])} repeats. Below 1 JAX is faster. Spread: the 10 % and 90 % quantiles.")
+    print(f"Medians of {len(rows[0][1])} repeats. Below 1 {ours} is faster. Spread: the 10 % and 90 % quantiles.")
     print(f"Command: {shlex.join(['python', *sys.argv])}")
     versions = [f"{name} {importlib.metadata.version(name)}" for name in packages]
     print(", ".join([f"Python {platform.python_version()}", *versions, f"{threads} threads each"]))

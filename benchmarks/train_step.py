@@ -6,7 +6,7 @@ from typing import Literal
 import jax
 import numpy as np
 import tyro
-from inputs import comparable_model, random_params, random_scans
+from inputs import comparable_model, random_batch, random_params
 from ratio import Contender, Job, alternate, check_equal, report, require_torch, warn_if_busy
 
 from sglpr_jax.data.batch import Batch, views
@@ -43,7 +43,7 @@ def main(
     warn_if_busy(threads)
     config = TrainConfig(model=comparable_model(preset), loss=PAPER_LOSS, rotate=False)
     params = random_params(config.model)
-    batch = random_tuple(config, points)
+    batch = random_batch(config, points)
     images, maps = views(batch, np.zeros(config.images, np.float32), config.model.grid)
     images = prepare(images, config.model)
 
@@ -61,16 +61,6 @@ def main(
     rows = [(contender.name, seconds[:, i], seconds[:, 0]) for i, contender in enumerate(ours, start=1)]
     title = f"training step, {preset}, {config.images} images with labels"
     report(title, rows, other="PyTorch", packages=("jax", "torch", "optax"), threads=threads)
-
-
-def random_tuple(config: TrainConfig, points: int) -> Batch:
-    """One anchor, its positive and negatives: random clouds, all with labels."""
-    clouds, classes = random_scans(config.images, points, grid=config.model.grid)
-    positives = config.sampling.positives
-    is_negative = np.arange(config.images)[None] > positives
-    count = np.full(config.images, points, np.int32)
-    labelled = np.ones(config.images, bool)
-    return Batch(labelled, is_negative, positives, points=clouds, count=count, classes=classes)
 
 
 def first_steps(contender: Contender) -> np.ndarray:

@@ -1,16 +1,32 @@
 """The benchmarks run for real; those against PyTorch say so where it is not installed."""
 
 import importlib
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.models.swin import SwinBlock
 from sglpr_jax.sim import Sensor, write_dataset
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
+PRESET = """
+from sglpr_jax.bev import Grid
+from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.train.config import TrainConfig
+
+HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
+MODEL = ModelConfig(grid=Grid(3.2, 16, 16), embed_dim=8, depths=(1,), heads=(2,), window=4, head=HEAD)
+SAMPLING = TupleConfig(negatives=2, positive_m=16.0)
+CONFIG = TrainConfig(model=MODEL, sampling=SAMPLING, tuples=2, chunk=4, max_points=50)
+"""
 
 
 def printed(benchmark: str, *options: str) -> str:
@@ -38,14 +54,91 @@ def test_simulate_prints_its_rate_and_where_the_time_goes():
 
 
 def test_baselines_are_scored_raw_and_rotated(tmp_path):
-    sensor = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
-    write_dataset(tmp_path, names=("00",), scans=60, sensor=sensor)
+    write_dataset(tmp_path, names=("00",), scans=60, sensor=SENSOR)
     output = printed("baselines.py", "--data", str(tmp_path), "--methods", "scan-context", "random")
     assert "60 scans" in output and "revisits" in output
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in output.splitlines() if "│" in line]
     scores = {row[0]: [float(cell) for cell in row[4:8]] for row in cells}
     assert list(scores) == ["scan-context", "random"]
     assert min(scores["scan-context"]) > max(scores["random"])
+
+
+def test_batches_of_packs_are_timed_against_files(tmp_path):
+    write_dataset(tmp_path / "town", names=("00",), scans=40, sensor=SENSOR)
+    (tmp_path / "own.py").write_text(PRESET)
+    folders = ("--data", tmp_path / "town", "--cache", tmp_path / "cache", "--preset", tmp_path / "own.py")
+    output = printed("read_batches.py", *map(str, folders), "--count", "1", "--repeats", "2", "--cold")
+    assert "40 scans of" in output and "pack / files" in output
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_throughput_is_a_share_of_the_peak(tmp_path):
+    preset, out = tmp_path / "own.py", tmp_path / "throughput.json"
+    preset.write_text(PRESET)
+    options = ("--preset", preset, "--size", "64", "--repeats", "2", "--steps", "1", "--out", out)
+    output = printed("throughput.py", *map(str, options))
+    assert "tuples/s" in output and "GFLOP/tuple" in output
+    (row,) = json.loads(out.read_text())["rows"]
+    assert (row["preset"], row["compute"], row["tuples"], row["images"]) == ("own", "float32", 2, 8)
+    assert row["images_per_second"] == pytest.approx(4 * row["tuples_per_second"])
+    assert row["flop_per_second"] == pytest.approx(row["flop_per_tuple"] * row["tuples_per_second"])
+    low, high = row["share_of_peak_spread"]
+    assert 0 < low <= row["share_of_peak"] <= high
+
+
+def flops(function, *shapes: tuple[int, ...]) -> int:
+    """What the counter of the benchmarks says of a function of arrays of these shapes."""
+    count = importlib.import_module("flops").count_flops
+    return count(jax.jit(function).trace(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)).jaxpr)
+
+
+@pytest.fixture
+def _benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+@pytest.mark.usefixtures("_benchmarks")
+def test_products_are_counted_as_by_hand():
+    product = 2 * 7 * 3 * 5 * 4
+    assert flops(lambda a, b: jnp.einsum("bij,bjk->bik", a, b), (7, 3, 5), (7, 5, 4)) == product
+    both = jax.grad(lambda ab: (ab[0] @ ab[1]).sum() + jnp.square(ab[0] @ ab[1]).sum())
+    assert flops(lambda a, b: both((a, b)), (7, 3, 5), (7, 5, 4)) == product * 3 + product * 2
+    assert flops(lambda a, b: jax.lax.scan(lambda x, _: (x @ b, None), a, length=6)[0], (3, 5), (5, 5)) == 6 * 150
+    assert flops(lambda a, b: jax.lax.cond(a.sum() > 0, lambda: a @ b, lambda: a), (5, 5), (5, 5)) == 250
+    assert flops(lambda a, b: (a @ b, a + 1)[1], (5, 5), (5, 5)) == 0  # nobody needs it
+    with pytest.raises(ValueError, match="number of turns"):
+        flops(lambda a, b: jax.lax.while_loop(lambda x: x.sum() > 0, lambda x: x @ b, a), (5, 5), (5, 5))
+
+
+@pytest.mark.usefixtures("_benchmarks")
+@pytest.mark.parametrize("groups", [1, 2])
+def test_convolutions_and_their_gradients_are_counted_as_by_hand(groups):
+    def convolve(image, kernel):
+        dimensions = ("NHWC", "HWIO", "NHWC")
+        return jax.lax.conv_general_dilated(
+            image, kernel, (2, 2), "VALID", dimension_numbers=dimensions, feature_group_count=groups
+        )
+
+    image, kernel = (3, 8, 8, 4), (2, 2, 4 // groups, 6)
+    forward = 2 * (3 * 4 * 4 * 6) * (2 * 2 * 4 // groups)
+    assert flops(convolve, image, kernel) == forward
+    gradient = jax.grad(lambda both: jnp.square(convolve(*both)).sum())
+    assert flops(lambda *both: gradient(both), image, kernel) == 3 * forward
+
+
+@pytest.mark.usefixtures("_benchmarks")
+def test_a_swin_block_is_counted_as_in_its_paper():
+    """4 h w C^2 + 2 M^2 h w C products for the attention (its equation 2), and 8 h w C^2 for the MLP.
+
+    Not in the paper: the bias table is looked up by a product with one-hot rows, once for all images.
+    """
+    h, w, c, m, heads = 8, 16, 12, 4, 3
+    block = SwinBlock(heads=heads, window=m, shifted=False)
+    weights = jax.eval_shape(block.init, jax.random.key(0), jnp.zeros((1, h, w, c)))
+    traced = jax.jit(block.apply).trace(weights, jax.ShapeDtypeStruct((5, h, w, c), jnp.float32))
+    expected = 2 * 5 * (12 * h * w * c**2 + 2 * m**2 * h * w * c)
+    bias = 2 * m**4 * (2 * m - 1) ** 2 * heads
+    assert importlib.import_module("flops").count_flops(traced.jaxpr) == expected + bias
 
 
 @pytest.mark.parametrize("name", ["describe", "train_step"])

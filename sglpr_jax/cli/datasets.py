@@ -8,6 +8,7 @@ from pathlib import Path
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Drive, open_sequence, sequence_names
 from sglpr_jax.data.kitti import PoseChoice
+from sglpr_jax.data.packed import packed
 from sglpr_jax.sim import SENSORS, Sensor, write_dataset, write_sessions
 from sglpr_jax.sim.dataset import VERSION
 from sglpr_jax.sim.drive import RATE_HZ, name_of_path
@@ -160,6 +161,15 @@ def all_drives(root: Path, *, poses: PoseChoice = "auto") -> list[Drive]:
     _require_positions(root, drives)
     print(f"training on {', '.join(drive.name for drive in drives)} of {root} too", file=sys.stderr)
     return drives
+
+
+def pack_drives(drives: Many[Drive], cache: Path) -> list[Drive]:
+    """The same drives, read from their packs in the folder `cache`, made on first use. Errors as of `packed`."""
+    packs = []
+    for drive in drives:
+        with progress_bar(f"pack {drive.name}", len(drive)) as show:
+            packs.append(packed(drive, cache, on_progress=show))
+    return packs
 
 
 def _require_positions(root: Path, drives: Many[Drive]) -> None:

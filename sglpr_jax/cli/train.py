@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import tyro
 
-from sglpr_jax.cli.datasets import all_drives, dataset_root, leave_one_out
+from sglpr_jax.cli.datasets import all_drives, dataset_root, leave_one_out, pack_drives
 from sglpr_jax.cli.environment import note_environment
 from sglpr_jax.cli.final_test import final_test
 from sglpr_jax.cli.learning_curves import draw_learning_curves
@@ -73,11 +73,13 @@ class TrainCommand:
     """The run's folder. None: runs/PRESET-SEQ."""
     resume: bool = False
     """Go on from the run's newest checkpoint."""
-    start: Path | None = None
-    """Weights to begin with, a run's folder or a folder with config.json and model.safetensors, in place of fresh ones.
-    What they lack, such as the segmentation head, is fresh."""
+    start: str | None = None
+    """Weights to begin with in place of fresh ones: the name of shipped weights, a run's folder, or one with config.json
+    and model.safetensors. What they lack, such as the segmentation head, is fresh."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
+    cache: Path | None = None
+    """A folder in which the drives that are trained on are packed, each once, to be read faster; docs/training.md."""
     references: bool = True
     """At the end score untrained weights, the thumbnail and polar-FFT beside it (--no-references: not)."""
     tensorboard: bool = False
@@ -125,6 +127,9 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
     folder = run_folder(command)
     config = command.config
     drives, also, test = _drives(command)
+    if command.cache is not None:
+        cache = command.cache
+        drives, also = on_all_hosts(lambda: (pack_drives(drives, cache), pack_drives(also, cache)))
     splits = [hold_out(positions_of(drive), config.validation, config.sampling) for drive in drives]
     pool = tuple_pool(drives, config, frames=[split.training for split in splits])
     mining = None
@@ -258,11 +263,12 @@ def _settings(command: TrainCommand) -> dict[str, Any]:
     plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
     elsewhere = (
         "references",
+        "cache",
         "tensorboard",
         "hosts",
         "host_index",
         "coordinator",
-    )  # how a run is watched and where it is made
+    )  # what is tested beside it, how it is read and watched, and made where
     told = {name: value for name, value in plain.items() if name not in elsewhere}
     return json.loads(json.dumps(told, default=str))
 

@@ -122,6 +122,24 @@ def test_event_files_are_written_when_asked_for_and_do_not_hinder_a_resume(
     assert command("train", *options, "--resume").status == 0
 
 
+def test_a_cache_changes_only_where_scans_are_read(command, trained, town, preset, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    out, cache = tmp_path / "run", tmp_path / "cache"
+    options = ("--seq", "08", "--data", town, "--preset", preset, "--out", out, "--cache", cache)
+    ended = command("train", *options)
+    assert ended.status == 0, ended.error
+    assert sorted(path.name[:3] for path in cache.iterdir()) == [
+        "00-",
+        "05-",
+    ]  # the drive that is tested is read as it is
+    assert (out / "config.json").read_bytes() == (trained.folder / "config.json").read_bytes()
+    weights = (folder / "weights" / "model.safetensors" for folder in (out, trained.folder))
+    assert len({path.read_bytes() for path in weights}) == 1
+    for path in cache.rglob("points.bin"):
+        path.write_bytes(b"")
+    assert_one_line_error(command("train", *options, "--resume"), cache, "expected a packed drive, found a damaged one")
+
+
 def test_a_run_is_not_overwritten(command, trained, town, preset):
     before = (trained.folder / "config.json").read_bytes()
     ended = command("train", "--data", town, "--preset", preset, "--out", trained.folder)

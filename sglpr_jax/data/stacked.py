@@ -1,0 +1,89 @@
+"""Arrays with rows of one shape, one after another in a file: written once, then mapped into memory."""
+
+import contextlib
+import dataclasses
+import math
+import mmap
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from sglpr_jax.files import writing
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stacked:
+    """Arrays one after another in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
+
+    What is asked for is a view, to read only.
+    """
+
+    file: mmap.mmap
+    rows: np.ndarray
+    offsets: tuple[int, ...]
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        start, stop = self.offsets[i : i + 2]
+        if stop > start:
+            self._announce(*(row * self.rows.strides[0] for row in (start, stop)))
+        return self.rows[start:stop]
+
+    def _announce(self, start: int, stop: int) -> None:
+        """Have the disk read these bytes at once: the system by itself reads 128 KiB at each first touch."""
+        page = start - start % mmap.PAGESIZE
+        self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
+
+
+class StackWriter:
+    """Writes arrays one after another into a new file; all have rows like those of `first`."""
+
+    def __init__(self, path: Path, first: np.ndarray):
+        self._path, self._dtype, self._row, self._offsets = path, first.dtype, first.shape[1:], [0]
+        with writing(path):
+            self._stream = path.open("xb")
+
+    def append(self, array: np.ndarray, *, of: str) -> None:
+        """Raises ValueError, naming `of`, where its rows are unlike the first array's; OSError on a full disk."""
+        if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
+            raise ValueError(
+                f"{of}: expected {self._dtype} with rows of shape {self._row}, as the first one has, to be packed with "
+                f"it, found {array.dtype} {array.shape[1:]}"
+            )
+        with writing(self._path):
+            self._stream.write(np.ascontiguousarray(array).data)
+        self._offsets.append(self._offsets[-1] + len(array))
+
+    def finish(self) -> dict[str, Any]:
+        """Have all on the disk, and say how it lies there."""
+        with writing(self._path):
+            sync(self._stream)
+        return {"dtype": self._dtype.str, "row": self._row, "offsets": self._offsets}
+
+    def close(self) -> None:
+        """To be called whether it was finished or not."""
+        with contextlib.suppress(OSError):  # of what was never flushed, because of an error that is on its way
+            self._stream.close()
+
+
+def map_stacked(path: Path, *, dtype: str, row: Sequence[int], offsets: Sequence[int]) -> Stacked:
+    """Map what a `StackWriter` wrote into memory; the other arguments are what its `finish` returned.
+
+    Raises FileNotFoundError, and ValueError where the file has another size: one too short would end the process as
+    soon as its missing part is touched.
+    """
+    shape = (offsets[-1], *row)
+    expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
+    if expected != found:
+        raise ValueError(f"{path.name}: expected {expected} bytes, found {found}")
+    with path.open("rb") as stream:
+        file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    return Stacked(file, np.frombuffer(file, dtype).reshape(shape), tuple(offsets))
+
+
+def sync(stream: IO) -> None:
+    """Have a file on the disk: renamed before that, a power cut could leave one with a hole."""
+    stream.flush()
+    os.fsync(stream.fileno())
