@@ -55,7 +55,7 @@ def test_training_sees_the_same_images(params, town):
     config = TrainConfig(
         model=params.config,
         sampling=TupleConfig(negatives=2, positive_m=16.0),
-        loss=LossConfig(ce_weight=0, dice_weight=0),
+        loss=LossConfig(ce_weight=0.0, dice_weight=0.0),
     )
     pool = tuple_pool([drive], config)
     batch = batches([drive], pool, config)(0)
