@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.ndimage import map_coordinates
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Float, Int, Num, Shaped
 
 ImageKind = Literal["points", "density"]
 """What the cells of a scan's image count: its points (equation 1), or voxels, as in the ready-made images of KITTI."""
@@ -111,6 +111,17 @@ def rotate_points(points: Float[Array, "*b n 3"], angle: Float[Array, "*b"]) -> 
 @jax.jit
 def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Float[Array, "*b h w"]:
     """Turn images about their centre as `rotate_points` turns the points: bilinear, zero from beyond the border."""
+    return _turned(image, angle, order=1)
+
+
+@jax.jit
+def rotate_labels(labels: Int[Array, "*b h w"], angle: Float[Array, "*b"]) -> Int[Array, "*b h w"]:
+    """Turn maps of labels as `rotate_image` turns their images: each cell takes the label nearest to where it was."""
+    return _turned(labels, angle, order=0)
+
+
+def _turned(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order: int) -> Shaped[Array, "*b h w"]:
+    """Images turned about their centre; `order` 0 takes the nearest cell, 1 interpolates."""
     *batch, height, width = image.shape
     down, right = np.mgrid[:height, :width].astype(np.float32)
     down, right = down - (height - 1) / 2, right - (width - 1) / 2
@@ -119,15 +130,51 @@ def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Fl
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         source_down, source_right = cos * down + sin * right, cos * right - sin * down
         source = [source_down + (height - 1) / 2, source_right + (width - 1) / 2]
-        return map_coordinates(image, source, order=1, mode="constant", cval=0.0)
+        return map_coordinates(image, source, order=order, mode="constant", cval=0)
 
     turned = jax.vmap(turn)(image.reshape(-1, height, width), jnp.reshape(angle, -1))
     return turned.reshape(*batch, height, width)
 
 
-def centre_crop(image: Num[Array, "*b h w"], *, height: int, width: int) -> Num[Array, "*b {height} {width}"]:
+def even_cells(image: Num[Array, "*b h w"]) -> Num[Array, "*b h+h%2 w+w%2"]:
+    """A ready-made density image on the cells of eq. 1: its middle row and column become two of half the count.
+
+    There they are as wide as two others, for the recipe truncates coordinates. Left as they are, they are a bright
+    cross that points where the vehicle does, and the sensor is not at the middle of an even crop. Labels (integers)
+    are not halved. Images of an even number of cells stay as they are.
+    """
+    counts = jnp.issubdtype(image.dtype, jnp.floating)
+    for axis in (-2, -1):
+        middle, odd = divmod(image.shape[axis], 2)
+        if odd:
+            before, wide, after = jnp.split(image, (middle, middle + 1), axis=axis)
+            half = wide / 2 if counts else wide
+            image = jnp.concatenate([before, half, half, after], axis=axis)
+    return image
+
+
+def centre_crop(image: Shaped[Array, "*b h w"], *, height: int, width: int) -> Shaped[Array, "*b {height} {width}"]:
     """The middle `height` x `width` cells of larger images; the odd cell of an uneven margin is cut at the far side."""
     if image.shape[-2] < height or image.shape[-1] < width:
         raise ValueError(f"a crop of {height} x {width} cells needs a larger image, found {image.shape[-2:]}")
-    top, left = (image.shape[-2] - height) // 2, (image.shape[-1] - width) // 2
-    return image[..., top : top + height, left : left + width]
+    down, right = _margin(image.shape[-2], height), _margin(image.shape[-1], width)
+    return image[..., down[0] : down[0] + height, right[0] : right[0] + width]
+
+
+def uncropped(crop: Int[np.ndarray, "h w"], *, shape: tuple[int, ...]) -> Int[np.ndarray, "..."]:
+    """The labels of an image of this shape, 0 around the `crop` that was cut from its `even_cells`.
+
+    Where the two halves of a middle cell differ the first one counts, unless it is 0.
+    """
+    whole = np.pad(crop, [_margin(size + size % 2, part) for size, part in zip(shape, crop.shape, strict=True)])
+    for axis, size in enumerate(shape):
+        if size % 2:
+            before, first, second, after = np.split(whole, np.arange(3) + size // 2, axis=axis)
+            whole = np.concatenate([before, np.where(first, first, second), after], axis=axis)
+    return whole
+
+
+def _margin(whole: int, part: int) -> tuple[int, int]:
+    """How many cells lie before and behind a crop."""
+    before = (whole - part) // 2
+    return before, whole - part - before

@@ -154,6 +154,8 @@ class LabelMap:
     """Red, green and blue of each class in pictures."""
     class_of: Int32[np.ndarray, " 260"]
     """The class of each raw id; -1 for ids that do not exist."""
+    raw_of: Int32[np.ndarray, " k"]
+    """The raw id that stands for each class: the first of those that become it."""
 
 
 def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> LabelMap:
@@ -161,7 +163,8 @@ def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> LabelMap:
     for class_id, members in enumerate(raw_ids.values()):
         class_of[list(members)] = class_id
     colors = np.array([_color(members[0]) for members in raw_ids.values()], dtype=np.uint8)
-    return LabelMap(tuple(raw_ids), colors, class_of)
+    raw_of = np.array([members[0] for members in raw_ids.values()], dtype=np.int32)
+    return LabelMap(tuple(raw_ids), colors, class_of, raw_of)
 
 
 _LABEL_MAPS = {categories: _label_map(raw_ids) for categories, raw_ids in _RAW_IDS.items()}
@@ -185,3 +188,8 @@ def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32
     if np.any(classes < 0):
         raise ValueError(f"expected raw SemanticKITTI ids, found {np.unique(raw[classes < 0])[:5].tolist()}")
     return classes
+
+
+def to_raw(classes: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
+    """Return a raw SemanticKITTI id of each class; `to_classes` with the same categories gives the classes back."""
+    return label_map(categories).raw_of[classes]

@@ -1,6 +1,7 @@
 """The training losses, equations 5 to 8. Sums that span a batch are kept apart, so that a batch can come in chunks."""
 
-from typing import Literal
+import functools
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,23 @@ def lazy_triplet(
         return temperature * jax.nn.softplus(jax.nn.logsumexp(violation / temperature, axis=-1))
     hinge = jax.nn.relu(violation)
     return hinge.max(-1) if reduction == "max" else hinge.sum(-1)
+
+
+def one_threshold(
+    positive: Float[Array, "t p"],
+    negative: Float[Array, "t n"],
+    *,
+    where: Bool[Array, "t n"],
+    **options: Any,
+) -> Float[Array, "t"]:
+    """The lazy triplet loss where the negatives of every anchor are those of all: for a threshold that all share.
+
+    Equation 5 compares the distances of one anchor. A loop is accepted below one distance for all places, so that the
+    distance to a positive here must be below that of any two places that are apart. Options are those of
+    `lazy_triplet`.
+    """
+    everyone = functools.partial(jnp.broadcast_to, shape=(len(positive), negative.size))
+    return lazy_triplet(positive, everyone(negative.reshape(1, -1)), where=everyone(where.reshape(1, -1)), **options)
 
 
 def cross_entropy(

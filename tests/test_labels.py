@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.labels import CATEGORIES, RAW_NAMES, label_map, to_classes
+from sglpr_jax.labels import CATEGORIES, RAW_NAMES, label_map, to_classes, to_raw
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "labels.md"
 SETTINGS = (6, 15, 20, 25, 34)
@@ -28,6 +28,14 @@ def test_every_raw_id_has_a_class_with_a_name_and_a_colour_of_its_own(categories
     assert found.colors.shape == (k, 3) and len(np.unique(found.colors, axis=0)) == k
     classes = to_classes(np.array(list(RAW_NAMES)), categories=categories)
     assert classes[0] == 0 and set(classes.tolist()) == set(range(k))
+
+
+@pytest.mark.parametrize("categories", SETTINGS)
+def test_the_raw_id_of_a_class_becomes_that_class(categories):
+    classes = np.arange(len(label_map(categories).names)).reshape(1, -1)
+    raw = to_raw(classes, categories=categories)
+    assert raw[0, 0] == 0 and raw.shape == classes.shape
+    np.testing.assert_array_equal(to_classes(raw, categories=categories), classes)
 
 
 def test_dynamic_things_are_sorted_as_the_paper_says():

@@ -163,6 +163,19 @@ def test_a_tuple_without_negatives_costs_nothing_and_has_no_gradient(options):
         assert np.abs(gradient[2]).max() == 0
 
 
+@pytest.mark.parametrize("options", [{}, {"reduction": "sum"}, {"temperature": 0.1}], ids=["max", "sum", "smooth"])
+def test_with_one_threshold_every_anchor_has_the_negatives_of_all(options):
+    positive, negative = distances()
+    where = jnp.asarray(np.random.default_rng(1).random(negative.shape) < 0.7)
+    found = jax.jit(lambda *x: losses.one_threshold(*x[:2], where=x[2], margin=0.3, **options))(
+        positive, negative, where
+    )
+    everyone = np.asarray(negative)[np.asarray(where)]
+    for i, own in enumerate(positive):
+        alone = losses.lazy_triplet(own[None], jnp.asarray(everyone)[None], margin=0.3, **options)
+        np.testing.assert_allclose(found[i], alone[0], rtol=1e-5)
+
+
 def test_the_smooth_triplet_loss_tends_to_the_lazy_one():
     positive, negative = distances()
     lazy = losses.lazy_triplet(positive, negative, margin=0.3)

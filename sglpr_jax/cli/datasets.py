@@ -21,7 +21,8 @@ BYTES_PER_RAY = 16
 """Of a scan and its labels: 20 for every return, and most rays return."""
 BYTES_PER_NCLT_RAY = 5
 """Of 8 for every return; many rays go into the sky."""
-BYTES_PER_IMAGE = 2000
+BYTES_PER_IMAGE = 3500
+"""With its label map."""
 
 
 def dataset_root(data: Path | None) -> Path:

@@ -8,7 +8,7 @@ import jax
 from sglpr_jax.cli.methods import Method, network, reference
 from sglpr_jax.cli.runtime import console, progress_bar, write_json
 from sglpr_jax.cli.segment import score_semantics
-from sglpr_jax.data import Drive, ScanSequence
+from sglpr_jax.data import Drive
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.report import comparison, evaluate, table, to_json
@@ -18,16 +18,16 @@ ROTATION_SEED = 0
 TRAINED = "sglpr"
 
 
-def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> None:
-    """Embed, score, print and draw; everything that is printed is also written into `folder`."""
+def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int, references: bool = True) -> None:
+    """Embed, score, print and draw; everything that is printed is also written into `folder`.
+
+    Without `references` the trained network stands alone.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    untrained = init(jax.random.key(seed + 1), config=params.config)
-    methods = {
-        TRAINED: network(params),
-        "untrained": network(untrained),
-        "thumbnail": reference("thumbnail", sequence, params.config.grid),
-        "polar-fft": reference("polar-fft", sequence, params.config.grid),
-    }
+    methods: dict[str, Method] = {TRAINED: network(params)}
+    if references:
+        methods["untrained"] = network(init(jax.random.key(seed + 1), config=params.config))
+        methods |= {name: reference(name, sequence, params.config.grid) for name in ("thumbnail", "polar-fft")}
     report: dict = {"sequence": sequence.name}
     for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
         results = _score(methods, sequence, folder, title, rotation_seed)
@@ -35,7 +35,7 @@ def final_test(params: Params, sequence: Drive, folder: Path, *, seed: int) -> N
         _print(results, f"sequence {sequence.name}, {title}")
         if importlib.util.find_spec("matplotlib"):
             _draw(results, sequence, folder, title)
-    if params.config.segments and isinstance(sequence, ScanSequence) and sequence.has_labels:
+    if params.config.segments and sequence.has_labels:
         report["segmentation"] = score_semantics(params, sequence, folder)
     write_json(folder / "results.json", report)
     console().print(f"written to {folder}")

@@ -9,13 +9,12 @@ from sglpr_jax.data import Drive, ScanSequence
 from sglpr_jax.evaluation.false_positives import FalsePositive
 from sglpr_jax.evaluation.inputs import Input
 from sglpr_jax.evaluation.page import HeatPicture, Pictures, SemanticPicture
-from sglpr_jax.labels import to_classes
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import read_image, read_views
 from sglpr_jax.retrieval.heat_maps import heat_maps
-from sglpr_jax.retrieval.semantic_maps import semantic_map
+from sglpr_jax.retrieval.semantic_maps import read_semantic_map
 
 SHOWN = (1 / 3, 2 / 3)
 """How far along the drive the scans are whose maps are shown."""
@@ -36,10 +35,6 @@ def take_pictures(sequence: Drive, params: Params | None, source: Input, worst: 
     heat = {sequence.ids[row]: _heat(sequence, params, row) for row in shown}
     if not params.config.segments:
         return Pictures(images, "Semantic maps: add --weights that have a segmentation head; these have none.", heat)
-    if not isinstance(sequence, ScanSequence):
-        return Pictures(
-            images, "Semantic maps: add --data with scans; ready-made images have no points to label.", heat
-        )
     return Pictures(images, {sequence.ids[row]: semantic_picture(sequence, params, row) for row in shown}, heat)
 
 
@@ -68,10 +63,8 @@ def _heat(sequence: Drive, params: Params, row: int) -> HeatPicture:
     return HeatPicture(np.asarray(views[0]), heat_maps(params, *views))
 
 
-def semantic_picture(sequence: ScanSequence, params: Params, row: int) -> SemanticPicture:
+def semantic_picture(sequence: Drive, params: Params, row: int) -> SemanticPicture:
     """Return one scan's counts and semantic maps: the network's and, with labels, the true one."""
-    labels, config = sequence.labels(row), params.config
-    classes = None if labels is None else to_classes(labels, categories=config.categories)
-    found = semantic_map(params, sequence.points(row), classes)
-    truth = None if labels is None else found.truth
+    config, found = params.config, read_semantic_map(params, sequence, row)
+    truth = None if sequence.label_paths[row] is None else found.truth
     return SemanticPicture(found.counts, truth, found.predicted, config.grid.resolution_m, config.categories)

@@ -40,7 +40,7 @@ class SimulateCommand:
     azimuth_steps: int | None = None
     """Firings per turn; fewer make smaller files. None: as many as the real sensor's."""
     images: bool = False
-    """Write BEV density images (NN/imgs, NN/pose.txt) in place of scans and labels."""
+    """Write BEV density images with label maps (NN/imgs, NN/labels, NN/pose.txt) in place of scans and labels."""
     seed: int = 0
 
 

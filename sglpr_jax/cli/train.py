@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import tyro
 
@@ -21,12 +22,13 @@ from sglpr_jax.cli.runtime import run, stop_on_signal, write_json
 from sglpr_jax.cli.training_batches import batches, named_places, positions_of, tuple_pool
 from sglpr_jax.cli.training_recall import training_recall
 from sglpr_jax.cli.validation import validation_score
-from sglpr_jax.data import Drive, ScanSequence
+from sglpr_jax.data import Drive
 from sglpr_jax.data.held_out import hold_out
 from sglpr_jax.data.kitti import PoseChoice
+from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 from sglpr_jax.data.tuples import TuplePool
-from sglpr_jax.models.params import save
-from sglpr_jax.models.sglpr import Params
+from sglpr_jax.models.params import graft, load, save
+from sglpr_jax.models.sglpr import Params, init
 from sglpr_jax.train.config import TrainConfig
 from sglpr_jax.train.describe_places import describe_places
 from sglpr_jax.train.devices import own_copy
@@ -60,16 +62,24 @@ class TrainCommand:
     data: Path | None = None
     """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated drives."""
     also: tuple[Path, ...] = ()
-    """Further datasets, all of whose drives are trained on, with --also-tuples of a step's tuples: simulated scans with
-    labels, say, beside real images without."""
+    """Further datasets, all of whose drives are trained on, with --also-tuples of a step's tuples: simulated scans or
+    images with labels, say, beside real images without."""
+    pseudo_labels: Path | None = None
+    """Label maps NN/<id>.png that bin/segment made of the images of --data, for its drives without labels of their own;
+    never for the one tested."""
     preset: str = "small"
     """A file of configs/ by name, or a path to one of your own."""
     out: Path | None = None
     """The run's folder. None: runs/PRESET-SEQ."""
     resume: bool = False
     """Go on from the run's newest checkpoint."""
+    start: Path | None = None
+    """Weights to begin with, a run's folder or a folder with config.json and model.safetensors, in place of fresh ones.
+    What they lack, such as the segmentation head, is fresh."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
+    references: bool = True
+    """At the end score untrained weights, the thumbnail and polar-FFT beside it (--no-references: not)."""
     tensorboard: bool = False
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     poses: PoseChoice = "auto"
@@ -98,7 +108,7 @@ def train_and_test(command: TrainCommand) -> Path:
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
         params, test = train_only(command)
     if is_first_host():
-        final_test(params, test, folder / "test", seed=command.config.seed)
+        final_test(params, test, folder / "test", seed=command.config.seed, references=command.references)
     return folder
 
 
@@ -134,6 +144,7 @@ def train_only(command: TrainCommand) -> tuple[Params, Drive]:
                 folder,
                 score=score,
                 refresh=mining.refresh if mining else None,
+                start_from=_start(command),
                 resume=command.resume,
                 stopped=stopped,
                 places=lambda step: named_places(drives, pool, config, step, mining=mining),
@@ -166,10 +177,28 @@ def _drives(command: TrainCommand) -> tuple[list[Drive], list[Drive], Drive]:
             "--also names datasets and --also-tuples how many tuples of a step are theirs: expected both or neither, "
             f"found {len(command.also)} datasets and {config.also_tuples} tuples"
         )
+    if command.pseudo_labels is not None:
+        drives = _pseudo_labelled(drives, command.pseudo_labels, config)
     if config.model.categories_read:
         for drive in (*drives, *also, test):
             _require_labels(drive)
     return drives, also, test
+
+
+def _start(command: TrainCommand) -> Params | None:
+    """The weights that a new run begins with, where it is told any."""
+    if command.start is None or command.resume:
+        return None
+    return graft(load(command.start), init(jax.random.key(command.config.seed), config=command.config.model))
+
+
+def _pseudo_labelled(drives: Sequence[Drive], folder: Path, config: TrainConfig) -> list[Drive]:
+    if not config.model.segments:
+        raise ValueError("--pseudo-labels are for the segmentation head: expected losses that train one, found none")
+    labelled = with_pseudo_labels(drives, folder)
+    maps = sum(path is not None for drive in labelled for path in drive.label_paths)
+    print(f"{maps} of {sum(map(len, labelled))} images have labels, with those of {folder}", file=sys.stderr)
+    return labelled
 
 
 def _describe_unturned(drives: Sequence[Drive], pool: TuplePool, config: TrainConfig) -> DescribeFn:
@@ -227,7 +256,13 @@ def require_same_settings(folder: Path, command: TrainCommand) -> None:
 def _settings(command: TrainCommand) -> dict[str, Any]:
     """The effective configuration as it is written beside the results; on which hosts changes none of them."""
     plain = dataclasses.asdict(dataclasses.replace(command, out=None, resume=False))
-    elsewhere = ("tensorboard", "hosts", "host_index", "coordinator")  # how a run is watched and where it is made
+    elsewhere = (
+        "references",
+        "tensorboard",
+        "hosts",
+        "host_index",
+        "coordinator",
+    )  # how a run is watched and where it is made
     told = {name: value for name, value in plain.items() if name not in elsewhere}
     return json.loads(json.dumps(told, default=str))
 
@@ -239,7 +274,7 @@ def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
 
 
 def _require_labels(drive: Drive) -> None:
-    labelled = sum(path is not None for path in drive.label_paths) if isinstance(drive, ScanSequence) else 0
+    labelled = sum(path is not None for path in drive.label_paths)
     if labelled < len(drive):
         raise ValueError(
             f"model.head.input reads labels: expected labels beside every scan of sequence {drive.name}, "

@@ -1,5 +1,6 @@
 """A batch of training tuples: read from files on the host, rotated and rasterised on the device."""
 
+import functools
 from collections.abc import Sequence as Many
 from typing import Any
 
@@ -8,8 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.bev import Grid, ImageKind, centre_crop, rasterize, rasterize_labels, rotate_image, rotate_points
-from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.bev import (
+    Grid,
+    ImageKind,
+    centre_crop,
+    even_cells,
+    rasterize,
+    rasterize_labels,
+    rotate_image,
+    rotate_labels,
+    rotate_points,
+)
+from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TuplePool
 from sglpr_jax.labels import UNLABELLED, to_classes
@@ -19,9 +30,10 @@ from sglpr_jax.labels import UNLABELLED, to_classes
 class Batch:
     """Tuples as arrays; t tuples of k = 1 + k_p + k_n places, flattened to b = t k where not said otherwise.
 
-    Either `images` (b, h, w), or `points` (b, n, 3) with `count` (b,) valid ones each and their `classes` (b, n) (None
-    where no drive has labels). `labelled` (b,) says which places have labels, `far` (t, b) which places can serve an
-    anchor as negatives, `positives` how many places after an anchor are its positives.
+    Either `images` (b, h, w) with their `maps` of classes (b, h, w), or `points` (b, n, 3) with `count` (b,) valid ones
+    each and their `classes` (b, n); maps and classes are None where no drive has labels. `labelled` (b,) says which
+    places have labels, `far` (t, b) which places can serve an anchor as negatives, `positives` how many places after an
+    anchor are its positives.
 
     With `also`, a second batch, its places come after those here: `labelled` covers both, and `far` both or, where the
     triplet loss does not count the second one, the first alone.
@@ -31,6 +43,7 @@ class Batch:
     far: Any
     positives: int = flax.struct.field(pytree_node=False)
     images: Any = None
+    maps: Any = None
     points: Any = None
     count: Any = None
     classes: Any = None
@@ -58,8 +71,7 @@ def read_batch(
     With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
     of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
     sorted into classes; with 0 they are not read. `image` "density" makes an image like the ready-made ones of all
-    points of a scan, which can have no labels then. `part` says which tuples to read; their negatives are still sought
-    among all of the batch.
+    points of a scan. `part` says which tuples to read; their negatives are still sought among all of the batch.
     """
     flat = frames.reshape(-1)
     far = pool.far_apart(frames[:, :1], flat[None, :])
@@ -67,14 +79,12 @@ def read_batch(
         far &= _own_negatives(frames.shape, positives=pool.config.positives)
     far = far[part]
     places = [(drives[int(pool.drive[f])], int(pool.frame[f])) for f in frames[part].reshape(-1)]
-    if isinstance(drives[0], ImageSequence):
-        images = np.stack([_read_image(*place) for place in places])
-        return Batch(np.zeros(len(places), bool), far, pool.config.positives, images=images)
-    if image == "density":
-        images = np.stack([_density_image(*place, categories) for place in places])
-        return Batch(np.zeros(len(places), bool), far, pool.config.positives, images=images)
-    points, count, classes, labelled = _padded([_read_scan(*place, categories) for place in places], max_points)
     has_labels = categories > 0 and any(drive.has_labels for drive in drives)
+    if isinstance(drives[0], ImageSequence) or image == "density":
+        read = _read_image if isinstance(drives[0], ImageSequence) else _density_image
+        images, maps, labelled = _stacked([read(*place, categories) for place in places])
+        return Batch(labelled, far, pool.config.positives, images=images, maps=maps if has_labels else None)
+    points, count, classes, labelled = _padded([_read_scan(*place, categories) for place in places], max_points)
     return Batch(
         labelled, far, pool.config.positives, points=points, count=count, classes=classes if has_labels else None
     )
@@ -100,10 +110,13 @@ def views(
 def _views(
     batch: Batch, angles: Float[Array, "b"], grid: Grid
 ) -> tuple[Float[Array, "b h w"], Int[Array, "b h w"] | None]:
-    if batch.images is not None:
-        return centre_crop(rotate_image(batch.images, angles), height=grid.height, width=grid.width), None
-    points = rotate_points(batch.points, angles)
+    crop = functools.partial(centre_crop, height=grid.height, width=grid.width)
     maps = None
+    if batch.images is not None:
+        if batch.maps is not None:
+            maps = crop(rotate_labels(even_cells(batch.maps), angles))
+        return crop(rotate_image(even_cells(batch.images), angles)), maps
+    points = rotate_points(batch.points, angles)
     if batch.classes is not None:
         maps = rasterize_labels(points, batch.classes, grid=grid, count=batch.count)
     return rasterize(points, grid=grid, count=batch.count).astype(jnp.float32), maps
@@ -115,27 +128,33 @@ def _own_negatives(shape: tuple[int, int], *, positives: int) -> Bool[np.ndarray
     return np.kron(np.eye(tuples, dtype=bool), is_negative)
 
 
-def _read_image(drive: Drive, frame: int) -> np.ndarray:
+def _read_image(drive: Drive, frame: int, categories: int) -> tuple[np.ndarray, np.ndarray | None]:
     if not isinstance(drive, ImageSequence):
         raise ValueError(f"expected all drives of a batch to be images, found scans in {drive.name}")
-    return drive.image(frame)
+    return drive.image(frame), _classes(drive, frame, categories)
 
 
 def _read_scan(drive: Drive, frame: int, categories: int) -> tuple[np.ndarray, np.ndarray | None]:
     if not isinstance(drive, ScanSequence):
         raise ValueError(f"expected all drives of a batch to be scans, found images in {drive.name}")
+    return drive.points(frame), _classes(drive, frame, categories)
+
+
+def _classes(drive: Drive, frame: int, categories: int) -> np.ndarray | None:
     labels = drive.labels(frame) if categories else None
-    return drive.points(frame), None if labels is None else to_classes(labels, categories=categories)
+    return None if labels is None else to_classes(labels, categories=categories)
 
 
-def _density_image(drive: Drive, frame: int, categories: int) -> np.ndarray:
+def _stacked(places: list[tuple[np.ndarray, np.ndarray | None]]) -> tuple[np.ndarray, ...]:
+    """Images, their maps of classes (UNLABELLED all over where there is none), and which have one."""
+    maps = [np.full(image.shape, UNLABELLED, np.int32) if classes is None else classes for image, classes in places]
+    labelled = np.array([classes is not None for _, classes in places])
+    return np.stack([image for image, _ in places]), np.stack(maps), labelled
+
+
+def _density_image(drive: Drive, frame: int, categories: int) -> tuple[np.ndarray, np.ndarray | None]:
     points, classes = _read_scan(drive, frame, categories)
-    if classes is not None:
-        raise ValueError(
-            f"scans become density images here (model.image), which have no labels in training: expected scans without "
-            f"labels, found some in {drive.name}; train without the segmentation losses, or on point counts"
-        )
-    return density_bev(points)
+    return density_bev(points), None if classes is None else density_label_bev(points, classes)
 
 
 def _padded(scans: list[tuple[np.ndarray, np.ndarray | None]], max_points: int) -> tuple[np.ndarray, ...]:

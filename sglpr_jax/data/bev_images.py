@@ -1,17 +1,16 @@
 """Sequences of ready-made BEV images in BEVPlace's layout.
 
-    00/imgs/000000.png   8-bit density images; the number is the frame, and frames may be left out
-    00/pose.txt          12 numbers a line, LiDAR frame, one line per frame
-
-In such an image the row runs backwards and the column to the right; eq. 1 has x (forward) to the right and y (left) up.
+00/imgs/000000.png     8-bit density images; the number is the frame, and frames may be left out
+00/labels/000000.png   what their pixels show (`label_maps.py`; optional, each)
+00/pose.txt            12 numbers a line, LiDAR frame, one line per frame
 """
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from PIL import Image
 
+from sglpr_jax.data.grey_png import read_grey_png
 from sglpr_jax.data.pose_files import read_poses, rows_of
 from sglpr_jax.data.sequence import ImageSequence
 
@@ -34,6 +33,7 @@ def open_sequence(root: Path, name: str) -> ImageSequence:
         raise FileNotFoundError(f"{folder / 'imgs'}: expected images (*.png), found none")
     ids = tuple(path.stem for path in image_paths)
     world_from_lidar = read_poses(folder / "pose.txt")
+    labels = {path.stem: path for path in (folder / "labels").glob("*.png")}
     rows = rows_of(ids, rows=len(world_from_lidar), path=folder / "pose.txt")
     return ImageSequence(
         name=name,
@@ -44,6 +44,7 @@ def open_sequence(root: Path, name: str) -> ImageSequence:
         image_paths=image_paths,
         resolution_m=RESOLUTION_M,
         read_image=read_image,
+        label_paths=tuple(labels.get(image) for image in ids),
     )
 
 
@@ -52,18 +53,9 @@ def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
 
     Raises FileNotFoundError, and ValueError where the file is no whole 8-bit grey image.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        with Image.open(path) as image:
-            mode, grey = image.mode, np.asarray(image)
-    except (OSError, SyntaxError) as error:  # what Pillow raises for a cut-off or broken PNG
-        raise ValueError(f"{path}: expected an 8-bit grey PNG, found no such image ({error})") from error
-    if mode != "L":
-        raise ValueError(f"{path}: expected an 8-bit grey PNG (mode L), found mode {mode}")
-    return counts_of(grey)
+    return counts_of(read_grey_png(path, bits=8))
 
 
-def counts_of(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "w h"]:
-    """The counts 0..10 that the grey values of an image say, in eq. 1's orientation."""
-    return np.ascontiguousarray(np.rot90(grey, -1)) * np.float32(MAX_COUNT / 255)
+def counts_of(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The counts 0..10 that the grey values of an image say."""
+    return np.ascontiguousarray(grey) * np.float32(MAX_COUNT / 255)

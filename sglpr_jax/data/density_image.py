@@ -29,7 +29,7 @@ def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 
 
     Equal to writing `density_image` as a PNG and reading that as a ready-made image.
     """
-    return counts_of(density_image(points))
+    return counts_of(np.rot90(density_image(points), -1))
 
 
 def density_label_bev(

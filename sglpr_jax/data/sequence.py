@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from sglpr_jax.data.label_maps import read_label_map
 from sglpr_jax.data.scan_files import read_labels
 
 
@@ -59,9 +60,10 @@ class ScanSequence:
 
 @dataclass(frozen=True, eq=False)
 class ImageSequence:
-    """Ready-made BEV images in the order their scans were taken, with their positions.
+    """Ready-made BEV images in the order their scans were taken, with their positions, and labels where there are any.
 
-    `resolution_m` is the edge of a pixel in metres. The other fields are those of `ScanSequence`.
+    `resolution_m` is the edge of a pixel in metres. The other fields are those of `ScanSequence`; without `label_paths`
+    no image has labels.
     """
 
     name: str
@@ -72,15 +74,31 @@ class ImageSequence:
     image_paths: tuple[Path, ...]
     resolution_m: float
     read_image: Callable[[Path], np.ndarray]
+    label_paths: tuple[Path | None, ...] = field(default=(), kw_only=True)
 
-    has_labels = False
+    def __post_init__(self):
+        if not self.label_paths:
+            object.__setattr__(self, "label_paths", (None,) * len(self.ids))
 
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def has_labels(self) -> bool:
+        """Whether any image has labels."""
+        return any(path is not None for path in self.label_paths)
+
     def image(self, i: int) -> Float32[np.ndarray, "h w"]:
         """Read image `i` in the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
         return self.read_image(self.image_paths[i])
+
+    def labels(self, i: int) -> Int32[np.ndarray, "h w"] | None:
+        """Read the raw SemanticKITTI ids of image `i`, one per pixel, or None where it has no labels.
+
+        0 is an empty pixel or one whose class is not known. Raises what `read_label_map` raises.
+        """
+        path = self.label_paths[i]
+        return None if path is None else read_label_map(path, shape=self.image(i).shape)
 
 
 Drive = ScanSequence | ImageSequence

@@ -1,6 +1,7 @@
 """What a model is, as plain values: the static part of its parameters."""
 
 import dataclasses
+import math
 from typing import Literal
 
 from sglpr_jax.bev import Grid, ImageKind
@@ -25,9 +26,12 @@ class HeadConfig:
     strides: tuple[int, ...] = (2, 2, 2)
     cbam: bool = True
     cbam_reduction: int = 16
-    pooling: Literal["netvlad", "mean"] = "netvlad"
-    """`mean`: the mean over the map and a linear layer stand in for NetVLAD (table 4)."""
+    pooling: Literal["netvlad", "mean", "spectrum"] = "netvlad"
+    """`mean`: the mean over the map and a linear layer stand in for NetVLAD (table 4). `spectrum`: the amplitudes of
+    the map's Fourier transform along the sectors of a polar image (models/spectrum.py)."""
     clusters: int = 64
+    spectrum_channels: int = 256
+    frequencies: int = 32
     descriptor_size: int = 256
 
     def __post_init__(self):
@@ -44,8 +48,28 @@ class HeadConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RingConfig:
+    """A backbone of convolutions that go around the polar image (models/ring_net.py), a block for each width."""
+
+    average: int = 2
+    """Edge of the squares of polar pixels whose means the first block sees: without, the resampling skips cells."""
+    widths: tuple[int, ...] = (16, 32, 64, 96, 128, 160, 160)
+    strides: tuple[int, ...] = (2, 2, 1, 2, 1, 1, 1)
+    """Of each block, along the radius."""
+    means: tuple[int, ...] = (1, 1, 2, 1, 2, 1, 1)
+    """How many neighbouring sectors become one after each block."""
+
+    def __post_init__(self):
+        if not len(self.widths) == len(self.strides) == len(self.means):
+            raise ValueError(
+                "the ring net needs as many strides and means as widths, found "
+                f"widths {self.widths}, strides {self.strides}, means {self.means}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """A Swin-Unet with a place head and a segmentation head, over images of `grid`."""
+    """A Swin-Unet, or a ring net, with a place head and a segmentation head, over images of `grid`."""
 
     grid: Grid = Grid()
     image: ImageKind = "points"
@@ -62,6 +86,8 @@ class ModelConfig:
     windowed attention knows only relative positions."""
     polar: tuple[int, int] | None = None
     """(rings, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
+    rings: RingConfig | None = None
+    """The backbone is a ring net in place of the Swin-Unet; the fields from `patch` to `drop_path` then say nothing."""
     patch: int = 4
     stem: tuple[int, ...] = ()
     """Widths of convolutions before the patch embedding, the second and later ones at half the resolution of the one
@@ -95,10 +121,20 @@ class ModelConfig:
                 f"a stem of {len(self.stem)} widths makes pixels of {2 ** (len(self.stem) - 1)} cells, of which a "
                 f"patch must be made, found patch {self.patch}"
             )
-        step = self.patch * 2 ** (len(self.depths) - 1)
-        for size in self.image_size:
+        if self.rings and not self.polar:
+            raise ValueError("a ring net sees a polar image: expected model.polar (rings, sectors), found none")
+        for size, step in zip(self.image_size, self._steps, strict=True):
             if size % step:
-                raise ValueError(f"the backbone's image must be a multiple of {step} cells, found {self.image_size}")
+                raise ValueError(
+                    f"the backbone's image must be a multiple of {self._steps} cells, found {self.image_size}"
+                )
+
+    @property
+    def _steps(self) -> tuple[int, int]:
+        """Of how many rows and columns of the backbone's image its coarsest features are made."""
+        if self.rings:
+            return self.rings.average * math.prod(self.rings.strides), self.rings.average * math.prod(self.rings.means)
+        return (self.patch * 2 ** (len(self.depths) - 1),) * 2
 
     @property
     def classes(self) -> int:

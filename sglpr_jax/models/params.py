@@ -16,7 +16,7 @@ import safetensors.numpy
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.files import writing
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, RingConfig
 from sglpr_jax.models.sglpr import Params, init
 from sglpr_jax.models.shipped import weights_folder
 
@@ -79,6 +79,19 @@ def for_places(params: Params) -> Params:
     return Params(flax.traverse_util.unflatten_dict(kept, sep="/"), config)
 
 
+def graft(given: Params, fresh: Params) -> Params:
+    """`fresh` with the values of `given` wherever that has them: to train on from weights handed out.
+
+    Raises ValueError where `given` has a weight that `fresh` has not, or one of another shape.
+    """
+    flat, values = _flatten(fresh.weights), _flatten(given.weights)
+    for name, value in values.items():
+        if name not in flat or flat[name].shape != value.shape:
+            wanted = flat[name].shape if name in flat else "no such weight"
+            raise ValueError(f"cannot begin with these weights: {name} has shape {value.shape}, expected {wanted}")
+    return dataclasses.replace(fresh, weights=flax.traverse_util.unflatten_dict(flat | values, sep="/"))
+
+
 def config_from_dict(values: dict[str, Any], *, source: Path | str) -> ModelConfig:
     """The model configuration that `dataclasses.asdict` made, tuples restored. Errors name `source`.
 
@@ -87,7 +100,8 @@ def config_from_dict(values: dict[str, Any], *, source: Path | str) -> ModelConf
     values = {"categories" if name == "classes" else name: value for name, value in values.items()}
     try:
         grid, head = Grid(**values["grid"]), HeadConfig(**_tuples(values["head"]))
-        return ModelConfig(**_tuples({**values, "grid": grid, "head": head}))
+        rings = RingConfig(**_tuples(values["rings"])) if values.get("rings") else None
+        return ModelConfig(**_tuples({**values, "grid": grid, "head": head, "rings": rings}))
     except (KeyError, TypeError) as error:
         raise ValueError(f"{source}: expected the fields of a ModelConfig, found {sorted(values)} ({error})") from error
     except ValueError as error:

@@ -8,6 +8,7 @@ from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.layers import LayerNorm, convolution, l2_normalize
 from sglpr_jax.models.mean_pooling import MeanPooling
 from sglpr_jax.models.netvlad import NetVLAD
+from sglpr_jax.models.spectrum import Spectrum
 
 
 class PlaceHead(nn.Module):
@@ -29,10 +30,14 @@ class PlaceHead(nn.Module):
         for i, (channels, kernel, stride) in enumerate(shapes):
             x = convolution(x, channels, kernel, stride, circular=self.circular, name=f"convolution_{i}")
             x = seen[f"head_convolution{i}"] = nn.relu(LayerNorm(name=f"norm_{i}")(x))
-        locals_ = x.reshape(len(x), -1, x.shape[-1])
-        return l2_normalize(self._pooling()(locals_)), seen
+        return l2_normalize(self._pool(x)), seen
 
-    def _pooling(self) -> nn.Module:
-        if self.config.pooling == "mean":
-            return MeanPooling(self.config.descriptor_size, name="mean_pooling")
-        return NetVLAD(self.config.clusters, self.config.descriptor_size, name="netvlad")
+    def _pool(self, x: Float[Array, "b h w c"]) -> Float[Array, "b d"]:
+        config = self.config
+        if config.pooling == "spectrum":
+            size, channels = config.descriptor_size, config.spectrum_channels
+            return Spectrum(channels, config.frequencies, size, name="spectrum")(x)
+        locals_ = x.reshape(len(x), -1, x.shape[-1])
+        if config.pooling == "mean":
+            return MeanPooling(config.descriptor_size, name="mean_pooling")(locals_)
+        return NetVLAD(config.clusters, config.descriptor_size, name="netvlad")(locals_)

@@ -3,7 +3,7 @@
 import dataclasses
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, RingConfig
 
 _HEAD_B = HeadConfig(tap="pixels", channels=(128, 256, 512), kernels=(4, 3, 3), strides=(4, 2, 2))
 _PAPER = ModelConfig()
@@ -22,6 +22,9 @@ _SMALL = ModelConfig(
     detail=32,
     head=HeadConfig(tap="tokens", channels=(64, 128, 256), kernels=(3, 3, 3), strides=(1, 1, 2)),
 )
+_RINGS = dataclasses.replace(
+    _SMALL, rings=RingConfig(), head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=())
+)
 
 MODELS: dict[str, ModelConfig] = {
     # The paper's model, its head read literally: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
@@ -34,6 +37,8 @@ MODELS: dict[str, ModelConfig] = {
     "small": _SMALL,
     # With convolutions in front, which learn the semantic map better (docs/results.md); a step takes longer.
     "small-stem": dataclasses.replace(_SMALL, stem=(16, 32, 64)),
+    # A convolutional backbone that turns with the scan.
+    "rings": _RINGS,
     # Smaller still, for bin/demo.
     "demo": dataclasses.replace(_SMALL, embed_dim=32, heads=(1, 2, 4)),
     # For tests: every part of the model, next to no arithmetic.

@@ -19,6 +19,7 @@ from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.polar import from_polar, to_polar
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.raw_place import RawPlace
+from sglpr_jax.models.ring_net import RingDecoder, RingNet
 from sglpr_jax.models.stem import Stem, StemDecoder
 from sglpr_jax.models.swin import FinalPatchExpand
 from sglpr_jax.models.swin_unet import SwinUnet
@@ -54,18 +55,7 @@ class SGLPR(nn.Module):
         if config.polar:
             seen = to_polar(image, config.grid, *config.polar)
         seen = seen.astype(config.compute)
-        maps = Stem(config.stem, circular, name="stem")(seen) if config.stem else []
-        tokens, intermediates = SwinUnet(
-            embed_dim=config.embed_dim,
-            depths=config.depths,
-            heads=config.heads,
-            window=config.window,
-            mlp_ratio=config.mlp_ratio,
-            patch=config.token_pixels,
-            drop_path=config.drop_path,
-            circular=circular,
-            name="backbone",
-        )(maps[-1] if maps else seen, train=train)
+        tokens, maps, intermediates = self._backbone(seen, train)
         expand = self._expansion()
         reads_pixels = config.head.tap == "pixels"
         features = expand(tokens, maps) if reads_pixels else tokens
@@ -79,9 +69,32 @@ class SGLPR(nn.Module):
             logits = self._logits(pixels, image[::segment])
         return Outputs(descriptor, logits, intermediates | head)
 
+    def _backbone(self, seen: Float[Array, "b p q c"], train: bool) -> tuple[Array, list[Array], dict[str, Array]]:
+        """Features, the maps on the way that the segmentation head looks at again, and every named map."""
+        config, circular = self.config, self.config.polar is not None
+        if config.rings:
+            maps = RingNet(config.rings, name="rings")(seen)
+            return maps[-1], maps, {f"ring_block{i}": seen for i, seen in enumerate(maps[1:])}
+        maps = Stem(config.stem, circular, name="stem")(seen) if config.stem else []
+        tokens, intermediates = SwinUnet(
+            embed_dim=config.embed_dim,
+            depths=config.depths,
+            heads=config.heads,
+            window=config.window,
+            mlp_ratio=config.mlp_ratio,
+            patch=config.token_pixels,
+            drop_path=config.drop_path,
+            circular=circular,
+            name="backbone",
+        )(maps[-1] if maps else seen, train=train)
+        return tokens, maps, intermediates
+
     def _expansion(self) -> Callable[[Array, list[Array]], Array]:
         """From tokens to pixels: a linear layer, or past the maps of the stem."""
         config = self.config
+        if config.rings:
+            decoder = RingDecoder(name="decoder")
+            return lambda _, maps: decoder(maps)
         if config.stem:
             return StemDecoder(config.token_pixels, config.polar is not None, name="decoder")
         expand = FinalPatchExpand(config.patch, name="expand")

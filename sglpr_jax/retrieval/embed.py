@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32
 
-from sglpr_jax.bev import Grid, ImageKind, centre_crop, rotate_image
+from sglpr_jax.bev import Grid, ImageKind, centre_crop, even_cells, rotate_image, rotate_labels
 from sglpr_jax.data.sequence import Drive, ImageSequence, ScanSequence
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
@@ -144,14 +144,16 @@ def read_views(
 ) -> tuple[Array, ...]:
     """The image of one scan and, with `categories`, its map of so many classes, both turned by `angle` radians.
 
-    Raises ValueError where scans come without a grid, or without the labels asked for.
+    Raises ValueError where scans come without a grid, or a scan or image without the labels asked for.
     """
     if isinstance(sequence, ImageSequence):
+        cells = even_cells if grid is not None else jnp.asarray
+        whole = cells(jnp.asarray(sequence.image(row)))
+        views = (whole if angle is None else rotate_image(whole, angle),)
         if categories:
-            raise ValueError(f"sequence {sequence.name}: expected scans with labels, found ready-made images")
-        whole = jnp.asarray(sequence.image(row))
-        whole = whole if angle is None else rotate_image(whole, angle)
-        return (whole if grid is None else centre_crop(whole, height=grid.height, width=grid.width),)
+            classes = cells(jnp.asarray(_classes(sequence, row, categories)))
+            views += (classes if angle is None else rotate_labels(classes, angle),)
+        return views if grid is None else tuple(centre_crop(v, height=grid.height, width=grid.width) for v in views)
     if grid is None:
         raise ValueError("scans need a grid to be rasterised on, found none")
     classes = _classes(sequence, row, categories) if categories else None
@@ -169,8 +171,8 @@ def _read_scan(
     return points[finite], _classes(sequence, row, 20)[finite]
 
 
-def _classes(sequence: ScanSequence, row: int, categories: int) -> Int32[np.ndarray, " n"]:
-    """The class of every point of one scan; ValueError where it has no labels."""
+def _classes(sequence: Drive, row: int, categories: int) -> Int32[np.ndarray, "..."]:
+    """The class of every point of one scan, or pixel of one image; ValueError where it has no labels."""
     raw = sequence.labels(row)
     if raw is None:
         raise ValueError(f"scan {sequence.ids[row]} of sequence {sequence.name}: expected labels, found none")

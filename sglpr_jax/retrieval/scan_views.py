@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int
 
-from sglpr_jax.bev import Grid, ImageKind, centre_crop, rasterize, rasterize_labels, rotate_points
+from sglpr_jax.bev import Grid, ImageKind, centre_crop, even_cells, rasterize, rasterize_labels, rotate_points
 from sglpr_jax.data.density_image import check_density_grid, density_bev, density_label_bev
 from sglpr_jax.models.config import ModelConfig
 
@@ -53,4 +53,5 @@ def _density_views(
 ) -> tuple[Array, ...]:
     check_density_grid(grid)
     whole = [density_bev(points)] if classes is None else [density_bev(points), density_label_bev(points, classes)]
-    return tuple(centre_crop(jnp.asarray(view), height=grid.height, width=grid.width) for view in whole)
+    cells = map(even_cells, map(jnp.asarray, whole))
+    return tuple(centre_crop(view, height=grid.height, width=grid.width) for view in cells)

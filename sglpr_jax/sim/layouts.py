@@ -1,4 +1,4 @@
-"""How a simulated drive lies on disk: scans in KITTI's layout or NCLT's, or images in BEVPlace's."""
+"""How a simulated drive lies on disk: scans in KITTI's layout or NCLT's, or images with label maps in BEVPlace's."""
 
 import io
 from collections.abc import Callable
@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.density_image import density_image
+from sglpr_jax.data.density_image import density_image, density_label_map
 from sglpr_jax.data.scan_files import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
 from sglpr_jax.sim.drive import Drive
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
@@ -50,10 +50,18 @@ def _points_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray) -> 
     return points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()
 
 
-def _image(points: Float[np.ndarray, "n 4"], _labels: np.ndarray) -> tuple[bytes, ...]:
+def _image_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray) -> tuple[bytes, ...]:
+    """A density image and the raw ids of what its pixels show; an empty pixel shows nothing."""
+    xyz = points[:, :3].astype(np.float32)
+    image = density_image(xyz)
+    shown = np.where(image > 0, density_label_map(xyz, labels), 0)
+    return _png(image), _png(shown.astype(np.uint16))
+
+
+def _png(pixels: UInt[np.ndarray, "rows columns"]) -> bytes:
     png = io.BytesIO()
-    Image.fromarray(density_image(points[:, :3].astype(np.float32))).save(png, format="png")
-    return (png.getvalue(),)
+    Image.fromarray(pixels).save(png, format="png")
+    return png.getvalue()
 
 
 def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
@@ -120,8 +128,8 @@ LAYOUTS = {
     ),
     "images": Layout(
         folder="{name}",
-        scan_files=("imgs/{id}.png",),
-        scan_contents=_image,
+        scan_files=("imgs/{id}.png", "labels/{id}.png"),
+        scan_contents=_image_and_labels,
         drive_contents=_bevplace_files,
         last_file="pose.txt",
     ),
@@ -133,5 +141,5 @@ LAYOUTS = {
         last_file="groundtruth_{name}.csv",
     ),
 }
-"""KITTI odometry's and SemanticKITTI's layout; BEVPlace's density images, which have neither labels nor times; NCLT's
+"""KITTI odometry's and SemanticKITTI's layout; BEVPlace's density images, which have no times, with label maps; NCLT's
 sessions, which have no labels."""

@@ -20,6 +20,9 @@ class LossConfig:
     """`max` is the lazy triplet loss; `sum` counts every negative inside the margin."""
     temperature: float = 0.0
     """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
+    one_threshold: float = 0.0
+    """Share of the triplet loss in which the negatives of all anchors are an anchor's (`losses.one_threshold`): one
+    threshold on distances for all places needs it. 0 in the paper."""
     ce_weight: float = 0.4
     dice_weight: float = 0.6
     segment_every: int = 1

@@ -39,6 +39,7 @@ def train(
     *,
     score: ScoreFn,
     refresh: RefreshFn | None = None,
+    start_from: Params | None = None,
     resume: bool = False,
     stopped: Callable[[], bool] = lambda: False,
     places: Callable[[int], str] | None = None,
@@ -47,17 +48,18 @@ def train(
     """Train until `config.steps`, or until `stopped()`; `make_batch(step)` gives each step's batch (the host's part).
 
     All devices share a step. Writes metrics and checkpoints under `folder`; with `resume` it goes on from the newest
-    one, if there is one yet. `refresh(step, params)` is called before the first step and before each multiple of
-    `sampling.refresh_steps`. `record` is told what the metrics are told. Raises FloatingPointError, naming the step and
-    its batch as `places` does, when the loss is no longer finite; OSError when metrics or a checkpoint cannot be
-    written; ValueError where the devices cannot share a step (`data_mesh`).
+    one, if there is one yet. A new run begins with `start_from`, or with fresh weights. `refresh(step, params)` is
+    called before the first step and before each multiple of `sampling.refresh_steps`. `record` is told what the
+    metrics are told. Raises FloatingPointError, naming the step and its batch as `places` does, when the loss is no
+    longer finite; OSError when metrics or a checkpoint cannot be written; ValueError where the devices cannot share a
+    step (`data_mesh`).
     """
     mesh = data_mesh(config)
     folder.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as opened:
         checkpoints = opened.enter_context(contextlib.closing(Checkpoints(folder / CHECKPOINTS)))
         go_on = resume and checkpoints.latest_step() is not None
-        state = replicate(checkpoints.restore(config) if go_on else new_state(config), mesh)
+        state = replicate(checkpoints.restore(config) if go_on else new_state(config, params=start_from), mesh)
         unlogged = checkpoints.unlogged() if go_on else []
         start = int(state.step)
         path = folder / METRICS_FILE if is_first_host() else None

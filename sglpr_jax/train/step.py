@@ -136,17 +136,19 @@ def triplet_loss(
     positives = grouped[:, 1 : 1 + batch.positives]
     to_positives = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, positives), squared=config.squared)
     to_all = losses.descriptor_distance(*jnp.broadcast_arrays(anchors, descriptors[None]), squared=config.squared)
-    terms = functools.partial(
-        losses.lazy_triplet,
-        to_positives,
-        to_all,
-        margin=config.margin,
-        closest_positive=config.closest_positive,
-        reduction=config.reduction,
-        where=batch.far,
-    )
-    loss = terms(temperature=config.temperature).mean()
-    return loss, {"triplet": loss, "violations": (terms() > 0).mean()}  # the smooth loss never is zero
+    options = {
+        "margin": config.margin,
+        "closest_positive": config.closest_positive,
+        "reduction": config.reduction,
+        "where": jnp.asarray(batch.far),
+    }
+    own = losses.lazy_triplet(to_positives, to_all, **options, temperature=config.temperature).mean()
+    violations = losses.lazy_triplet(to_positives, to_all, **options) > 0  # the smooth loss never is zero
+    if not config.one_threshold:
+        return own, {"triplet": own, "violations": violations.mean()}
+    shared = losses.one_threshold(to_positives, to_all, **options, temperature=config.temperature).mean()
+    loss = (1 - config.one_threshold) * own + config.one_threshold * shared
+    return loss, {"triplet": loss, "violations": violations.mean()}
 
 
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:

@@ -106,16 +106,33 @@ def town(tmp_path_factory) -> Path:
 def images(tmp_path_factory) -> Path:
     """Ready-made BEV images of two straight drives, 00 and 06, which never come back."""
     root = tmp_path_factory.mktemp("data") / "images"
+    write_images(root)
+    return root
+
+
+@pytest.fixture(scope="session")
+def labelled_images(tmp_path_factory) -> Path:
+    """The same with label maps: buildings where an image is bright, cars that move where it is not, and empty cells."""
+    root = tmp_path_factory.mktemp("data") / "labelled"
+    write_images(root, labels=True)
+    return root
+
+
+def write_images(root: Path, *, labels: bool = False) -> None:
     rng = np.random.default_rng(0)
     for name in ("00", "06"):
-        (root / name / "imgs").mkdir(parents=True)
+        for what in ("imgs", "labels") if labels else ("imgs",):
+            (root / name / what).mkdir(parents=True)
         poses = np.tile(np.eye(3, 4), (30, 1, 1))
         poses[:, 0, 3] = 6.0 * np.arange(30)
         np.savetxt(root / name / "pose.txt", poses.reshape(30, 12))
         for frame in range(30):
             picture = rng.integers(0, 255, (20, 22), dtype=np.uint8)
+            if labels:
+                picture[picture < 50] = 0
+                raw = np.where(picture > 150, 50, 252) * (picture > 0)
+                Image.fromarray(raw.astype(np.uint16)).save(root / name / "labels" / f"{frame:06d}.png")
             Image.fromarray(picture).save(root / name / "imgs" / f"{frame:06d}.png")
-    return root
 
 
 @pytest.fixture(scope="session")

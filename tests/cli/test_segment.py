@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sglpr_jax.labels import RAW_NAMES
+
 from .conftest import assert_one_line_error
 
 
@@ -44,7 +46,33 @@ def test_scans_without_labels_get_maps_but_no_scores(segment, trained, town, tmp
     assert not (maps / "segmentation.json").exists()
 
 
-def test_ready_made_images_are_refused(segment, trained, images):
-    ended, maps = segment("--weights", trained.folder, "--data", images, "--seq", "06")
-    assert_one_line_error(ended, images, "expected scans, found ready-made images")
-    assert not maps.exists()
+def pixels(path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_images_get_label_maps_that_lie_on_them(segment, trained, labelled_images):
+    ended, maps = segment("--weights", trained.folder, "--data", labelled_images, "--seq", "06")
+    assert ended.status == 0, ended.error
+    for frame in range(30):
+        found = pixels(maps / f"{frame:06d}.png")
+        empty = pixels(labelled_images / f"06/imgs/{frame:06d}.png") == 0
+        empty[[0, 1, -2, -1]] = empty[:, [0, 1, 2, -3, -2, -1]] = True  # beyond the model's 16 x 16 cells
+        assert found.dtype == np.uint16 and found.shape == (20, 22)
+        np.testing.assert_array_equal(found == 0, empty)
+        assert set(np.unique(found)) <= set(RAW_NAMES)
+    scores = json.loads((maps / "segmentation.json").read_text())
+    assert {name for name, share in scores["shares"].items() if share} == {"car", "building"}
+
+
+def test_what_the_network_is_not_sure_of_is_left_out(segment, trained, images):
+    options = ("--weights", trained.folder, "--data", images, "--seq", "06")
+    _, maps = segment(*options)
+    every = np.stack([pixels(path) for path in sorted(maps.glob("*.png"))])
+    ended, maps = segment(*options, "--min-confidence", 0.12)
+    some = np.stack([pixels(path) for path in sorted(maps.glob("*.png"))])
+    assert 0 < (some > 0).sum() < (every > 0).sum()
+    np.testing.assert_array_equal(some, np.where(some > 0, every, 0))
+    assert f"30 semantic maps of {(some > 0).sum() / (16 * 16 * 30):.0%} of the cells with points" in ended.out
+    assert not (maps / "segmentation.json").exists()
+    assert_one_line_error(segment(*options, "--min-confidence", 80)[0], "--min-confidence", "0 to 1", "80")

@@ -204,6 +204,17 @@ def test_ready_made_images_train_too_and_a_drive_without_revisits_says_so(comman
     ]
 
 
+def test_a_run_starts_with_the_weights_it_is_given(command, trained, images, preset, tmp_path):
+    options = ("--data", images, "--preset", preset, "--seq", "06", "--steps", 1, "--no-references")
+    options = (*options, "--optimizer.learning-rate", "0", "--optimizer.weight-decay", "0")
+    begun = command("train", *options, "--start", trained.folder, "--out", tmp_path / "run")
+    assert begun.status == 0, begun.error
+    assert weights_hash(sglpr_jax.load(tmp_path / "run")) == weights_hash(sglpr_jax.load(trained.folder))
+    assert set(json.loads((tmp_path / "run" / "test" / "results.json").read_text())["raw"]) == {"sglpr"}
+    other = ("--model.head.clusters", 3, "--start", trained.folder, "--out", tmp_path / "other")
+    assert_one_line_error(command("train", *options, *other), "place_head/netvlad", "expected")
+
+
 @pytest.mark.parametrize("missing", ["poses", "positives"])
 def test_what_cannot_be_trained_on_leaves_no_run(command, town, preset, tmp_path, missing):
     root, out = tmp_path / "town", tmp_path / "run"

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
-from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image
+from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels
 from sglpr_jax.data.batch import read_batch, views
-from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.data.density_image import density_bev, density_label_bev
+from sglpr_jax.data.label_maps import label_map_pixels
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
 from sglpr_jax.data.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
@@ -186,11 +188,73 @@ def test_scans_become_density_images_of_all_their_points(drives, pool):
     assert batch.points is None and not batch.labelled.any() and batch.places == 4
     np.testing.assert_array_equal(batch.images, [density_bev(clouds(1)[frame]) for frame in frames[0]])
     assert batch.images.sum() > 0
-    np.testing.assert_allclose(views(batch, jnp.zeros(4), GRID)[0], batch.images[:, 67:83, 67:83], atol=1e-4)
-    with pytest.raises(ValueError, match=r"model.image.*expected scans without labels, found some in 00"):
-        read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, image="density")
+    seen, maps = views(batch, jnp.zeros(4), GRID)
+    assert maps is None
+    np.testing.assert_allclose(seen, even_cells(jnp.asarray(batch.images))[:, 68:84, 68:84], atol=1e-4)
+
+
+def test_the_maps_of_density_images_are_those_of_the_labelled_scans(drives, pool):
+    batch = read_batch(drives, pool, FRAMES, max_points=2, share_negatives=False, image="density")
+    assert batch.images.shape == batch.maps.shape == (8, 151, 151)
+    np.testing.assert_array_equal(batch.labelled, FRAMES.reshape(-1) < len(SIZES))
+    for row in np.flatnonzero(batch.labelled):
+        cloud = clouds(0)[FRAMES.reshape(-1)[row]]
+        expected = density_label_bev(cloud, to_classes(labels_of(cloud).astype(np.int32)))
+        np.testing.assert_array_equal(batch.maps[row], expected)
+    assert batch.maps.any() and not batch.maps[~batch.labelled].any()
     unread = read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
-    assert unread.images.shape == (8, 151, 151)
+    assert unread.maps is None and not unread.labelled.any()
+
+
+def image_drive(folder: Path, *, labelled: range) -> ImageSequence:
+    """Images in memory, and label maps on disk of some: a car wherever the image is above 5."""
+    folder.mkdir()
+    pictures = np.random.default_rng(len(folder.name)).uniform(0, 10, (len(SIZES), 20, 22)).astype(np.float32)
+    label_paths = tuple(folder / f"{i:06d}.png" if i in labelled else None for i in range(len(SIZES)))
+    for path, picture in zip(label_paths, pictures, strict=True):
+        if path is not None:
+            Image.fromarray(label_map_pixels(np.where(picture > 5, 252, 0))).save(path)
+    return ImageSequence(
+        name=folder.name,
+        ids=tuple(f"{i:06d}" for i in range(len(SIZES))),
+        positions=positions(),
+        times=None,
+        pose_source=None,
+        image_paths=tuple(Path(f"{i:06d}.png") for i in range(len(SIZES))),
+        resolution_m=1.0,
+        read_image=lambda path: pictures[int(path.stem)],
+        label_paths=label_paths,
+    )
+
+
+@pytest.mark.parametrize(("categories", "moving_car"), [(20, 1), (25, 25)])
+def test_images_come_with_the_maps_that_there_are(pool, tmp_path, categories, moving_car):
+    drives = [image_drive(tmp_path / "06", labelled=range(3)), image_drive(tmp_path / "07", labelled=range(0))]
+    options = {"max_points": 9, "share_negatives": False}
+    batch = read_batch(drives, pool, FRAMES, **options, categories=categories)
+    np.testing.assert_array_equal(batch.labelled, FRAMES.reshape(-1) < 3)
+    assert batch.labelled.any() and batch.maps.dtype == np.int32
+    expected = np.where(batch.images > 5, moving_car, 0) * batch.labelled[:, None, None]
+    np.testing.assert_array_equal(batch.maps, expected)
+    alone = read_batch(drives, pool, FRAMES, **options, part=slice(1, 2))  # without one labelled frame, as another host
+    assert alone.maps is not None and not alone.labelled.any()
+
+    unread = read_batch(drives, pool, FRAMES, **options, categories=0)
+    assert unread.maps is None and not unread.labelled.any()
+    bare = read_batch(drives[1:] * 2, pool, FRAMES, **options)
+    assert bare.maps is None and not bare.labelled.any()
+
+
+def test_maps_are_turned_and_cropped_with_their_images(pool, tmp_path):
+    drives = [image_drive(tmp_path / name, labelled=range(99)) for name in ("06", "07")]
+    batch = read(drives, pool)
+    angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 8).astype(np.float32)
+    images, maps = jax.jit(views, static_argnames="grid")(batch, jnp.asarray(angles), grid=GRID)
+    assert images.shape == maps.shape == (8, 16, 16)
+    np.testing.assert_allclose(images, rotate_image(jnp.asarray(batch.images), angles)[:, 2:18, 3:19], atol=1e-4)
+    np.testing.assert_array_equal(maps, rotate_labels(jnp.asarray(batch.maps), angles)[:, 2:18, 3:19])
+    same_angle = np.asarray(images)[np.asarray(maps) == 1].mean()
+    assert same_angle > 5.5 > 4.5 > np.asarray(images)[np.asarray(maps) == 0].mean()
 
 
 def test_scans_and_images_do_not_mix(drives, pool):

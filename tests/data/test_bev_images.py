@@ -36,6 +36,20 @@ def test_sparse_images_take_their_own_rows(bev_root):
     np.testing.assert_array_equal(sequence.positions, [[0, 1, 2], [6, 7, 8]])
 
 
+def test_labels_lie_beside_some_of_the_images(bev_root):
+    (bev_root / "06/labels").mkdir()
+    raw = np.arange(35, dtype=np.uint16).reshape(5, 7) // 34 * 252
+    Image.fromarray(raw).save(bev_root / "06/labels/000001.png")
+    sequence = open_sequence(bev_root, "06")
+    assert sequence.has_labels
+    assert sequence.label_paths == (None, bev_root / "06/labels/000001.png", None)
+    assert sequence.labels(0) is None
+    np.testing.assert_array_equal(sequence.labels(1), np.rot90(raw, -1))
+    Image.fromarray(raw[1:]).save(bev_root / "06/labels/000001.png")
+    with pytest.raises(ValueError, match=r"labels/000001\.png: expected 5 rows of 7 pixels, .*, found 4 rows"):
+        sequence.labels(1)
+
+
 def test_too_few_poses_name_the_frame(bev_root):
     path = bev_root / "06/pose.txt"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from sglpr_jax.models.params import CONFIG_FILE, WEIGHTS_FILE, config_from_dict, load, save, weights_hash
+from sglpr_jax.models.params import CONFIG_FILE, WEIGHTS_FILE, config_from_dict, graft, load, save, weights_hash
 from sglpr_jax.models.presets import MODELS, model_preset
 from sglpr_jax.models.sglpr import Params
 
@@ -28,6 +28,18 @@ def test_weights_and_configuration_come_back_bit_by_bit(params, tmp_path):
     assert weights_hash(found) == weights_hash(params)
     assert sorted(path.name for path in folder.parent.iterdir()) == ["weights"]
     assert sorted(path.name for path in folder.iterdir()) == [CONFIG_FILE, WEIGHTS_FILE]
+
+
+def test_weights_without_the_training_parts_are_grafted_onto_fresh_ones(params):
+    kept = {name: values for name, values in params.weights.items() if name != "segmentation_head"}
+    given = Params(kept, dataclasses.replace(params.config, categories=0))
+    fresh = jax.tree.map(np.zeros_like, params)
+    found = graft(given, fresh)
+    assert found.config == params.config
+    chex.assert_trees_all_equal({k: v for k, v in found.weights.items() if k != "segmentation_head"}, kept)
+    chex.assert_trees_all_equal(found.weights["segmentation_head"], fresh.weights["segmentation_head"])
+    with pytest.raises(ValueError, match=r"segmentation_head/kernel has shape .*, expected no such weight"):
+        graft(params, given)
 
 
 def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_what_was_there(params, tmp_path, small_files):

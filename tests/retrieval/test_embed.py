@@ -6,13 +6,15 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
-from sglpr_jax.bev import Grid, rasterize, rasterize_labels, rotate_image, rotate_points
+from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
 from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.data.label_maps import label_map_pixels
 from sglpr_jax.data.sequence import ImageSequence, ScanSequence
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import embed, embed_scans
+from sglpr_jax.retrieval.embed import embed, embed_scans, read_views
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 SCANS = 7
@@ -132,8 +134,8 @@ def test_scans_become_density_images_of_the_turned_points(scans, seed):
         cos, sin = np.cos(np.float64(angle)), np.sin(np.float64(angle))
         x, y, z = cloud.astype(np.float64).T
         turned = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)
-        image = density_bev(cloud if seed is None else turned)
-        np.testing.assert_array_equal(found.descriptors[row], image[43:107, 43:107].reshape(-1))
+        image = even_cells(jnp.asarray(density_bev(cloud if seed is None else turned)))
+        np.testing.assert_array_equal(found.descriptors[row], image[44:108, 44:108].reshape(-1))
         assert image.sum() > 0
 
 
@@ -214,8 +216,21 @@ def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(sc
         np.testing.assert_array_equal(descriptor, np.asarray(expected).reshape(-1))
     with pytest.raises(ValueError, match="scan 000000 of sequence 08: expected labels, found none"):
         embed(maps, scans, GRID, config={}, categories=25)
-    with pytest.raises(ValueError, match="sequence 06: expected scans with labels, found ready-made images"):
+    with pytest.raises(ValueError, match="scan 000000 of sequence 06: expected labels, found none"):
         embed(maps, pictures, GRID, config={}, categories=25)
+
+
+def test_images_come_with_their_maps_turned_by_the_same_angle(pictures, tmp_path):
+    paths = tuple(tmp_path / f"{i}.png" for i in range(SCANS))
+    for path, picture in zip(paths, map(pictures.image, range(SCANS)), strict=True):
+        Image.fromarray(label_map_pixels(np.where(picture > 5, 259, 40))).save(path)
+    labelled = dataclasses.replace(pictures, label_paths=paths)
+    angle, grid = jnp.float32(0.7), Grid(0.4, 16, 16)
+    image, classes = read_views(labelled, 1, grid, categories=25, angle=angle)
+    np.testing.assert_array_equal(image, read_views(pictures, 1, grid, angle=angle)[0])
+    whole = jnp.asarray(np.where(pictures.image(1) > 5, 25, 11).astype(np.int32))
+    np.testing.assert_array_equal(classes, rotate_labels(whole, angle)[2:18, 4:20])
+    assert read_views(labelled, 1, None, categories=25)[1].shape == (20, 24)
 
 
 def test_points_are_described_scan_by_scan(scans):

@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from sglpr_jax.data import ImageSequence, ScanSequence, open_sequence
 from sglpr_jax.data.batch import read_batch
-from sglpr_jax.data.density_image import density_image
+from sglpr_jax.data.density_image import density_image, density_label_map
 from sglpr_jax.data.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
 from sglpr_jax.poses import positions_from_camera
@@ -171,13 +172,25 @@ def test_a_malformed_pose_file_leaves_nothing_behind(tmp_path, pose_file):
 
 def test_images_are_those_of_the_scans(tmp_path, drive):
     root = write(tmp_path / "images", names=("08",), layout="images")
-    assert sorted(content(root)) == [f"08/imgs/{i:06d}.png" for i in range(SCANS)] + ["08/pose.txt", "simulation.json"]
+    pictures = [f"08/{what}/{i:06d}.png" for what in ("imgs", "labels") for i in range(SCANS)]
+    assert sorted(content(root)) == [*pictures, "08/pose.txt", "simulation.json"]
     images = open_sequence(root, "08")
     assert isinstance(images, ImageSequence)
     np.testing.assert_allclose(images.positions, drive.positions, atol=1e-5)
     expected = np.rot90(density_image(drive.points(2)), -1) * np.float32(10 / 255)
     np.testing.assert_array_equal(images.image(2), expected)
     assert expected.max() > 0
+    labels = images.labels(2)
+    shown = np.rot90(density_label_map(drive.points(2), drive.labels(2)), -1)
+    np.testing.assert_array_equal(labels, np.where(expected > 0, shown, 0))
+    assert 0.8 < (labels[expected > 0] > 0).mean() <= 1
+
+
+def test_images_written_before_there_were_label_maps_get_them(tmp_path):
+    root = write(tmp_path / "images", names=("08",), layout="images")
+    whole = content(root)
+    shutil.rmtree(root / "08" / "labels")
+    assert content(write(root, names=("08",), layout="images")) == whole
 
 
 @pytest.mark.parametrize(

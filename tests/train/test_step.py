@@ -57,6 +57,39 @@ def test_without_labels_the_triplet_loss_is_all_in_chunks_too(config, params, ma
     assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
 
 
+@pytest.fixture(scope="module")
+def mapped(make_batch, config):
+    """A batch of images of which every third has no labels."""
+    batch = make_batch(0, images=True)
+    maps = np.random.default_rng(1).integers(0, 20, batch.images.shape).astype(np.int32)
+    return batch.replace(maps=maps, labelled=np.arange(config.images) % 3 != 0)
+
+
+def test_images_with_label_maps_teach_semantics_in_chunks_too(config, params, make_batch, mapped):
+    gradient, metrics = gradients_of(params, mapped, config)
+    assert metrics["cross_entropy"] > 0 and metrics["dice"] > 0
+    np.testing.assert_allclose(
+        metrics["triplet"], gradients_of(params, make_batch(0, images=True), config)[1]["triplet"]
+    )
+    assert np.abs(gradient["segmentation_head"]["kernel"]).max() > 1e-3
+    assert_same(gradients_of(params, mapped, dataclasses.replace(config, chunk=4)), (gradient, metrics))
+    scrambled = np.where(mapped.labelled[:, None, None], mapped.maps, (mapped.maps + 3) % 20)
+    assert (scrambled != mapped.maps).any()
+    chex.assert_trees_all_equal(gradients_of(params, mapped.replace(maps=scrambled), config)[1], metrics)
+
+
+def test_the_gradient_of_the_segmentation_losses_comes_from_labelled_images_alone(config, params, mapped):
+    batch = jax.tree.map(jnp.asarray, mapped)
+    chunk = jax.tree.map(lambda x: x[0], chunks_of(batch, config))
+
+    def segmentation_loss(images):
+        metrics = joint_loss(summarize(params, chunk._replace(images=images), config.loss), batch, config.loss)[1]
+        return metrics["cross_entropy"] + metrics["dice"]
+
+    gradient = jax.jit(jax.grad(segmentation_loss), compiler_options=FAST_COMPILE)(chunk.images)
+    np.testing.assert_array_equal(np.abs(gradient).max((1, 2)) > 0, mapped.labelled)
+
+
 def test_the_metrics_are_those_of_numpy(config, params, make_batch, whole):
     batch = make_batch(0)
     chunks = chunks_of(batch, config)

@@ -1,0 +1,82 @@
+"""Semantics from images: their own label maps, those of a second dataset, and those that a model made."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sglpr_jax.cli import train as train_command
+from sglpr_jax.cli import training_batches
+from sglpr_jax.train.metrics_log import read_metrics
+
+from .conftest import assert_one_line_error
+
+
+@pytest.fixture(autouse=True)
+def _no_final_test(monkeypatch):
+    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+
+
+@pytest.fixture
+def labelled_places(monkeypatch):
+    """For every batch read, which of its places have labels."""
+    seen, read_batch = [], training_batches.read_batch
+
+    def noted(*arguments, **options):
+        batch = read_batch(*arguments, **options)
+        seen.append(batch.labelled)
+        return batch
+
+    monkeypatch.setattr(training_batches, "read_batch", noted)
+    return seen
+
+
+def steps_of(folder) -> list[dict]:
+    return [line for line in read_metrics(folder / "metrics.jsonl") if "loss" in line]
+
+
+def test_images_with_label_maps_are_trained_on_alone(command, labelled_images, preset, tmp_path, labelled_places):
+    out = tmp_path / "run"
+    options = ("--seq", "06", "--data", labelled_images, "--preset", preset, "--out", out)
+    ended = command("train", *options, "--steps", 2)
+    assert ended.status == 0, ended.error
+    assert all(line["cross_entropy"] > 0 and line["dice"] > 0 for line in steps_of(out))
+    assert len(labelled_places) == 2 and np.all(labelled_places)
+
+
+def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
+    command, images, labelled_images, trained, preset, tmp_path, labelled_places
+):
+    pseudo, out = tmp_path / "pseudo", tmp_path / "run"
+    made = command("segment", "--weights", trained.folder, "--data", images, "--seq", "00", "--out", pseudo / "00")
+    assert made.status == 0, made.error
+    for frame in range(0, 30, 2):
+        (pseudo / "00" / f"{frame:06d}.png").unlink()
+    (pseudo / "06").mkdir()
+    (pseudo / "06" / "000000.png").write_text("of the drive that is tested, and never read")
+    mixed = ("--also", labelled_images, "--tuples", 3, "--also-tuples", 1)
+    options = ("--seq", "06", "--data", images, "--pseudo-labels", pseudo, "--preset", preset, "--out", out, *mixed)
+    ended = command("train", *options, "--steps", 2)
+    assert ended.status == 0, ended.error
+    assert f"15 of 30 images have labels, with those of {pseudo}" in ended.error
+    assert all(line["cross_entropy"] > 0 for line in steps_of(out))
+    main, also = np.concatenate(labelled_places[::2]), np.concatenate(labelled_places[1::2])
+    assert main.any() and not main.all() and also.all()
+    assert json.loads((out / "config.json").read_text())["pseudo_labels"] == str(pseudo)
+    assert_one_line_error(command("train", *options[:4], *options[6:], "--resume"), "pseudo_labels")
+
+
+def test_pseudo_labels_that_cannot_be_used_are_refused_before_the_run(command, images, town, preset, tmp_path):
+    options = ("--seq", "06", "--preset", preset, "--out", tmp_path / "run", "--pseudo-labels", tmp_path)
+    assert_one_line_error(command("train", *options, "--data", images), tmp_path, "NN/<id>.png", "(00), found none")
+    off = ("--loss.ce-weight", 0, "--loss.dice-weight", 0)
+    assert_one_line_error(command("train", *options, "--data", images, *off), "--pseudo-labels", "segmentation head")
+    assert_one_line_error(
+        command("train", *options, "--seq", "08", "--data", town), tmp_path, "of which there are none"
+    )
+    (tmp_path / "00").mkdir()
+    for frame in range(30):
+        Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "00" / f"{frame:06d}.png")
+    ended = command("train", *options, "--data", images)
+    assert_one_line_error(ended, f"{tmp_path}/00/0000", "expected 20 rows of 22 pixels", "found 4 rows")
