@@ -114,8 +114,8 @@ def _views(
     maps = None
     if batch.images is not None:
         if batch.maps is not None:
-            maps = crop(rotate_labels(even_cells(batch.maps), angles))
-        return crop(rotate_image(even_cells(batch.images), angles)), maps
+            maps = crop(rotate_labels(even_cells(jnp.asarray(batch.maps)), angles))
+        return crop(rotate_image(even_cells(jnp.asarray(batch.images)), angles)), maps
     points = rotate_points(batch.points, angles)
     if batch.classes is not None:
         maps = rasterize_labels(points, batch.classes, grid=grid, count=batch.count)
