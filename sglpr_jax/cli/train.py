@@ -74,8 +74,8 @@ class TrainCommand:
     resume: bool = False
     """Go on from the run's newest checkpoint."""
     start: str | None = None
-    """Weights to begin with, fresh ones where these have none (the segmentation head, say): the name of shipped weights,
-    a run's folder, or one with config.json and model.safetensors."""
+    """Weights to begin with, fresh ones where these have none (the segmentation head, say): the name of shipped ones, a
+    run's folder, or a folder with config.json and model.safetensors."""
     train_seqs: tuple[str, ...] = ()
     """The drives to train on. Empty: all but the one tested."""
     cache: Path | None = None

@@ -71,8 +71,7 @@ def read_batch(
     With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
     of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
     sorted into classes; with 0 they are not read. `image` "density" makes an image like the ready-made ones of all
-    points of a scan. `part` says which tuples to read; their negatives are still sought
-    among all of the batch.
+    points of a scan. `part` says which tuples to read; their negatives are still sought among all of the batch.
     """
     flat = frames.reshape(-1)
     far = pool.far_apart(frames[:, :1], flat[None, :])
@@ -115,8 +114,8 @@ def _views(
     maps = None
     if batch.images is not None:
         if batch.maps is not None:
-            maps = crop(rotate_labels(even_cells(batch.maps), angles))
-        return crop(rotate_image(even_cells(batch.images), angles)), maps
+            maps = crop(rotate_labels(even_cells(jnp.asarray(batch.maps)), angles))
+        return crop(rotate_image(even_cells(jnp.asarray(batch.images)), angles)), maps
     points = rotate_points(batch.points, angles)
     if batch.classes is not None:
         maps = rasterize_labels(points, batch.classes, grid=grid, count=batch.count)

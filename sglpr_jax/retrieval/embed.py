@@ -148,8 +148,8 @@ def read_views(
     """
     if isinstance(sequence, ImageSequence):
         cells = even_cells if grid is not None else jnp.asarray
-        image = cells(jnp.asarray(sequence.image(row)))
-        views = (image if angle is None else rotate_image(image, angle),)
+        whole = cells(jnp.asarray(sequence.image(row)))
+        views = (whole if angle is None else rotate_image(whole, angle),)
         if categories:
             classes = cells(jnp.asarray(_classes(sequence, row, categories)))
             views += (classes if angle is None else rotate_labels(classes, angle),)
