@@ -23,7 +23,10 @@ _SMALL = ModelConfig(
     head=HeadConfig(tap="tokens", channels=(64, 128, 256), kernels=(3, 3, 3), strides=(1, 1, 2)),
 )
 _RINGS = dataclasses.replace(
-    _SMALL, rings=RingConfig(), head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=())
+    _SMALL,
+    image="density",
+    rings=RingConfig(),
+    head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
 )
 
 MODELS: dict[str, ModelConfig] = {
