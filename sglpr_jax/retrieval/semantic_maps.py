@@ -41,8 +41,8 @@ def semantic_map(
     Cells whose likeliest class is less probable than `min_confidence` are left unlabelled.
     """
     classes = np.zeros(len(points), np.int32) if classes is None else classes
-    views = scan_views(points, params.config.grid, image=params.config.image, classes=classes)
-    return _semantic_map(params, *views, min_confidence)
+    counts, truth = scan_views(points, params.config.grid, image=params.config.image, classes=classes)
+    return _semantic_map(params, counts, truth, min_confidence)
 
 
 def read_semantic_map(params: Params, sequence: Drive, row: int, *, min_confidence: float = 0.0) -> SemanticMap:
@@ -56,8 +56,8 @@ def read_semantic_map(params: Params, sequence: Drive, row: int, *, min_confiden
         return semantic_map(params, sequence.points(row), classes, min_confidence=min_confidence)
     image = sequence.image(row)
     whole = image, np.zeros(image.shape, np.int32) if classes is None else classes
-    views = (centre_crop(even_cells(jnp.asarray(view)), height=grid.height, width=grid.width) for view in whole)
-    return _semantic_map(params, *views, min_confidence)
+    counts, truth = (centre_crop(even_cells(jnp.asarray(x)), height=grid.height, width=grid.width) for x in whole)
+    return _semantic_map(params, counts, truth, min_confidence)
 
 
 def _semantic_map(params: Params, counts: Array, truth: Array, min_confidence: float) -> SemanticMap:
