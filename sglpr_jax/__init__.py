@@ -11,7 +11,7 @@ from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rota
 from sglpr_jax.data import open_sequence, read_scan, sequence_names
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.labels import CATEGORIES, label_map, to_classes
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, RingConfig
 from sglpr_jax.models.params import for_places, load, save
 from sglpr_jax.models.presets import MODELS, model_preset
 from sglpr_jax.models.sglpr import Outputs, Params, describe, forward, init, segment
@@ -31,6 +31,7 @@ __all__ = [
     "ModelConfig",
     "Outputs",
     "Params",
+    "RingConfig",
     "count_outside",
     "density_bev",
     "describe",
