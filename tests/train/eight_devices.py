@@ -75,7 +75,7 @@ def test_eight_devices_make_the_steps_of_one(config, params, make_batch, kind):
 
 
 def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, monkeypatch, tmp_path):
-    monkeypatch.setattr(loop, "new_state", lambda c: new_state(c, params=jax.tree.map(jnp.copy, params)))
+    monkeypatch.setattr(loop, "new_state", lambda c, **_: new_state(c, params=jax.tree.map(jnp.copy, params)))
     monkeypatch.setattr(loop, "train_step", STEP)
     config = dataclasses.replace(config, score_every=100)
 

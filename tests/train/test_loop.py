@@ -38,7 +38,7 @@ def logged(folder: Path) -> list[dict]:
 @pytest.fixture
 def from_params(monkeypatch, params):
     """New runs begin with ready-made weights; compiling the network's `init` takes seconds."""
-    monkeypatch.setattr(loop, "new_state", lambda c: new_state(c, params=jax.tree.map(jnp.copy, params)))
+    monkeypatch.setattr(loop, "new_state", lambda c, **_: new_state(c, params=jax.tree.map(jnp.copy, params)))
 
 
 @pytest.fixture
