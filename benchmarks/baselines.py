@@ -5,15 +5,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import tyro
+from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
-from sglpr_jax.cli.methods import reference
-from sglpr_jax.cli.runtime import console, progress_bar
-from sglpr_jax.data import Drive, open_sequence
-from sglpr_jax.evaluation.baselines import BASELINES
-from sglpr_jax.evaluation.protocols import top1_f1max
+from sglpr_jax.data import Recording, open_recording
+from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.poses import revisits
+from sglpr_jax.retrieval.embed import embed
+from sglpr_jax.revisits import revisits
 
 ROTATION_SEED = 0
 
@@ -28,7 +30,7 @@ class Score(NamedTuple):
     per_pair_s: float
 
 
-def main(data: Path, *, seq: str | None = None, methods: tuple[str, ...] = tuple(BASELINES)) -> None:
+def main(data: Path, *, seq: str | None = None, methods: tuple[str, ...] = tuple(HANDCRAFTED)) -> None:
     """Score baselines by top-1 retrieval: 3 m / 20 m, the last 30 s excluded.
 
     Args:
@@ -36,27 +38,25 @@ def main(data: Path, *, seq: str | None = None, methods: tuple[str, ...] = tuple
         seq: which sequence; may be left out where there is only one.
         methods: which baselines, by their names in bin/embed.
     """
-    sequence = open_sequence(data, seq)
+    sequence = open_recording(data, seq)
     scores = {}
-    with progress_bar("baselines", 2 * len(methods)) as show:
-        for name in methods:
-            raw, rotated = (score(name, sequence, seed) for seed in (None, ROTATION_SEED))
-            scores[name] = raw, rotated
-            show(2 * len(scores))
-    console().print(table(scores, title=f"{data.name} {sequence.name}, {describe(sequence)}"))
+    for name in track(methods, "baselines", console=Console(stderr=True)):
+        raw, rotated = (score(name, sequence, seed) for seed in (None, ROTATION_SEED))
+        scores[name] = raw, rotated
+    Console(width=140, highlight=False).print(table(scores, title=f"{data.name} {sequence.name}, {describe(sequence)}"))
 
 
-def describe(sequence: Drive) -> str:
+def describe(sequence: Recording) -> str:
     """How much the scores rest on."""
     if sequence.positions is None or not (found := revisits(sequence.positions, times=sequence.times)).any():
         raise SystemExit(f"expected positions with revisits to score against, found none in sequence {sequence.name}")
     return f"{len(sequence)} scans, {found.sum()} revisits"
 
 
-def score(name: str, sequence: Drive, seed: int | None) -> Score:
+def score(name: str, sequence: Recording, seed: int | None) -> Score:
     """Describe the sequence, and score; comparing the queries with the rest is what a pair takes."""
     start = time.perf_counter()
-    file = reference(name, sequence, model_preset("small").grid).embed(sequence, rotation_seed=seed)
+    file = embed(handcrafted(name, sequence, model_preset("small").grid), sequence, rotation_seed=seed)
     described = time.perf_counter()
     result = top1_f1max(file)
     compared = time.perf_counter()
@@ -72,7 +72,7 @@ def table(scores: dict[str, tuple[Score, Score]], *, title: str) -> Table:
     for name, (raw, rotated) in scores.items():
         reached = (raw.f1_max, rotated.f1_max, raw.recall_at_1, rotated.recall_at_1)
         took = (f"{1e3 * raw.per_scan_s:.0f}", f"{1e6 * raw.per_pair_s:.1f}")
-        about = (BASELINES[name].input, str(raw.numbers), BASELINES[name].distance)
+        about = (HANDCRAFTED[name].takes, str(raw.numbers), HANDCRAFTED[name].distance_name)
         rows.add_row(name, *about, *(f"{value:.3f}" for value in reached), *took)
     return rows
 

@@ -9,7 +9,9 @@ from inputs import comparable_model, random_params, random_scans
 from ratio import Contender, Job, alternate, check_equal, report, require_torch, warn_if_busy
 
 from sglpr_jax.bev import rasterize
-from sglpr_jax.models.sglpr import Params, describe, prepare
+from sglpr_jax.models.input_image import prepare
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import describe
 
 
 def main(

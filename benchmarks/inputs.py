@@ -6,11 +6,13 @@ import jax
 import numpy as np
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.data.batch import Batch
+from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params, init
-from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.models.sglpr import init
+from sglpr_jax.training.config import TrainConfig
 
 CLOUD_SPREAD = 0.29
 """Standard deviation of x and y as a part of the window's width: 84 % of the points fall inside."""
@@ -23,12 +25,16 @@ def comparable_model(preset: str) -> ModelConfig:
     """The preset's model, less what is not the same arithmetic in both frameworks.
 
     A polar model is left without its resampling and circular borders: the image comes in the size of the polar one.
-    Nothing is out of view, for the labels of such cells are dropped. Stochastic depth, which is random, is off.
+    Nothing is out of view, for the labels of such cells are dropped. Stochastic depth, which is random, is off. Raises
+    ValueError for a backbone that is no Swin-Unet.
     """
     config = model_preset(preset)
     height, width = config.image_size
     grid = Grid(config.grid.resolution_m, height, width)
-    return dataclasses.replace(config, grid=grid, field="square", blind_m=0.0, polar=None, drop_path=0.0)
+    if not isinstance(config.backbone, SwinConfig):
+        raise ValueError(f"preset {preset}: expected the backbone 'swin', found {config.backbone.kind!r}")
+    backbone = dataclasses.replace(config.backbone, drop_path=0.0)
+    return dataclasses.replace(config, grid=grid, field="square", blind_m=0.0, polar=None, backbone=backbone)
 
 
 def random_params(config: ModelConfig) -> Params:

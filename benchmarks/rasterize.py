@@ -1,4 +1,4 @@
-"""Rasterising one scan, ours against numpy's bincount, and its label map against numpy's assignment."""
+"""Rasterising one scan, ours against numpy's bincount, and its label image against numpy's assignment."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""Reading the batches of a training from a packed drive, against reading them from its files."""
+"""Reading the batches of a training from a packed recording, against reading them from its files."""
 
 import os
 import time
@@ -10,13 +10,13 @@ import numpy as np
 import tyro
 from ratio import report
 
-from sglpr_jax.cli.datasets import pack_drives
-from sglpr_jax.cli.presets import load_preset
-from sglpr_jax.cli.training_batches import batches, tuple_pool
-from sglpr_jax.data import Drive, ImageSequence, open_sequence, sequence_names
-from sglpr_jax.data.batch import Batch
+from sglpr_jax.data import Recording, open_recording, recording_names
+from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.training.batches import TupleBatches, tuple_pool
+from sglpr_jax.training.presets import load_preset
 
-Open = Callable[[], Sequence[Drive]]
+Open = Callable[[], Sequence[Recording]]
 
 
 def main(
@@ -34,22 +34,22 @@ def main(
     Args:
         data: the dataset.
         cache: the folder of the packs, which are made first where they are missing.
-        seqs: the drives; none: all.
+        seqs: the recordings; none: all.
         preset: says how many places a batch has, and how large clouds may be.
         count: batches read in one timing, others at every repeat.
         repeats: how often both are timed against each other.
         cold: have the system forget all these files before each timing, so that the disk is read.
     """
     config = load_preset(preset)
-    files = [open_sequence(data, name) for name in seqs or sequence_names(data)]
+    files = [open_recording(data, name) for name in seqs or recording_names(data)]
     pool = tuple_pool(files, config)
     make_packs(files, cache)
-    sources: tuple[Open, ...] = (lambda: pack_drives(files, cache), lambda: files)
+    sources: tuple[Open, ...] = (lambda: [packed(each, cache) for each in files], lambda: files)
 
     def read(source: Open, steps: Iterable[int]) -> tuple[list[Batch], float]:
         if cold:
             forget([*paths_of(files), *cache.rglob("*.bin")])
-        make_batch = batches(source(), pool, config)
+        make_batch = TupleBatches(source(), pool, config).batch
         start = time.perf_counter()
         made = [make_batch(step) for step in steps]
         return made, time.perf_counter() - start
@@ -64,12 +64,13 @@ def main(
     report(title, rows, other="files", ours="pack", packages=("numpy",), threads=1)
 
 
-def make_packs(drives: Sequence[Drive], cache: Path) -> None:
+def make_packs(recordings: Sequence[Recording], cache: Path) -> None:
     """Pack what is not packed yet, and print how long it took and how large all is."""
     start = time.perf_counter()
-    pack_drives(drives, cache)
+    for recording in recordings:
+        packed(recording, cache)
     seconds = time.perf_counter() - start
-    scans, read = sum(map(len, drives)), sum(path.stat().st_size for path in paths_of(drives))
+    scans, read = sum(map(len, recordings)), sum(path.stat().st_size for path in paths_of(recordings))
     written = sum(path.stat().st_size for path in cache.rglob("*.bin"))
     print(f"{scans} scans of {read / 1e6:.0f} MB packed or found packed in {seconds:.1f} s; {written / 1e6:.0f} MB")
 
@@ -81,13 +82,9 @@ def check_same(ours: list[Batch], theirs: list[Batch]) -> None:
         raise SystemExit("the batches of packs and files differ, so there is nothing to time")
 
 
-def paths_of(drives: Sequence[Drive]) -> list[Path]:
-    """The files of some drives."""
-    listed = (
-        drive.image_paths if isinstance(drive, ImageSequence) else (*drive.scan_paths, *drive.label_paths)
-        for drive in drives
-    )
-    return [path for paths in listed for path in paths if path is not None]
+def paths_of(recordings: Sequence[Recording]) -> list[Path]:
+    """The files of some recordings."""
+    return [path for each in recordings for path in (*each.paths, *each.label_paths) if path is not None]
 
 
 def forget(paths: Iterable[Path]) -> None:

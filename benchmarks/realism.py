@@ -10,9 +10,9 @@ import tyro
 from range_images import range_image_paths, read_range_image
 from scan_statistics import HISTOGRAMS, NUMBERS, Measures, image_measures, scan_measures, total_variation
 
-from sglpr_jax.data import Drive, ImageSequence, open_sequence, sequence_names
-from sglpr_jax.data.bev_images import MAX_COUNT
+from sglpr_jax.data import Recording, open_recording, recording_names
 from sglpr_jax.data.density_image import density_image
+from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.evaluation.figures import save
 from sglpr_jax.labels import to_classes
 
@@ -70,24 +70,24 @@ def main(
 
 def measure_dataset(kind: str, root: Path, scans: int) -> Iterator[Source]:
     """Yield one source for each drive of a dataset."""
-    for name in sequence_names(root):
-        drive = open_sequence(root, name)
+    for name in recording_names(root):
+        drive = open_recording(root, name)
         chosen = np.unique(np.linspace(0, len(drive) - 1, min(scans, len(drive))).astype(int))
-        what = "images" if isinstance(drive, ImageSequence) else "scans"
+        what = "images" if drive.has_images else "scans"
         measures = [_measures(drive, i) for i in chosen]
         yield Source(f"{kind} {what} {name}", measures, _image(drive, chosen[len(chosen) // 2]))
 
 
-def _measures(drive: Drive, i: int) -> Measures:
-    if isinstance(drive, ImageSequence):
+def _measures(drive: Recording, i: int) -> Measures:
+    if drive.has_images:
         return image_measures(_image(drive, i))
     labels = drive.labels(i)
     return scan_measures(drive.points(i), None if labels is None else to_classes(labels))
 
 
-def _image(drive: Drive, i: int) -> np.ndarray:
+def _image(drive: Recording, i: int) -> np.ndarray:
     """The density image of one scan, in the orientation of eq. 1."""
-    if isinstance(drive, ImageSequence):
+    if drive.has_images:
         return np.rint(drive.image(i) * (255 / MAX_COUNT)).astype(np.uint8)
     return np.rot90(density_image(drive.points(i)), -1)
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sglpr_jax.bev import rasterize, rasterize_labels
-from sglpr_jax.data.bev_images import RESOLUTION_M
-from sglpr_jax.data.density_image import density_image, density_label_map
+from sglpr_jax.data.density_image import density_image, density_label_image
+from sglpr_jax.data.readers.bev_images import RESOLUTION_M
 from sglpr_jax.labels import CATEGORIES
 from sglpr_jax.models.presets import model_preset
 
@@ -69,7 +69,7 @@ def scan_measures(points: np.ndarray, classes: np.ndarray | None) -> Measures:
     return measures | {
         "class_of_points": _share_of_classes(classes),
         "class_of_cells": _share_of_classes(cells[counts > 0]),
-        "class_of_pixels": _share_of_classes(density_label_map(points, classes)),
+        "class_of_pixels": _share_of_classes(density_label_image(points, classes)),
     }
 
 

@@ -13,15 +13,17 @@ from range_images import range_image_paths, read_range_image
 from rich.console import Console
 from rich.table import Table
 
-from sglpr_jax.cli.methods import network, reference
-from sglpr_jax.cli.runtime import run
-from sglpr_jax.data import ScanSequence, open_sequence, sequence_names
+from sglpr_jax.data import Record, open_recording, recording_names
 from sglpr_jax.evaluation.figures import save, segmentation_panel
-from sglpr_jax.evaluation.report import evaluate, to_json
+from sglpr_jax.evaluation.report import to_json
+from sglpr_jax.evaluation.scoring import score
 from sglpr_jax.evaluation.segmentation import SegmentationResult, confusion_matrix, score_confusion
-from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_classes
-from sglpr_jax.models.params import load
-from sglpr_jax.models.sglpr import Params, init
+from sglpr_jax.labels import CATEGORIES, UNLABELLED, to_raw
+from sglpr_jax.methods.registry import handcrafted, network
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.weights_file import load
+from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.retrieval.semantic_maps import SemanticMap, semantic_map
 
 ROTATION_SEED = 0
@@ -41,7 +43,7 @@ class Semantics:
     range_images: Path | None = None
     """A folder of labelled range images."""
     prior_scans: int = 30
-    """Scans of each simulated drive that make the prior."""
+    """Scans of each simulated recording that make the prior."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,8 +65,8 @@ def semantics(command: Semantics) -> None:
     prior = _commonest_by_cell(params, command.prior, command.prior_scans)
     classes = params.config.classes
     trained, by_cell = {}, {}
-    for source, points, labels in _labelled_scans(command):
-        found = semantic_map(params, points, labels)
+    for source, scan in _labelled_scans(command):
+        found = semantic_map(params, scan)
         if source not in trained:
             trained[source], by_cell[source] = np.zeros((2, classes, classes), np.int64)
             panel = segmentation_panel(
@@ -83,18 +85,17 @@ def semantics(command: Semantics) -> None:
     (command.out / "semantics.json").write_text(json.dumps(report, indent=2) + "\n")
 
 
-def _labelled_scans(command: Semantics) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Source, points and classes of every scan that has labels."""
+def _labelled_scans(command: Semantics) -> Iterator[tuple[str, Record]]:
+    """Source and record of every scan that has labels."""
     for root in command.scans:
-        for name in sequence_names(root):
-            sequence = open_sequence(root, name)
-            for row in range(len(sequence) if isinstance(sequence, ScanSequence) else 0):
-                labels = sequence.labels(row)
-                if labels is not None:
-                    yield f"scans of {name}", sequence.points(row), to_classes(labels)
+        for name in recording_names(root):
+            recording = open_recording(root, name)
+            for row, labelled in enumerate(recording.labelled):
+                if labelled and not recording.has_images:
+                    yield f"scans of {name}", recording.record(row)
     for path in range_image_paths(command.range_images) if command.range_images else ():
         points, classes = read_range_image(path)
-        yield f"range images of {path.stem[:2]}", points, classes
+        yield f"range images of {path.stem[:2]}", Record(points=points, labels=to_raw(classes))
 
 
 def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:
@@ -102,10 +103,10 @@ def _commonest_by_cell(params: Params, root: Path, scans: int) -> np.ndarray:
     grid = params.config.grid
     votes = np.zeros((grid.height, grid.width, params.config.classes), np.int64)
     rows, columns = np.indices(votes.shape[:2])
-    for name in sequence_names(root):
-        sequence = open_sequence(root, name)
-        for row in np.linspace(0, len(sequence) - 1, scans).astype(int):
-            found: SemanticMap = semantic_map(params, sequence.points(row), to_classes(sequence.labels(row)))
+    for name in recording_names(root):
+        recording = open_recording(root, name)
+        for row in np.linspace(0, len(recording) - 1, scans).astype(int):
+            found: SemanticMap = semantic_map(params, recording.record(row))
             votes[rows, columns, found.truth] += 1
     votes[..., UNLABELLED] = 0
     votes[..., CATEGORIES.index("road")] += 1
@@ -139,15 +140,15 @@ def places(command: Places) -> None:
     report: dict = {}
     table = Table("sequence", "method", "turned", "top-1 F1max", "pairs F1max", "Recall@1")
     for seq in command.seqs:
-        sequence = open_sequence(command.images, seq)
+        sequence = open_recording(command.images, seq)
         methods = {
             "trained in the simulator": network(params),
             "untrained": network(init(jax.random.key(1), config=params.config)),
-            "polar-fft": reference("polar-fft", sequence, params.config.grid),
+            "polar-fft": handcrafted("polar-fft", sequence, params.config.grid),
         }
         for name, method in methods.items():
             for turned, seed in (("no", None), ("yes", ROTATION_SEED)):
-                results = evaluate(method.embed(sequence, rotation_seed=seed))
+                results = score(embed(method, sequence, rotation_seed=seed))
                 report[f"{seq}, {name}, turned: {turned}"] = to_json(results)
                 table.add_row(seq, name, turned, *(f"{result.score:.3f}" for result in results))
         table.add_section()
@@ -161,7 +162,7 @@ Command = Annotated[Semantics, tyro.conf.subcommand("semantics")] | Annotated[Pl
 def main() -> None:
     """The entry point."""
     command = tyro.cli(Command, prog="sim_to_real.py", description=__doc__)
-    run(lambda: semantics(command) if isinstance(command, Semantics) else places(command))
+    semantics(command) if isinstance(command, Semantics) else places(command)
 
 
 if __name__ == "__main__":

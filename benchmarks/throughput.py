@@ -18,14 +18,15 @@ import tyro
 from flops import count_flops
 from inputs import random_batch
 from ratio import SPREAD
+from rich.console import Console
 from rich.table import Table
 
-from sglpr_jax.cli.presets import load_preset
-from sglpr_jax.cli.runtime import console, write_json
-from sglpr_jax.data.batch import Batch
-from sglpr_jax.train.config import TrainConfig
-from sglpr_jax.train.state import new_state
-from sglpr_jax.train.step import train_step
+from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.files import write_json
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.presets import load_preset
+from sglpr_jax.training.state import new_state
+from sglpr_jax.training.step import train_step
 
 Job = Callable[[], Any]
 
@@ -72,7 +73,7 @@ def main(
             rates = measure(config, batch, flops, repeats=repeats, steps=steps, size=size, products=products)
             rows.append({"preset": Path(name).stem, "compute": type_, **summary(config, flops, *rates)})
     report = {"rows": rows, "labels": labels, **about()}
-    console().print(table(rows, title=f"training step on {report['device']}"))
+    Console(width=140, highlight=False).print(table(rows, title=f"training step on {report['device']}"))
     print("Share: of the peak, medians of what was measured in turn. Spread: its 10 % and 90 % quantiles.")
     print("\n".join(f"{name}: {report[name]}" for name in ("command", "versions", "machine")))
     if out is not None:

@@ -13,11 +13,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sglpr_jax.losses import DICE_EPSILON
-from sglpr_jax.models.attention import BLOCKED, relative_position_index, shift_mask
+from sglpr_jax.models.backbones.attention import BLOCKED, relative_position_index, shift_mask
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.swin_layers import MLP_RATIO
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.sglpr import Params
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.torch_import import torch_name
-from sglpr_jax.train.config import LossConfig, TrainConfig
+from sglpr_jax.training.config import LossConfig, TrainConfig
 
 
 class WindowAttention(nn.Module):
@@ -57,7 +59,7 @@ class Mlp(nn.Module):
 class Block(nn.Module):
     """A Swin block on maps of `size`."""
 
-    def __init__(self, size: tuple[int, int], channels: int, heads: int, *, shifted: bool, config: ModelConfig):
+    def __init__(self, size: tuple[int, int], channels: int, heads: int, *, shifted: bool, config: SwinConfig):
         super().__init__()
         self.window = min(config.window, *size)
         self.shift = self.window // 2 if shifted and min(size) > self.window else 0
@@ -65,7 +67,7 @@ class Block(nn.Module):
         mask = None if blocked is None else torch.where(blocked, BLOCKED, 0.0)
         self.norm1, self.norm2 = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.attn = WindowAttention(channels, heads, self.window, mask)
-        self.mlp = Mlp(channels, config.mlp_ratio * channels, F.gelu)
+        self.mlp = Mlp(channels, MLP_RATIO * channels, F.gelu)
 
     def forward(self, x: Tensor) -> Tensor:
         x = x + self._attend(self.norm1(x))
@@ -125,9 +127,9 @@ class PatchExpand(nn.Module):
 class Stage(nn.Module):
     """The blocks of one level of the U."""
 
-    def __init__(self, level: int, config: ModelConfig):
+    def __init__(self, level: int, config: SwinConfig, image_size: tuple[int, int]):
         super().__init__()
-        height, width = (size // (config.patch * 2**level) for size in config.image_size)
+        height, width = (size // (config.patch * 2**level) for size in image_size)
         channels, heads = config.embed_dim * 2**level, config.heads[level]
         self.blocks = nn.Sequential(
             *(
@@ -211,11 +213,12 @@ class SGLPR(nn.Module):
 
     def __init__(self, config: ModelConfig):
         super().__init__()
-        if config.polar:
-            raise ValueError("the PyTorch model has no polar resampling")
-        self.tap, levels, channels = config.head.tap, len(config.depths), config.embed_dim
-        self.patch_embed = PatchEmbed(config.channels, channels, config.patch)
-        self.layers = nn.ModuleList(Stage(level, config) for level in range(levels))
+        swin = config.backbone
+        if config.polar or not isinstance(swin, SwinConfig):
+            raise ValueError("the PyTorch model is a Swin-Unet without polar resampling")
+        self.tap, levels, channels = config.head.tap, len(swin.depths), swin.embed_dim
+        self.patch_embed = PatchEmbed(config.channels, channels, swin.patch)
+        self.layers = nn.ModuleList(Stage(level, swin, config.image_size) for level in range(levels))
         self.layers_up = nn.ModuleList([PatchExpand(channels * 2 ** (levels - 1), 2, channels * 2 ** (levels - 2))])
         self.concat_back_dim = nn.ModuleList([nn.Identity()])
         for level in range(levels - 1):
@@ -223,11 +226,11 @@ class SGLPR(nn.Module):
         for level in reversed(range(levels - 1)):
             width = channels * 2**level
             self.concat_back_dim.append(nn.Linear(2 * width, width))
-            self.layers_up.append(Stage(level, config))
+            self.layers_up.append(Stage(level, swin, config.image_size))
             if level > 0:
                 self.layers_up[-1].upsample = PatchExpand(width, 2, width // 2)
         self.norm, self.norm_up = nn.LayerNorm(channels * 2 ** (levels - 1)), nn.LayerNorm(channels)
-        self.up = PatchExpand(channels, config.patch, channels)
+        self.up = PatchExpand(channels, swin.patch, channels)
         self.detail = Detail(config.channels, config.detail, config.detail) if config.detail else None
         self.narrow = nn.Linear(channels, config.detail) if config.detail else None
         self.output = nn.Linear(config.detail or channels, config.classes, bias=False)

@@ -9,11 +9,12 @@ import tyro
 from inputs import comparable_model, random_batch, random_params
 from ratio import Contender, Job, alternate, check_equal, report, require_torch, warn_if_busy
 
-from sglpr_jax.data.batch import Batch, views
-from sglpr_jax.models.sglpr import Params, prepare
-from sglpr_jax.train.config import LossConfig, TrainConfig
-from sglpr_jax.train.state import new_state
-from sglpr_jax.train.step import train_step
+from sglpr_jax.data.sampling.batch import Batch, views
+from sglpr_jax.models.input_image import prepare
+from sglpr_jax.models.params import Params
+from sglpr_jax.training.config import LossConfig, TrainConfig
+from sglpr_jax.training.state import new_state
+from sglpr_jax.training.step import train_step
 
 PAPER_LOSS = LossConfig(margin=0.5, squared=True, reduction="max", temperature=0.0)
 CHECKED_STEPS = 2

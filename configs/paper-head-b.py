@@ -1,13 +1,15 @@
-"""The paper's model with its place head three times cheaper (candidate B: 4x4/4, 3x3/2, 3x3/2 convolutions).
+"""The preset `paper` with a place head of a third of the cost: a 4 x 4 convolution of stride 4, then two of 3 x 3.
 
-Everything else is configs/paper.py. Expect numbers near the paper's table 1 on KITTI; not yet run at full length here.
+Reproduces table 1, of whose place head the paper gives no sizes (candidate B of docs/decisions/paper.md).
+
+Expect: as for `paper`, not measured here; it wants a GPU.
 
 Command: bin/train --seq 08 --data KITTI --preset paper-head-b
 """
 
 import dataclasses
 
-from sglpr_jax.cli.presets import load_preset
 from sglpr_jax.models.presets import model_preset
+from sglpr_jax.training.presets import load_preset
 
 CONFIG = dataclasses.replace(load_preset("paper"), model=model_preset("paper-head-b"))

@@ -1,15 +1,18 @@
-"""Convolutions that turn with the scan, in place of the Swin-Unet: more accurate than `small` after less computation.
+"""Convolutions around the polar image in place of the Swin-Unet: more accurate than `small` after less computation.
 
-Reproduces nothing of the paper; it answers its first open question, a descriptor that does not move when the scan is
-turned (docs/decisions.md has the reasons, docs/results.md the measurements).
+Reproduces nothing of the paper; it answers the first open question of its conclusion, a descriptor that does not move
+when the scan is rotated. docs/decisions/models.md has the reasons, docs/results.md the measurements.
 
-Expect: on the KITTI BEV images, leave-one-out, see docs/results.md.
+Expect: on the KITTI BEV images, trained on 00 and 02 for 320 steps (docs/results.md has the flags) and tested on 06:
+top-1 F1max .921, Recall@1 .952; rotated .919 and .981. That took five minutes on one CPU core; at this rate the 1500
+steps of the preset take less than half an hour.
+
 Command: bin/train --seq 06 --data KITTI_BEV --preset rings
 """
 
-from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.data.sampling.tuples import TupleConfig
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.train.config import LossConfig, OptimizerConfig, TrainConfig
+from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(
     model=model_preset("rings"),

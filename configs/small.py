@@ -1,15 +1,17 @@
-"""The small model, for two CPU cores: place recognition within the hour.
+"""The paper's network made small, for two CPU cores: place recognition within the hour.
 
-Reproduces nothing of the paper; it is the paper's network made small, with the image in polar form and other places of
-the batch as further negatives (docs/decisions.md has the reasons, docs/results.md the measurements).
+Reproduces nothing of the paper. The image is polar, and other places of the batch are further negatives;
+docs/decisions/models.md has the reasons, docs/results.md the measurements.
 
-Expect: on the KITTI BEV images, trained on 00 and 02 and tested on 06, see docs/results.md.
+Expect: on the KITTI BEV images, trained on 00 and 02 and tested on 06: top-1 F1max .90, Recall@1 .99; rotated .94 and
+.99. The 3000 steps took 40 minutes on two CPU cores. The preset has changed a little since that run (docs/results.md).
+
 Command: bin/train --seq 06 --data KITTI_BEV --preset small
 """
 
-from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.data.sampling.tuples import TupleConfig
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.train.config import LossConfig, OptimizerConfig, TrainConfig
+from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(
     model=model_preset("small"),

@@ -1,57 +1,112 @@
-"""LiDAR place recognition in JAX: the public API.
+"""LiDAR place recognition in JAX: the public API, by what one wants to do.
 
     params = sglpr_jax.load("simulated")                # weights by name, or by folder
     bev = sglpr_jax.scan_image(points, params.config)   # scan (n, 3), metres -> image (h, w)
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 
-Everything below is a pure function or a frozen value; the rest of the package is for training and evaluation.
+- describe a place: `load`, `scan_image`, `describe`; `segment`, `forward`; under jit, vmap and grad
+- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
+- find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
+- train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`
+- recordings without a dataset: `simulate`
+- images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
+- what a model is: `ModelConfig`, its backbones `SwinConfig`, `RingConfig`, `SglprConfig`, its `HeadConfig`
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
-from sglpr_jax.data import open_sequence, read_scan, sequence_names
+from sglpr_jax.data import Record, Recording, open_recording, read_scan, recording_names
 from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.labels import CATEGORIES, label_map, to_classes
-from sglpr_jax.models.config import HeadConfig, ModelConfig, RingConfig
-from sglpr_jax.models.params import for_places, load, save
+from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes
+from sglpr_jax.models.backbones.rings import RingConfig
+from sglpr_jax.models.backbones.sglpr import SglprConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import MODELS, model_preset
-from sglpr_jax.models.sglpr import Outputs, Params, describe, forward, init, segment
+from sglpr_jax.models.sglpr import Outputs, describe, forward, init, segment
 from sglpr_jax.models.shipped import shipped_weights
+from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.retrieval.scan_views import scan_image
+from sglpr_jax.retrieval.embed import embed, scan_image
+from sglpr_jax.retrieval.nearest import Nearest, nearest
+
+if TYPE_CHECKING:
+    from sglpr_jax.evaluation.scoring import Evaluation, evaluate
+    from sglpr_jax.sim.simulation import simulate
+    from sglpr_jax.training.presets import load_preset as preset
+    from sglpr_jax.training.recipe import TrainResult, train
 
 __version__ = "0.1.0"
+
+_LATER = {
+    "Evaluation": ("evaluation.scoring", "Evaluation"),
+    "evaluate": ("evaluation.scoring", "evaluate"),
+    "simulate": ("sim.simulation", "simulate"),
+    "preset": ("training.presets", "load_preset"),
+    "TrainResult": ("training.recipe", "TrainResult"),
+    "train": ("training.recipe", "train"),
+}
+"""Imported when they are first asked for: training, scoring and simulating bring as much along as all the rest."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, attribute = _LATER[name]
+    globals()[name] = getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
 
 __all__ = [
     "CATEGORIES",
     "MODELS",
     "DescriptorFile",
+    "Evaluation",
     "Grid",
     "HeadConfig",
     "ModelConfig",
+    "Nearest",
     "Outputs",
     "Params",
+    "Record",
+    "Recording",
     "RingConfig",
+    "SglprConfig",
+    "SwinConfig",
+    "TrainResult",
     "count_outside",
     "density_bev",
     "describe",
     "embed",
+    "evaluate",
     "for_places",
     "forward",
     "init",
-    "label_map",
     "load",
     "model_preset",
-    "open_sequence",
+    "nearest",
+    "open_recording",
+    "preset",
     "rasterize",
     "rasterize_labels",
     "read_scan",
+    "recording_names",
     "rotate_image",
     "rotate_points",
     "save",
     "scan_image",
     "segment",
-    "sequence_names",
     "shipped_weights",
+    "simulate",
+    "taxonomy",
     "to_classes",
+    "train",
 ]

@@ -102,7 +102,7 @@ def count_outside(
 
 @jax.jit
 def rotate_points(points: Float[Array, "*b n 3"], angle: Float[Array, "*b"]) -> Float[Array, "*b n 3"]:
-    """Turn clouds about the z axis by `angle` radians, counter-clockwise seen from above."""
+    """Rotate clouds about the z axis by `angle` radians, counter-clockwise seen from above."""
     x, y, z = jnp.moveaxis(points, -1, 0)
     cos, sin = jnp.cos(angle)[..., None], jnp.sin(angle)[..., None]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
@@ -110,30 +110,30 @@ def rotate_points(points: Float[Array, "*b n 3"], angle: Float[Array, "*b"]) -> 
 
 @jax.jit
 def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Float[Array, "*b h w"]:
-    """Turn images about their centre as `rotate_points` turns the points: bilinear, zero from beyond the border."""
-    return _turned(image, angle, order=1)
+    """Rotate images about their centre as `rotate_points` rotates the points: bilinear, zero from beyond the border."""
+    return _rotated(image, angle, order=1)
 
 
 @jax.jit
 def rotate_labels(labels: Int[Array, "*b h w"], angle: Float[Array, "*b"]) -> Int[Array, "*b h w"]:
-    """Turn maps of labels as `rotate_image` turns their images: each cell takes the label nearest to where it was."""
-    return _turned(labels, angle, order=0)
+    """Rotate maps of classes as `rotate_image` rotates their images: each cell takes the class nearest to it."""
+    return _rotated(labels, angle, order=0)
 
 
-def _turned(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order: int) -> Shaped[Array, "*b h w"]:
-    """Images turned about their centre; `order` 0 takes the nearest cell, 1 interpolates."""
+def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order: int) -> Shaped[Array, "*b h w"]:
+    """Images rotated about their centre; `order` 0 takes the nearest cell, 1 interpolates."""
     *batch, height, width = image.shape
     down, right = np.mgrid[:height, :width].astype(np.float32)
     down, right = down - (height - 1) / 2, right - (width - 1) / 2
 
-    def turn(image, angle):
+    def rotate(image, angle):
         cos, sin = jnp.cos(angle), jnp.sin(angle)
         source_down, source_right = cos * down + sin * right, cos * right - sin * down
         source = [source_down + (height - 1) / 2, source_right + (width - 1) / 2]
         return map_coordinates(image, source, order=order, mode="constant", cval=0)
 
-    turned = jax.vmap(turn)(image.reshape(-1, height, width), jnp.reshape(angle, -1))
-    return turned.reshape(*batch, height, width)
+    rotated = jax.vmap(rotate)(image.reshape(-1, height, width), jnp.reshape(angle, -1))
+    return rotated.reshape(*batch, height, width)
 
 
 @jax.jit

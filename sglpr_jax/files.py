@@ -1,16 +1,97 @@
-"""Errors of writing that name their file."""
+"""Files and folders written whole or not at all, and errors of writing that name their file."""
 
 import contextlib
+import json
+import os
+import shutil
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+
+class WriteError(OSError):
+    """A file cannot be written; the message names it."""
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Name `path` in an OSError of the block that names no file: a full disk's own says only that it is full."""
+def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
+    """Write `path`, a file or a folder, whole or not at all.
+
+    The block writes to the path that it is given, a hidden one beside `path`. At the end of the block this takes the
+    place of `path`; after an error it is removed, and what was at `path` stays. Folders missing above `path` are made.
+    With `keep` a folder that somebody else has put at `path` meanwhile stays too. Raises WriteError where `path` cannot
+    be written.
+
+    Example:
+      with replacing(path) as temporary:
+          temporary.write_bytes(content)
+    """
+    temporary = _hidden(path)
+    try:
+        with writing(path, temporary, *path.parents):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            _put(temporary, path, keep=keep)
+    finally:
+        _remove(temporary)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all. Raises WriteError where it cannot be written."""
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file whole or not at all. Raises WriteError where it cannot be written."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+@contextlib.contextmanager
+def writing(path: Path, *others: Path) -> Iterator[None]:
+    """Raise WriteError for an OSError of the block that names no file, as that of a full disk, or one of `others`."""
     try:
         yield
+    except WriteError:
+        raise
     except OSError as error:
-        if error.filename is not None:
+        if error.filename is not None and Path(str(error.filename)) not in others:
             raise
-        raise OSError(f"{path}: expected to write it, found: {error.strerror or error}") from error
+        raise WriteError(f"{path}: expected to write it, found: {error.strerror or error}") from error
+
+
+def half_written(folder: Path, name: str = "*") -> list[Path]:
+    """What processes that were killed inside `replacing` left, of files called `name`, in `folder` and below."""
+    return list(folder.rglob(f".{name}.*.tmp"))
+
+
+def remove_half_written(folder: Path) -> None:
+    """Remove what processes that were killed inside `replacing` left in `folder` and below."""
+    for left in half_written(folder):
+        _remove(left)
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # no process id: several hosts share a disk
+
+
+def _put(new: Path, path: Path, *, keep: bool) -> None:
+    try:
+        os.replace(new, path)
+    except OSError:
+        if not (new.is_dir() and path.is_dir()):  # a folder replaces none that holds files
+            raise
+        if not keep:
+            old = _hidden(path)
+            os.replace(path, old)
+            os.replace(new, path)
+            shutil.rmtree(old)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):  # it is gone where all went well; its folder may be none
+            path.unlink()

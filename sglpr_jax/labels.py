@@ -1,4 +1,4 @@
-"""SemanticKITTI's raw label ids, and figure 9's ways to sort them into categories: the table is in docs/labels.md."""
+"""SemanticKITTI's raw label ids, and figure 9's ways to sort them into categories (docs/reference/labels.md)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -146,7 +146,7 @@ def _color(raw: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class LabelMap:
+class Taxonomy:
     """One way to sort raw ids into classes 0 to k - 1. Class 0 is `UNLABELLED`."""
 
     names: tuple[str, ...]
@@ -158,32 +158,32 @@ class LabelMap:
     """The raw id that stands for each class: the first of those that become it."""
 
 
-def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> LabelMap:
+def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> Taxonomy:
     class_of = np.full(max(RAW_NAMES) + 1, -1, dtype=np.int32)
     for class_id, members in enumerate(raw_ids.values()):
         class_of[list(members)] = class_id
     colors = np.array([_color(members[0]) for members in raw_ids.values()], dtype=np.uint8)
     raw_of = np.array([members[0] for members in raw_ids.values()], dtype=np.int32)
-    return LabelMap(tuple(raw_ids), colors, class_of, raw_of)
+    return Taxonomy(tuple(raw_ids), colors, class_of, raw_of)
 
 
 _LABEL_MAPS = {categories: _label_map(raw_ids) for categories, raw_ids in _RAW_IDS.items()}
 
 
-def label_map(categories: int = 20) -> LabelMap:
+def taxonomy(categories: int = 20) -> Taxonomy:
     """The classes of one setting of figure 9. Raises ValueError with the settings there are."""
     if categories not in _LABEL_MAPS:
-        raise ValueError(f"no label map of {categories!r} categories; there are {', '.join(map(str, _LABEL_MAPS))}")
+        raise ValueError(f"no label image of {categories!r} categories; there are {', '.join(map(str, _LABEL_MAPS))}")
     return _LABEL_MAPS[categories]
 
 
-CATEGORIES = label_map(20).names
+CATEGORIES = taxonomy(20).names
 """The names of the 20 classes of SG-LPR and RINet, by class id."""
 
 
 def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
     """Return the class of each raw SemanticKITTI id. Raises ValueError naming ids that do not exist."""
-    class_of = label_map(categories).class_of
+    class_of = taxonomy(categories).class_of
     classes = np.where((raw >= 0) & (raw < len(class_of)), class_of[np.clip(raw, 0, len(class_of) - 1)], -1)
     if np.any(classes < 0):
         raise ValueError(f"expected raw SemanticKITTI ids, found {np.unique(raw[classes < 0])[:5].tolist()}")
@@ -192,4 +192,4 @@ def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32
 
 def to_raw(classes: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
     """Return a raw SemanticKITTI id of each class; `to_classes` with the same categories gives the classes back."""
-    return label_map(categories).raw_of[classes]
+    return taxonomy(categories).raw_of[classes]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.sglpr import Params, init
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import init
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -22,6 +23,13 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no development data at {SHARED} (licences forbid shipping it)")
     return SHARED
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _free_compiled_programs():
+    """No test file needs the programs that another one compiled: kept, they grow to gigabytes."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The public API as a whole: documented, in one style, and enough for the README's lines of Python."""
 
-import dataclasses
 import inspect
 
 import jax
@@ -14,10 +13,12 @@ PUBLIC = [(name, getattr(sglpr_jax, name)) for name in sglpr_jax.__all__]
 CALLABLES = [(name, member) for name, member in PUBLIC if callable(member)]
 FUNCTIONS = [(name, inspect.signature(member)) for name, member in CALLABLES if not inspect.isclass(member)]
 INPUTS_NOT_OPTIONS = {
-    ("open_sequence", "name"),
+    ("open_recording", "name"),
     ("describe", "labels"),
     ("forward", "labels"),
-    ("label_map", "categories"),
+    ("nearest", "database"),
+    ("evaluate", "protocols"),
+    ("taxonomy", "categories"),
 }
 
 
@@ -55,7 +56,8 @@ def test_key_comes_first_and_options_are_named(name, signature):
 def test_the_readmes_lines(tmp_path):
     head = sglpr_jax.HeadConfig(channels=(8,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
     grid = sglpr_jax.Grid(resolution_m=3.2, height=16, width=16)
-    config = dataclasses.replace(sglpr_jax.model_preset("tiny"), grid=grid, depths=(1,), heads=(2,), head=head)
+    backbone = sglpr_jax.SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4)
+    config = sglpr_jax.ModelConfig(grid=grid, backbone=backbone, head=head)
     params = sglpr_jax.init(jax.random.key(0), config=config)
     rng = np.random.default_rng(0)
     cloud = np.concatenate([rng.normal(scale=8, size=(2000, 3)), rng.random((2000, 1))], axis=1)
@@ -63,7 +65,7 @@ def test_the_readmes_lines(tmp_path):
     sglpr_jax.save(params, tmp_path / "run" / "weights")
 
     loaded = sglpr_jax.load(tmp_path / "run")
-    points = sglpr_jax.read_scan(tmp_path / "000000.bin")
+    points = sglpr_jax.read_scan(str(tmp_path / "000000.bin"))  # text or a Path
     bev = sglpr_jax.scan_image(points, loaded.config)
     np.testing.assert_array_equal(bev, sglpr_jax.rasterize(points, grid=loaded.config.grid))
     descriptor = sglpr_jax.describe(loaded, bev)

@@ -11,19 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.swin import SwinBlock
+from sglpr_jax.models.backbones.swin_layers import SwinBlock
 from sglpr_jax.sim import Sensor, write_dataset
 
+pytestmark = pytest.mark.slow
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
 PRESET = """
 from sglpr_jax.bev import Grid
-from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.training.config import TrainConfig
 
 HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
-MODEL = ModelConfig(grid=Grid(3.2, 16, 16), embed_dim=8, depths=(1,), heads=(2,), window=4, head=HEAD)
+SWIN = SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4)
+MODEL = ModelConfig(grid=Grid(3.2, 16, 16), backbone=SWIN, head=HEAD)
 SAMPLING = TupleConfig(negatives=2, positive_m=16.0)
 CONFIG = TrainConfig(model=MODEL, sampling=SAMPLING, tuples=2, chunk=4, max_points=50)
 """

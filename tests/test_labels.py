@@ -1,4 +1,4 @@
-"""Raw SemanticKITTI ids become the classes of each setting of figure 9, as docs/labels.md says."""
+"""Raw SemanticKITTI ids become the classes of each setting of figure 9, as docs/reference/labels.md says."""
 
 import re
 from pathlib import Path
@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.labels import CATEGORIES, RAW_NAMES, label_map, to_classes, to_raw
+from sglpr_jax.labels import CATEGORIES, RAW_NAMES, taxonomy, to_classes, to_raw
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "labels.md"
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "reference" / "labels.md"
 SETTINGS = (6, 15, 20, 25, 34)
 
 
@@ -16,12 +16,12 @@ def test_some_known_ids():
     raw = np.array([[0, 10, 252], [40, 60, 81]])
     np.testing.assert_array_equal(to_classes(raw), [[0, 1, 1], [9, 9, 19]])
     assert to_classes(raw).dtype == np.int32
-    assert [label_map(6).names[c] for c in to_classes(np.array([30, 254, 31, 253]), categories=6)] == ["human"] * 4
+    assert [taxonomy(6).names[c] for c in to_classes(np.array([30, 254, 31, 253]), categories=6)] == ["human"] * 4
 
 
 @pytest.mark.parametrize("categories", SETTINGS)
 def test_every_raw_id_has_a_class_with_a_name_and_a_colour_of_its_own(categories):
-    found = label_map(categories)
+    found = taxonomy(categories)
     k = len(found.names)
     assert k - categories == (1 if categories in (6, 25) else 0)  # where the unlabelled class comes on top
     assert found.names[0] == "unlabeled" and len(set(found.names)) == k
@@ -32,7 +32,7 @@ def test_every_raw_id_has_a_class_with_a_name_and_a_colour_of_its_own(categories
 
 @pytest.mark.parametrize("categories", SETTINGS)
 def test_the_raw_id_of_a_class_becomes_that_class(categories):
-    classes = np.arange(len(label_map(categories).names)).reshape(1, -1)
+    classes = np.arange(len(taxonomy(categories).names)).reshape(1, -1)
     raw = to_raw(classes, categories=categories)
     assert raw[0, 0] == 0 and raw.shape == classes.shape
     np.testing.assert_array_equal(to_classes(raw, categories=categories), classes)
@@ -42,8 +42,8 @@ def test_dynamic_things_are_sorted_as_the_paper_says():
     moving, movable = np.arange(252, 260), np.array([10, 11, 13, 15, 16, 18, 20, 30, 31, 32])
     twins = np.array([10, 31, 30, 32, 16, 13, 18, 20])
     np.testing.assert_array_equal(to_classes(moving), to_classes(twins))
-    assert {label_map(25).names[c] for c in to_classes(moving, categories=25)} == {"moving"}
-    assert "moving" not in {label_map(25).names[c] for c in to_classes(movable, categories=25)}
+    assert {taxonomy(25).names[c] for c in to_classes(moving, categories=25)} == {"moving"}
+    assert "moving" not in {taxonomy(25).names[c] for c in to_classes(movable, categories=25)}
     assert not to_classes(np.append(moving, movable), categories=15).any()
 
 
@@ -55,15 +55,15 @@ def test_an_unknown_id_is_named(unknown):
 
 @pytest.mark.parametrize("categories", [0, 19])
 def test_an_unknown_setting_lists_those_there_are(categories):
-    with pytest.raises(ValueError, match=rf"no label map of {categories} categories; there are 6, 15, 20, 25, 34"):
-        label_map(categories)
+    with pytest.raises(ValueError, match=rf"no label image of {categories} categories; there are 6, 15, 20, 25, 34"):
+        taxonomy(categories)
 
 
 def test_the_documented_table_is_the_code():
     """A failure shows the table as it should be."""
     lines = ["| raw id | name | " + " | ".join(map(str, SETTINGS)) + " |", "|---" * (2 + len(SETTINGS)) + "|"]
     for raw, name in RAW_NAMES.items():
-        classes = [(to_classes(np.array(raw), categories=n).item(), label_map(n).names) for n in SETTINGS]
+        classes = [(to_classes(np.array(raw), categories=n).item(), taxonomy(n).names) for n in SETTINGS]
         lines.append(f"| {raw} | {name} | " + " | ".join(f"{c} {names[c]}" for c, names in classes) + " |")
     found = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("|")]
     assert found == lines, "\n".join(lines)
@@ -79,7 +79,7 @@ def test_the_map_names_and_colours_are_those_of_semantic_kitti(shared):
     for class_id, raw_id in sections["learning_map_inv"].items():
         assert CATEGORIES[int(class_id)] == sections["labels"][raw_id].strip('"')
         blue_green_red = [int(channel) for channel in re.findall(r"\d+", sections["color_map"][raw_id])]
-        assert label_map().colors[int(class_id)].tolist() == blue_green_red[::-1]
+        assert taxonomy().colors[int(class_id)].tolist() == blue_green_red[::-1]
 
 
 def test_real_labels_have_classes(shared):

@@ -204,5 +204,6 @@ def test_distance_is_numpys_and_its_gradient_is_finite_where_two_descriptors_are
 
 
 def test_joint_loss_weighs_its_terms():
-    total = losses.joint(jnp.float32(1), jnp.float32(10), jnp.float32(100), ce_weight=0.4, dice_weight=0.6)
+    terms = {"triplet": jnp.float32(1), "cross_entropy": jnp.float32(10), "dice": jnp.float32(100)}
+    total = losses.joint(terms, {"dice": 0.6, "cross_entropy": 0.4, "triplet": 1.0})
     assert float(total) == pytest.approx(65)

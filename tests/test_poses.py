@@ -8,9 +8,10 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from sglpr_jax.data.kitti import read_trajectory
-from sglpr_jax.data.pose_files import read_poses
-from sglpr_jax.poses import EXCLUDED_FRAMES, POSITIVE_M, database_end, distances, positions_from_camera, revisits
+from sglpr_jax.data.formats.pose_files import read_poses
+from sglpr_jax.data.readers.kitti import read_trajectory
+from sglpr_jax.poses import POSITIVE_M, distances, positions_from_camera
+from sglpr_jax.revisits import EXCLUDED_FRAMES, database_end, revisits
 
 coordinates = st.floats(-1e4, 1e4)
 
@@ -83,7 +84,7 @@ def test_height_counts_only_in_3d():
 )
 def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
     published = json.loads((shared / "data/protocol/logg3d_is_revisit_D-3_T-30.json").read_text())[sequence]
-    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, poses="semantickitti")
+    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     found = revisits(positions, times=times)
     assert found.sum() == count
     np.testing.assert_array_equal(found, np.array(published) == 1)
@@ -92,7 +93,7 @@ def test_revisits_of_kitti_are_the_published_ones(shared, sequence, count):
 
 @pytest.mark.parametrize("sequence, count", [("02", 217), ("08", 158)])
 def test_the_pose_file_matters(shared, sequence, count):
-    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, poses="kitti")
+    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="kitti")
     assert revisits(positions, times=times).sum() == count
 
 

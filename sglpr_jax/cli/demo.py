@@ -8,11 +8,12 @@ from pathlib import Path
 import tyro
 
 from sglpr_jax.cli.datasets import simulate
-from sglpr_jax.cli.embed import EmbedCommand, embed_sequence
-from sglpr_jax.cli.evaluate import PAGE, EvaluateCommand, evaluate_file
-from sglpr_jax.cli.presets import load_preset
+from sglpr_jax.cli.embed import EmbedCommand, embed_recording
+from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
 from sglpr_jax.cli.runtime import run
 from sglpr_jax.cli.train import TrainCommand, train_and_test
+from sglpr_jax.evaluation.page.writing import PAGE
+from sglpr_jax.training.presets import load_preset
 
 SCANS = 300
 AZIMUTH_STEPS = 450
@@ -21,15 +22,15 @@ TESTED = "00"
 
 @dataclasses.dataclass(frozen=True)
 class DemoCommand:
-    """Train a small model on two simulated drives and find the loop closures of a third, never seen.
+    """Train a small model on two simulated recordings and find the loop closures of a third, never seen.
 
     The third is 00, which comes back to its places in the same direction.
     """
 
     out: Path = Path("runs/demo")
-    """Folder for everything; an earlier demo's run in it is replaced, its simulated drives are kept."""
+    """Folder for everything; an earlier demo's run in it is replaced, its simulated recordings are kept."""
     scans: int = SCANS
-    """Scans of each drive."""
+    """Scans of each recording."""
     steps: int | None = None
     """Training steps. None: the preset's."""
 
@@ -44,7 +45,7 @@ def demo(command: DemoCommand) -> Path:
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
     train_and_test(TrainCommand(seq=TESTED, data=town, preset="demo", out=trained, config=config))
     print("\nthe same by hand: bin/embed, then bin/evaluate", file=sys.stderr)
-    descriptors = embed_sequence(
+    descriptors = embed_recording(
         EmbedCommand(data=town, seq=TESTED, weights=str(trained), out=command.out / f"{TESTED}.npz")
     )
     evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=str(trained)))

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.methods import MethodName, method_named
 from sglpr_jax.cli.runtime import progress_bar, run
-from sglpr_jax.data import open_sequence
-from sglpr_jax.data.kitti import PoseChoice
-from sglpr_jax.data.scan_files import ScanFormat
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.methods.registry import MethodName, method_named
+from sglpr_jax.retrieval.embed import embed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +21,7 @@ class EmbedCommand:
     Examples:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
       bin/embed --weights simulated --data my_scans/ --out mine.npz --skip-bad
-      bin/embed --method scan-context --data KITTI --seq 08 --out reference.npz
+      bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
     """
 
     data: Path
@@ -30,39 +31,42 @@ class EmbedCommand:
     weights: str | None = None
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     method: MethodName = "sglpr"
-    """The network, or a reference that needs no weights; scan-context to solid need points, ssc labels too."""
+    """The network, or a handcrafted method, which needs no weights; some need points, ssc labels too."""
     seq: str | None = None
     """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
-    poses: PoseChoice = "auto"
+    pose_source: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
     """What the scans of a plain folder are, where their names do not tell."""
-    rotate_seed: int | None = None
-    """Turn every scan about z by its own random angle first."""
+    rotate: bool = False
+    """Rotate every scan about z by its own random angle first."""
+    seed: int = 0
+    """Draws the angles of --rotate."""
     skip_bad: bool = False
     """Report scans that cannot be read and go on without them."""
     batch: int = 16
     """Images described at a time."""
 
 
-def embed_sequence(command: EmbedCommand) -> Path:
+def embed_recording(command: EmbedCommand) -> Path:
     """Do what the command says; returns the file written."""
     if command.out.suffix != ".npz":
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
-    sequence = open_sequence(command.data, command.seq, poses=command.poses, format=command.format)
-    method = method_named(command.method, command.weights, sequence)
-    with progress_bar(f"embed {sequence.name}", len(sequence)) as show:
-        file = method.embed(
-            sequence,
-            rotation_seed=command.rotate_seed,
+    recording = open_recording(command.data, command.seq, pose_source=command.pose_source, format=command.format)
+    method = method_named(command.method, command.weights, recording)
+    with progress_bar(f"embed {recording.name}", len(recording)) as show:
+        file = embed(
+            method,
+            recording,
+            rotation_seed=command.seed if command.rotate else None,
             batch=command.batch,
             on_bad_scan=_report if command.skip_bad else None,
             on_progress=show,
         )
     file.save(command.out)
-    skipped = len(sequence) - len(file)
+    skipped = len(recording) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
     return command.out
 
@@ -73,7 +77,7 @@ def _report(scan: str, error: Exception) -> None:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: embed_sequence(tyro.cli(EmbedCommand, prog="embed")))
+    run(lambda: embed_recording(tyro.cli(EmbedCommand, prog="embed")))
 
 
 if __name__ == "__main__":

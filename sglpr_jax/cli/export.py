@@ -6,16 +6,21 @@ from pathlib import Path
 import tyro
 
 from sglpr_jax.bev import ImageKind
-from sglpr_jax.cli.runtime import run
-from sglpr_jax.models.params import WEIGHTS_FILE, for_places, load, save
-from sglpr_jax.models.sglpr import Params
+from sglpr_jax.cli.runtime import progress_bar, run
+from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights_file import WEIGHTS_FILE, load, save
+from sglpr_jax.retrieval.whiten import whiten
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportCommand:
     """Write weights to hand out: what describes places, without the segmentation head.
 
-    Example: bin/export --weights runs/small-08 --out mine --half
+    Examples:
+      bin/export --weights runs/small-08 --out mine --half
+      bin/export --weights sglpr --whiten my_scans/ --out mine      for one's own sensor, without labels or poses
     """
 
     weights: str
@@ -29,6 +34,11 @@ class ExportCommand:
     image: ImageKind | None = None
     """What raw scans are made into, where config.json says something else: `density` for weights that were trained on
     ready-made density images."""
+    whiten: tuple[Path, ...] = ()
+    """Datasets or folders of scans; to their descriptors a last layer is fitted that evens out the spread over the
+    directions (models/whitening.py), in place of one that is there."""
+    whiten_power: float = 0.5
+    """By which power of its spread a principal component is divided: 1 evens out all."""
 
 
 def export(command: ExportCommand) -> Path:
@@ -39,6 +49,10 @@ def export(command: ExportCommand) -> Path:
     params = params if command.keep_segmentation else for_places(params)
     if command.image is not None:
         params = Params(params.weights, dataclasses.replace(params.config, image=command.image))
+    if command.whiten:
+        recordings = [open_recording(folder, name) for folder in command.whiten for name in recording_names(folder)]
+        with progress_bar("embed", max(map(len, recordings))) as show:
+            params = whiten(params, recordings, power=command.whiten_power, on_progress=show)
     save(params, command.out, half=command.half)
     print(f"{command.out}: {(command.out / WEIGHTS_FILE).stat().st_size / 1e6:.1f} MB of weights")
     return command.out

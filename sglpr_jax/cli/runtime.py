@@ -1,28 +1,32 @@
 """What every command does around its work: a compilation cache, orderly interruption, errors in one line."""
 
+import argparse
 import contextlib
 import dataclasses
-import json
 import logging
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sglpr_jax.files import writing
-
 _TABLE_WIDTH = 140
 
 
 def cache_folder() -> Path:
-    """Where this user's compiled programs and simulated drives are kept."""
+    """Where this user's compiled programs and simulated recordings are kept."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax"
+
+
+def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
+    """What --preset says, read before the other flags are, because it sets their defaults."""
+    chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    chooser.add_argument("--preset", default=default)
+    return chooser.parse_known_args(arguments)[0].preset
 
 
 def run(command: Callable[[], object]) -> None:
@@ -50,22 +54,6 @@ def _show_unraisable(unraisable) -> None:
 def console() -> Console:
     """Standard output; wide enough for the tables where it is no terminal with a width of its own."""
     return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file whole or not at all."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with writing(path):
-            temporary.write_text(text)
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @dataclasses.dataclass

@@ -1,14 +1,14 @@
 """bin/simulate: write simulated drives in KITTI's layout, as images in BEVPlace's, or several days in NCLT's."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.datasets import SIMULATED, SIMULATED_SCANS, simulate, simulate_days
+from sglpr_jax.cli.datasets import simulate
 from sglpr_jax.cli.runtime import run
-from sglpr_jax.sim.drive import RATE_HZ, name_of_path
+from sglpr_jax.sim.drive import RATE_HZ
+from sglpr_jax.sim.simulation import SCANS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,7 @@ class SimulateCommand:
     """
 
     out: Path
-    """The dataset's folder; an interrupted one is completed, and drives can be added."""
+    """The dataset's folder; an interrupted one is completed, and recordings can be added."""
     seq: tuple[str, ...] | None = None
     """Which routes, of 00 to 10. Their revisits are like KITTI's: 00, 02, 05, 06, 07 and 09 have them in the same
     direction, 08 in the opposite one, the others none. None: 00 05 08, or none where --along is given."""
@@ -30,8 +30,8 @@ class SimulateCommand:
     sessions: tuple[str, ...] = ()
     """Dates: one town on so many days, in NCLT's layout. The first drives one route of --seq (00), the others the same
     streets, partly the other way; parked cars and traffic are other ones."""
-    scans: int = SIMULATED_SCANS
-    """Scans of each drive."""
+    scans: int = SCANS
+    """Scans of each recording."""
     rate_hz: float = RATE_HZ
     """Scans per second of a route; KITTI's rate is 10."""
     sensor: str | None = None
@@ -40,53 +40,20 @@ class SimulateCommand:
     azimuth_steps: int | None = None
     """Firings per turn; fewer make smaller files. None: as many as the real sensor's."""
     images: bool = False
-    """Write BEV density images with label maps (NN/imgs, NN/labels, NN/pose.txt) in place of scans and labels."""
+    """Write BEV density images with label images (NN/imgs, NN/labels, NN/pose.txt) in place of scans and labels."""
     seed: int = 0
 
 
-def simulate_drives(command: SimulateCommand) -> Path:
+def write_simulation(command: SimulateCommand) -> Path:
     """Do what the command says; returns the dataset's folder."""
-    drives = _simulate_sessions(command) if command.sessions else _simulate_towns(command)
-    print(f"{command.out}: drives {', '.join(drives)}")
+    options = {field.name: getattr(command, field.name) for field in dataclasses.fields(command)}
+    print(simulate(options.pop("out"), routes=options.pop("seq"), **options))
     return command.out
-
-
-def _simulate_towns(command: SimulateCommand) -> Sequence[str]:
-    names = command.seq if command.seq is not None else () if command.along else SIMULATED
-    simulate(
-        command.out,
-        names=names,
-        along=command.along,
-        scans=command.scans,
-        sensor=command.sensor or "hdl64e",
-        azimuth_steps=command.azimuth_steps,
-        seed=command.seed,
-        rate_hz=command.rate_hz,
-        images=command.images,
-    )
-    return [*names, *map(name_of_path, command.along)]
-
-
-def _simulate_sessions(command: SimulateCommand) -> Sequence[str]:
-    routes = command.seq or ("00",)
-    if command.along or command.images or len(routes) != 1:
-        raise ValueError("expected at most one route (--seq) beside --sessions, found more, or --along or --images")
-    simulate_days(
-        command.out,
-        dates=command.sessions,
-        route=routes[0],
-        scans=command.scans,
-        sensor=command.sensor or "hdl32e-nclt",
-        azimuth_steps=command.azimuth_steps,
-        seed=command.seed,
-        rate_hz=command.rate_hz,
-    )
-    return command.sessions
 
 
 def main() -> None:
     """The entry point."""
-    run(lambda: simulate_drives(tyro.cli(SimulateCommand, prog="simulate")))
+    run(lambda: write_simulation(tyro.cli(SimulateCommand, prog="simulate")))
 
 
 if __name__ == "__main__":

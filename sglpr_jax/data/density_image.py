@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.data.bev_images import MAX_COUNT, RESOLUTION_M, as_counts
+from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M, as_counts
 
 SIZE = 151
 """Rows and columns of an image. The crop leaves the outer 13 empty."""
@@ -35,8 +35,8 @@ def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 
 def density_label_bev(
     points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
 ) -> Int32[np.ndarray, "151 151"]:
-    """The map of classes that lies on `density_bev`; see `density_label_map`."""
-    return np.ascontiguousarray(np.rot90(density_label_map(points, classes), -1))
+    """The map of classes that lies on `density_bev`; see `density_label_image`."""
+    return np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
 
 
 def check_density_grid(grid: Grid) -> None:
@@ -59,7 +59,7 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
     return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(SIZE, SIZE)
 
 
-def density_label_map(
+def density_label_image(
     points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
 ) -> Int32[np.ndarray, "151 151"]:
     """The class of the last point that falls into each cell of the scan's density image, 0 where none does.

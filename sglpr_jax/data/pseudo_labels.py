@@ -1,33 +1,33 @@
 """Labels that a model made (pseudo-labels), beside images that have none of their own.
 
-06/000000.png   the label map (`label_maps.py`) of image 000000 of drive 06; `bin/segment` writes such files
+06/000000.png   the label image (`label_images.py`) of image 000000 of recording 06; `bin/segment` writes such files
 """
 
 import dataclasses
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 from pathlib import Path
 
-from sglpr_jax.data.sequence import Drive, ImageSequence
+from sglpr_jax.data.recording import Recording
 
 
-def with_pseudo_labels(drives: Many[Drive], folder: Path) -> list[Drive]:
-    """Return the drives, those of images without any labels with the label maps of `folder`.
+def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
+    """Return the recordings, those of images without any labels with the label images of `folder`.
 
-    An image without a map stays unlabelled. Raises FileNotFoundError where `folder` has no map for any drive.
+    An image without a label image stays unlabelled. Raises FileNotFoundError where `folder` has none for any recording.
     """
-    labelled = [_labelled(drive, folder / drive.name) for drive in drives]
-    if not any(new is not old for new, old in zip(labelled, drives, strict=True)):
-        wanted = [d.name for d in drives if isinstance(d, ImageSequence) and not d.has_labels]
+    labelled = [_labelled(recording, folder / recording.name) for recording in recordings]
+    if not any(new is not old for new, old in zip(labelled, recordings, strict=True)):
+        wanted = [each.name for each in recordings if each.has_images and not each.has_labels]
         raise FileNotFoundError(
-            f"{folder}: expected label maps NN/<id>.png of drives of images without labels of their own "
+            f"{folder}: expected label images NN/<id>.png of recordings of images without labels of their own "
             f"({', '.join(wanted) or 'of which there are none'}), found none"
         )
     return labelled
 
 
-def _labelled(drive: Drive, folder: Path) -> Drive:
-    if not isinstance(drive, ImageSequence) or drive.has_labels:
-        return drive
+def _labelled(recording: Recording, folder: Path) -> Recording:
+    if not recording.has_images or recording.has_labels:
+        return recording
     there = {path.stem: path for path in folder.glob("*.png")}
-    label_paths = tuple(there.get(image) for image in drive.ids)
-    return dataclasses.replace(drive, label_paths=label_paths) if any(label_paths) else drive
+    label_paths = tuple(there.get(image) for image in recording.ids)
+    return dataclasses.replace(recording, label_paths=label_paths) if any(label_paths) else recording

@@ -1,1 +1,1 @@
-"""From a descriptor file to numbers and pictures: protocols, report, figures, and baselines to compare with."""
+"""From descriptors to numbers and pictures: protocols, one call that scores, tables, figures and pages."""

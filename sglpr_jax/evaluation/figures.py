@@ -1,6 +1,6 @@
 """The pictures of an evaluation, as matplotlib figures that nothing global knows of (extra `viz`)."""
 
-import os
+import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.evaluation.protocols import Decision
-from sglpr_jax.files import writing
-from sglpr_jax.labels import LabelMap, label_map
+from sglpr_jax.files import replacing
+from sglpr_jax.labels import Taxonomy, taxonomy
 from sglpr_jax.metrics import PrecisionRecallCurve
 
 if TYPE_CHECKING:
@@ -32,15 +32,15 @@ DECISIONS = {
 """Name, colour (red, black, blue as in figure 6) and size in square points of each decision's dots; mistakes on top."""
 
 
+def can_draw() -> bool:
+    """Return whether matplotlib is installed: the extra `viz` brings it."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
 def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
     """Write the figure, whole or not at all, in the format that the ending of `path` names."""
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
-        with writing(path):
-            figure.savefig(temporary, dpi=DOTS_PER_INCH)
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:], dpi=DOTS_PER_INCH)
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
@@ -120,9 +120,9 @@ def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]
 def stress(
     changes: Mapping[tuple[str, str], Mapping[str, Sequence[tuple[str, float]]]], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
-    """Draw how much each method's score changes with the strength of a disturbance: a row of panels for each protocol.
+    """Draw how much each method's score changes with the strength of a corruption: a row of panels for each protocol.
 
-    `changes` has by (protocol, kind of disturbance), by method, the labels of the strengths and the changes.
+    `changes` has by (protocol, kind of corruption), by method, the labels of the strengths and the changes.
     """
     protocols, kinds = (list(dict.fromkeys(names)) for names in zip(*changes, strict=True))
     figure = _figure(max(1.6 + 1.9 * len(kinds), 4.0), 1.0 + 2.4 * len(protocols))
@@ -156,7 +156,7 @@ def segmentation_panel(
 
     Without a truth it has no panel. `categories` says which classes they are.
     """
-    labels = label_map(categories)
+    labels = taxonomy(categories)
     pictures = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
     if truth is not None:
         pictures["true classes"] = labels.colors[truth]
@@ -211,7 +211,7 @@ def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:
         axes.text(f1, f1, f"F1 = {f1}", color="0.6", fontsize=7, ha="center", backgroundcolor="white", zorder=0)
 
 
-def _add_class_legend(figure: "matplotlib.figure.Figure", labels: LabelMap, classes: Int[np.ndarray, " k"]) -> None:
+def _add_class_legend(figure: "matplotlib.figure.Figure", labels: Taxonomy, classes: Int[np.ndarray, " k"]) -> None:
     """Name the colour of each of these classes under the pictures."""
     from matplotlib.patches import Patch
 

@@ -1,7 +1,7 @@
 """The numbers of the SG-LPR paper: tables 1 to 7, row by row as printed.
 
 The rows of a table do not all rest on one protocol. By where a row comes from (the paper names the sources; which
-protocol lies behind them is our reading, see docs/protocols.md):
+protocol lies behind them is our reading, see docs/concepts/protocols.md):
 
 - RINET, "RINet's paper": F1max over pairs, 100 negatives per positive: `pairs-f1max`.
 - ITS_PAPER, "its own paper": top-1 F1max, 3 m and 20 m, 30 s: `top1-f1max`.
@@ -25,7 +25,7 @@ BEVPLACE_2, NO_SOURCE = "BEVPlace++'s paper", "no source named"
 
 KITTI = ("00", "02", "05", "06", "07", "08")
 NCLT = ("2012-02-04", "2012-03-17", "2012-06-15", "2012-09-28", "2012-11-16", "2013-02-23")
-NCLT_MAP = "2012-01-15"
+NCLT_DATABASE = "2012-01-15"
 """The session that is the database of table 3."""
 
 
@@ -85,7 +85,7 @@ TABLE_1 = Table(
 
 TABLE_2 = Table(
     2,
-    "F1max on KITTI, every scan turned at random about z",
+    "F1max on KITTI, every scan rotated at random about z",
     "real KITTI",
     KITTI,
     (

@@ -1,17 +1,18 @@
-"""One method under chosen protocols, as a table and as JSON."""
+"""Results as tables and as JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sglpr_jax.evaluation.inputs import Input
-from sglpr_jax.evaluation.inputs.choice import protocols_of
-from sglpr_jax.evaluation.protocols import HEADLINES, Result, protocol_named
+from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
 
+WIDTH = 140
+"""Characters of a line, where results are made into text."""
 MOST_COLUMNS = 6
 """More protocols side by side would not fit a terminal."""
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
@@ -20,15 +21,6 @@ PUBLISHED_NOTE = (
     f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
     "protocol: those of RINet's paper are pairs-f1max, the others top1-f1max as far as is known."
 )
-
-
-def evaluate(source: Input, protocols: Sequence[str] = HEADLINES) -> list[Result]:
-    """Return the result of each named protocol on one file of descriptors, one top-k list or one list of pairs.
-
-    Raises ValueError where there are no positions, or a name is no protocol that such a file can be scored by.
-    """
-    known = protocols_of(source)
-    return [protocol_named(name, known)(source) for name in protocols]
 
 
 def table(results: Sequence[Result], *, title: str = "") -> Table:
@@ -80,6 +72,23 @@ def published_table(rows: Sequence[tuple[str, ...]]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def as_text(found: Any, *, width: int) -> str:
+    """Return what a console of so many columns would show."""
+    console = Console(width=width, highlight=False, color_system=None)
+    with console.capture() as capture:
+        console.print(found)
+    return capture.get()
+
+
+class PrintsItself:
+    """A result that `print` shows as a console does: derive from it, and give `__rich__` or `__rich_console__`."""
+
+    def __str__(self) -> str:
+        return as_text(self, width=WIDTH)
+
+    __repr__ = __str__
 
 
 def format_score(result: Result) -> str:

@@ -1,11 +1,14 @@
 """How well semantic maps are predicted: intersection over union, beside what the commonest class alone would score."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from rich.table import Table
 
-from sglpr_jax.labels import UNLABELLED
+from sglpr_jax.labels import UNLABELLED, taxonomy
+from sglpr_jax.retrieval.semantic_maps import SemanticMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,3 +78,42 @@ def score_confusion(confusion: Int[np.ndarray, "k k"]) -> SegmentationResult:
     union = cells_of_class + confusion.sum(0) - np.diag(confusion)
     iou = np.where(cells_of_class > 0, np.diag(confusion) / np.maximum(union, 1), np.nan)
     return SegmentationResult(iou=iou, shares=cells_of_class / cells, cells=cells)
+
+
+def map_confusion(found: SemanticMap, *, categories: int) -> Int[np.ndarray, "k k"]:
+    """The confusion matrix of one semantic map: over the cells of which the network says something and the truth is
+    known; all 0 for a scan without labels."""
+    classes = len(taxonomy(categories).names)
+    return confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
+
+
+def segmentation_table(result: SegmentationResult, *, categories: int, title: str = "") -> Table:
+    """Return a row for each class that occurs, and the means."""
+    names = taxonomy(categories).names
+    table = Table(title=title, caption=f"{result.cells} cells with points and a label")
+    for column in ("class", "share of the cells", "IoU"):
+        table.add_column(column, justify="left" if column == "class" else "right")
+    for name, share, iou in zip(names, result.shares, result.iou, strict=True):
+        if share:
+            table.add_row(name, f"{share:.2%}", f"{iou:.3f}")
+    table.add_section()
+    table.add_row(f"mean of {result.present} classes", "", f"{result.mean_iou:.3f}")
+    table.add_row(f"{names[result.majority]} everywhere", "", f"{result.majority_mean_iou:.3f}")
+    return table
+
+
+def segmentation_json(result: SegmentationResult, *, categories: int) -> dict[str, Any]:
+    """Return plain values for `json.dump`; null for the score of a class that does not occur."""
+    names = taxonomy(categories).names
+
+    def by_name(values: np.ndarray) -> dict[str, float | None]:
+        return {name: None if np.isnan(x) else float(x) for name, x in zip(names, values, strict=True)}
+
+    return {
+        "mean_iou": result.mean_iou,
+        "majority": names[result.majority],
+        "majority_mean_iou": result.majority_mean_iou,
+        "cells": result.cells,
+        "iou": by_name(result.iou),
+        "shares": by_name(result.shares),
+    }

@@ -1,30 +1,53 @@
-"""One session as the map, others as queries: a column for each session and their mean, as in table 3 of the paper."""
+"""One session as the database, others as queries: a column for each and their mean, as in table 3 of the paper."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rich.console import Console, ConsoleOptions
+from rich.table import Table
 
-from sglpr_jax.evaluation.inputs.choice import ALL
-from sglpr_jax.evaluation.protocols import CROSS_SESSION_PROTOCOLS, Result, protocol_named
+from sglpr_jax.evaluation.inputs.own_file import read_own_file
+from sglpr_jax.evaluation.protocols import Result, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.choice import ALL
 from sglpr_jax.evaluation.protocols.source import positions_of
-from sglpr_jax.evaluation.published import NCLT_MAP, TABLE_3
-from sglpr_jax.evaluation.report import format_score
+from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
+from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 APART_M = 25.0
 """The largest distance at which a protocol here calls two frames one place."""
 
 
-@dataclass(frozen=True, eq=False)
-class AcrossSessions:
-    """The results of one method, asked on every session about one map."""
+@dataclass(frozen=True, eq=False, repr=False)
+class AcrossSessions(PrintsItself):
+    """The results of one method for every session of queries, all searched in one database. Prints itself as tables."""
 
-    map_session: str
+    database: str
+    """The session that is searched."""
     sessions: tuple[str, ...]
+    """Those of the queries."""
     protocols: Mapping[str, Sequence[Result]]
     """By the protocol's name: one result for each session."""
+    about: str = ""
+    """What was scored and how it is compared, in a line."""
+    published: Sequence[tuple[str, ...]] = ()
+    """`published_rows`, where they were asked for."""
+    made_with: Mapping[str, Any] = field(default_factory=dict)
+    """The files, as JSON can hold them."""
+
+    @property
+    def title(self) -> str:
+        """What stands over the tables."""
+        return f"database {self.database}; queries of {len(self.sessions)} sessions"
+
+    @property
+    def results(self) -> list[Result]:
+        """All results, protocol by protocol."""
+        return [result for of_one in self.protocols.values() for result in of_one]
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -37,51 +60,97 @@ class AcrossSessions:
             (name, *map(format_score, results), _text(mean_score(results))) for name, results in self.protocols.items()
         ]
 
-    def published_rows(self) -> list[tuple[str, ...]]:
-        """Return the rows of table 3 in the same columns, marked as published; the mean is that of the columns shown.
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for `json.dump`."""
+        results = {
+            name: {
+                "mean": None if math.isnan(mean_score(of_one)) else mean_score(of_one),
+                "sessions": dict(zip(self.sessions, to_json(of_one), strict=True)),
+            }
+            for name, of_one in self.protocols.items()
+        }
+        published = {"about": PUBLISHED_NOTE, "columns": self.columns, "rows": self.published}
+        beside = {"published": published} if self.published else {}
+        return {**self.made_with, "database_session": self.database, "results": results, **beside}
 
-        Sessions that the table does not have are left empty. Raises ValueError where it has none of them, or another
-        map.
-        """
-        shown = [session for session in self.sessions if session in TABLE_3.columns]
-        if self.map_session != NCLT_MAP or not shown:
-            raise ValueError(
-                f"expected map {NCLT_MAP} and queries among {', '.join(TABLE_3.columns)}, for which numbers are "
-                f"published; found map {self.map_session} and queries {', '.join(self.sessions)}"
-            )
-        columns = [TABLE_3.column(session) for session in self.sessions]
-        complete = len(shown) == len(TABLE_3.columns)
-        rows = []
-        for row in TABLE_3.rows:
-            scores = [column.get(row.method) for column in columns]
-            mean = row.mean if complete else float(np.mean([score for score in scores if score is not None]))
-            rows.append((f"published: {row.method}", *map(_text, scores), _text(mean)))
-        return rows
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | str]:
+        yield table(self.results)
+        rows = Table(*self.columns, title=self.title)
+        for row in self.rows():
+            rows.add_row(*row)
+        rows.add_section()
+        for row in self.published:
+            rows.add_row(*row)
+        yield rows
+        if self.published:
+            yield PUBLISHED_NOTE
 
 
 PUBLISHED_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset}, by bevplace-nclt-recall's rule."
 
 
 def evaluate_sessions(
-    database: DescriptorFile, queries: Sequence[DescriptorFile], names: Sequence[str] = ()
+    database: DescriptorFile, queries: Sequence[DescriptorFile], names: Sequence[str] = (), *, published: bool = False
 ) -> AcrossSessions:
-    """Score every session of `queries` against the map by each named protocol; none or `all` named: by all of them.
+    """Search every session of `queries` in the database and score by each named protocol; none or `all`: by all.
 
-    Raises ValueError where a session occurs twice, has no positions, lies elsewhere than the map or has other
-    descriptors, and for an unknown protocol.
+    With `published` the rows of table 3 stand beside. Raises ValueError where a session occurs twice, has no positions,
+    lies elsewhere than the database or has other descriptors, and for an unknown protocol.
     """
-    chosen = list(dict.fromkeys(names)) if names and ALL not in names else list(CROSS_SESSION_PROTOCOLS)
-    protocols = {name: protocol_named(name, CROSS_SESSION_PROTOCOLS) for name in chosen}
+    known = protocols_taking("sessions")
+    chosen = list(dict.fromkeys(names)) if names and ALL not in names else list(known)
+    protocols = {name: protocol_named(name, known) for name in chosen}
     sessions = tuple(file.sequence for file in queries)
     if len({database.sequence, *sessions}) <= len(sessions):
-        raise ValueError(f"expected different sessions, found map {database.sequence}, queries {', '.join(sessions)}")
+        found = f"database {database.sequence}, queries {', '.join(sessions)}"
+        raise ValueError(f"expected different sessions, found {found}")
     for file in queries:
         check_one_world(database, file)
     return AcrossSessions(
         database.sequence,
         sessions,
         {name: [protocol(database, file) for file in queries] for name, protocol in protocols.items()},
+        about=f"descriptors of {database.descriptors.shape[1]} numbers, compared by {database.distance}",
+        published=published_rows(database.sequence, sessions) if published else (),
     )
+
+
+def evaluate_session_files(
+    database: Path, queries: Sequence[Path], names: Sequence[str] = (), *, published: bool = False
+) -> AcrossSessions:
+    """Do as `evaluate_sessions` with descriptor files. Raises ValueError for files of another kind too."""
+    files = [_read(path) for path in (database, *queries)]
+    found = evaluate_sessions(files[0], files[1:], names, published=published)
+    made_with = {"files": [str(path) for path in queries], "database": str(database)}
+    return replace(found, about=f"{database}: {found.about}", made_with=made_with)
+
+
+def _read(path: Path) -> DescriptorFile:
+    if path.suffix != ".npz":
+        raise ValueError(f"{path}: expected descriptor files of bin/embed (.npz) for an evaluation across sessions")
+    return read_own_file(path, None)
+
+
+def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the rows of table 3 for these sessions, marked as published; the mean is that of the columns shown.
+
+    Sessions that the table does not have are left empty. Raises ValueError where it has none of them, or another
+    database.
+    """
+    shown = [session for session in sessions if session in TABLE_3.columns]
+    if database != NCLT_DATABASE or not shown:
+        raise ValueError(
+            f"expected database {NCLT_DATABASE} and queries among {', '.join(TABLE_3.columns)}, for which numbers "
+            f"are published; found database {database} and queries {', '.join(sessions)}"
+        )
+    columns = [TABLE_3.column(session) for session in sessions]
+    complete = len(shown) == len(TABLE_3.columns)
+    rows = []
+    for row in TABLE_3.rows:
+        scores = [column.get(row.method) for column in columns]
+        mean = row.mean if complete else float(np.mean([score for score in scores if score is not None]))
+        rows.append((f"published: {row.method}", *map(_text, scores), _text(mean)))
+    return rows
 
 
 def check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
@@ -91,7 +160,7 @@ def check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
     if np.any(low_q > high + APART_M) or np.any(high_q < low - APART_M):
         there, here = (f"x {a[0]:.0f} to {b[0]:.0f}, y {a[1]:.0f} to {b[1]:.0f} m" for a, b in corners)
         raise ValueError(
-            f"expected {queries.sequence} in the world frame of the map {database.sequence} ({there}), found it "
+            f"expected {queries.sequence} in the world frame of the database {database.sequence} ({there}), found it "
             f"elsewhere ({here}): no place is in both"
         )
 

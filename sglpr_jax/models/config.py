@@ -1,38 +1,54 @@
-"""What a model is, as plain values: the static part of its parameters."""
+"""What a model is, as plain values: the static part of its parameters.
+
+Here stands what all models share; each backbone keeps its own configuration beside its layers.
+"""
 
 import dataclasses
-import math
 from typing import Literal
 
 from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data.density_image import check_density_grid
-from sglpr_jax.labels import Categories, label_map
+from sglpr_jax.labels import Categories, taxonomy
+from sglpr_jax.models.backbones.rings import RingConfig
+from sglpr_jax.models.backbones.sglpr import SglprConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
+
+BackboneConfig = SwinConfig | RingConfig | SglprConfig
+"""The backbones there are; `models/backbones/interface.py` says what each one has."""
 
 
 @dataclasses.dataclass(frozen=True)
 class HeadConfig:
     """The place head: CBAM, three convolutions, NetVLAD (section 4.1.2).
 
-    The paper names no kernels, strides or channels; candidates A to D are compared in docs/decisions.md.
+    The paper names no kernels, strides or channels; candidates A to D are compared in docs/decisions/paper.md.
     """
 
     input: Literal["features", "counts", "labels", "counts+labels"] = "features"
     """What it reads (table 6): the backbone's features (HS), the image of point counts (RB), its true semantic map
     (RS), or both (RB+RS). Only `features` needs a backbone; the others have none, and no segmentation head."""
     tap: Literal["pixels", "tokens"] = "pixels"
-    """`pixels`: the x4-expanded map before the last linear layer. `tokens`: the patch map it is expanded from."""
+    """`pixels`: the decoder's map, before the last linear layer. `tokens`: the features that it is decoded from."""
     channels: tuple[int, ...] = (128, 256, 512)
+    """Of each convolution."""
     kernels: tuple[int, ...] = (3, 3, 3)
     strides: tuple[int, ...] = (2, 2, 2)
+    means: tuple[int, ...] = ()
+    """How many neighbouring sectors of a polar map become one after each convolution. With these the strides are along
+    the radius alone, and convolutions and CBAM go around, so that a rotation of the scan is a shift. (): as in the
+    paper."""
     cbam: bool = True
+    """Weight the map by channel and by place first."""
     cbam_reduction: int = 16
+    """Channels for each hidden unit of CBAM's channel gate."""
     pooling: Literal["netvlad", "mean", "spectrum"] = "netvlad"
     """`mean`: the mean over the map and a linear layer stand in for NetVLAD (table 4). `spectrum`: the amplitudes of
-    the map's Fourier transform along the sectors of a polar image (models/spectrum.py)."""
+    the map's Fourier transform along the sectors of a polar image (models/heads/spectrum.py)."""
     clusters: int = 64
-    spectrum_channels: int = 256
-    frequencies: int = 32
+    """Of NetVLAD."""
     descriptor_size: int = 256
+    whiten: bool = False
+    """Whether a last linear layer spreads the descriptors evenly over their directions (models/whitening.py)."""
 
     def __post_init__(self):
         if not len(self.channels) == len(self.kernels) == len(self.strides):
@@ -40,36 +56,38 @@ class HeadConfig:
                 "the head needs as many kernels and strides as channels, found "
                 f"channels {self.channels}, kernels {self.kernels}, strides {self.strides}"
             )
+        if self.means and (len(self.means) != len(self.channels) or set(self.kernels) != {3}):
+            raise ValueError(
+                "a head that goes around needs a number of sectors for each convolution and 3 x 3 kernels, found "
+                f"means {self.means}, kernels {self.kernels}"
+            )
+
+    @property
+    def reads_features(self) -> bool:
+        """Whether there is a backbone in front of it."""
+        return self.input == "features"
+
+    @property
+    def reads_counts(self) -> bool:
+        """Whether it reads the image itself."""
+        return self.input in ("counts", "counts+labels")
 
     @property
     def reads_labels(self) -> bool:
-        """Whether a descriptor needs the semantic map too."""
-        return "labels" in self.input
+        """Whether a descriptor needs the true semantic map."""
+        return self.input in ("labels", "counts+labels")
 
-
-@dataclasses.dataclass(frozen=True)
-class RingConfig:
-    """A backbone of convolutions that go around the polar image (models/ring_net.py), a block for each width."""
-
-    average: int = 2
-    """Edge of the squares of polar pixels whose means the first block sees: without, the resampling skips cells."""
-    widths: tuple[int, ...] = (16, 32, 64, 96, 128, 160, 160)
-    strides: tuple[int, ...] = (2, 2, 1, 2, 1, 1, 1)
-    """Of each block, along the radius."""
-    means: tuple[int, ...] = (1, 1, 2, 1, 2, 1, 1)
-    """How many neighbouring sectors become one after each block."""
-
-    def __post_init__(self):
-        if not len(self.widths) == len(self.strides) == len(self.means):
-            raise ValueError(
-                "the ring net needs as many strides and means as widths, found "
-                f"widths {self.widths}, strides {self.strides}, means {self.means}"
-            )
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Which of its maps are drawn: what a picture is called, and the map's name."""
+        if self.cbam:
+            return {"CBAM": "cbam"}
+        return {"place head, first": "head_convolution0"} if self.channels else {}
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """A Swin-Unet, or a ring net, with a place head and a segmentation head, over images of `grid`."""
+    """SG-LPR (figure 2): a backbone with a place head and a segmentation head, over images of `grid`."""
 
     grid: Grid = Grid()
     image: ImageKind = "points"
@@ -85,71 +103,52 @@ class ModelConfig:
     """A second input channel with every cell's distance: how many points the bare ground returns depends on it, and
     windowed attention knows only relative positions."""
     polar: tuple[int, int] | None = None
-    """(rings, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
-    rings: RingConfig | None = None
-    """The backbone is a ring net in place of the Swin-Unet; the fields from `patch` to `drop_path` then say nothing."""
-    patch: int = 4
-    stem: tuple[int, ...] = ()
-    """Widths of convolutions before the patch embedding, the second and later ones at half the resolution of the one
-    before; the segmentation head sees each of them again. (): none, as in the paper."""
-    embed_dim: int = 96
-    depths: tuple[int, ...] = (2, 2, 2, 2)
-    heads: tuple[int, ...] = (3, 6, 12, 24)
-    window: int = 7
-    mlp_ratio: int = 4
-    drop_path: float = 0.2
+    """(radii, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
+    backbone: BackboneConfig = SwinConfig()
+    head: HeadConfig = HeadConfig()
+    """The place head."""
     categories: Categories = 20
-    """Into how many categories labels are sorted (figure 9, docs/labels.md); 0: no segmentation head."""
+    """Into how many categories labels are sorted (figure 9, docs/reference/labels.md); 0: no segmentation head."""
     detail: int = 0
     """Width of a layer that shows the segmentation head the image beside the features. 0: none, as in the paper."""
     compute: Literal["float32", "bfloat16"] = "float32"
     """In what matrices are multiplied and images convolved. Weights, norms, softmax, NetVLAD's sums, the descriptor and
     the losses are float32 all the same."""
-    head: HeadConfig = HeadConfig()
 
     def __post_init__(self):
         if self.head.reads_labels and not self.categories:
             raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
-        if len(self.depths) != len(self.heads):
-            raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
         if self.image == "density":
             check_density_grid(self.grid)
         if self.polar and self.field != "circle":
             raise ValueError(f"a polar image covers a circle: expected field 'circle', found {self.field!r}")
-        if self.stem and self.patch % 2 ** (len(self.stem) - 1):
+        if self.backbone.needs_polar and not self.polar:
             raise ValueError(
-                f"a stem of {len(self.stem)} widths makes pixels of {2 ** (len(self.stem) - 1)} cells, of which a "
-                f"patch must be made, found patch {self.patch}"
+                f"the backbone {self.backbone.kind!r} sees a polar image: expected model.polar (radii, sectors), "
+                "found none"
             )
-        if self.rings and not self.polar:
-            raise ValueError("a ring net sees a polar image: expected model.polar (rings, sectors), found none")
-        for size, step in zip(self.image_size, self._steps, strict=True):
-            if size % step:
-                raise ValueError(
-                    f"the backbone's image must be a multiple of {self._steps} cells, found {self.image_size}"
-                )
+        if self.head.means and not self.polar:
+            raise ValueError("a head that goes around needs a polar image: expected model.polar, found none")
+        rows_and_columns = zip(self.image_size, self.backbone.multiple, strict=True)
+        if any(size % step for size, step in rows_and_columns):
+            raise ValueError(
+                f"the backbone's image must be a multiple of {self.backbone.multiple} cells, found {self.image_size}"
+            )
 
     @property
-    def _steps(self) -> tuple[int, int]:
-        """Of how many rows and columns of the backbone's image its coarsest features are made."""
-        if self.rings:
-            return self.rings.average * math.prod(self.rings.strides), self.rings.average * math.prod(self.rings.means)
-        return (self.patch * 2 ** (len(self.depths) - 1),) * 2
+    def segments(self) -> bool:
+        """Whether there is a segmentation head."""
+        return self.head.reads_features and self.categories > 0
 
     @property
     def classes(self) -> int:
         """Classes of a semantic map, the unlabelled one included."""
-        return len(label_map(self.categories).names) if self.categories else 0
+        return len(taxonomy(self.categories).names) if self.categories else 0
 
     @property
     def categories_read(self) -> int:
         """The categories of the semantic maps that a descriptor needs; 0 where it needs none."""
         return self.categories if self.head.reads_labels else 0
-
-    @property
-    def segments(self) -> bool:
-        """Whether there is a segmentation head."""
-        return self.head.input == "features" and self.categories > 0
 
     @property
     def channels(self) -> int:
@@ -162,6 +161,8 @@ class ModelConfig:
         return self.polar or (self.grid.height, self.grid.width)
 
     @property
-    def token_pixels(self) -> int:
-        """Edge of a token's patch in pixels of the map that the backbone reads: the image, or the stem's last."""
-        return self.patch // 2 ** max(len(self.stem) - 1, 0)
+    def pictures(self) -> dict[str, str]:
+        """Of which maps heat maps are drawn: what a picture is called, and the map's name."""
+        if self.head.reads_features:
+            return {**self.backbone.pictures, **self.head.pictures}
+        return self.head.pictures or {"input of the place head": "raw_input"}

@@ -1,6 +1,6 @@
 """Resampling between the Cartesian image and a polar one, in which a rotation about the sensor is a shift.
 
-The polar image has `rings` rows, the innermost first, and `sectors` columns, counter-clockwise from x. It covers the
+The polar image has `radii` rows, the innermost first, and `sectors` columns, counter-clockwise from x. It covers the
 largest circle in the grid. Both directions are bilinear with fixed weights: a value is a weighted sum of four others.
 """
 
@@ -23,16 +23,16 @@ class Taps(NamedTuple):
 
 
 def to_polar(
-    image: Float[Array, "b h w c"], grid: Grid, rings: int, sectors: int
-) -> Float[Array, "b {rings} {sectors} c"]:
-    """The image read along rings and sectors."""
+    image: Float[Array, "b h w c"], grid: Grid, radii: int, sectors: int
+) -> Float[Array, "b {radii} {sectors} c"]:
+    """The image read along radii and sectors."""
     radius_cells = min(grid.height, grid.width) / 2
-    radius = (np.arange(rings) + 0.5) * (radius_cells / rings)
+    radius = (np.arange(radii) + 0.5) * (radius_cells / radii)
     angle = (np.arange(sectors) + 0.5) * (2 * np.pi / sectors)
     row = (grid.height - 1) / 2 - np.outer(radius, np.sin(angle))
     column = (grid.width - 1) / 2 + np.outer(radius, np.cos(angle))
     taps = _bilinear(row.clip(0, grid.height - 1), column.clip(0, grid.width - 1), grid.height, grid.width)
-    return _read(_flat(image), taps).reshape(len(image), rings, sectors, -1)
+    return _read(_flat(image), taps).reshape(len(image), radii, sectors, -1)
 
 
 def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {grid.height} {grid.width} c"]:
@@ -41,16 +41,16 @@ def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {g
     Differentiable in reverse mode only: its gradient is written as a reading too, because with the scatter that JAX
     makes of a gather's gradient, forward and backward took six times as long on a CPU.
     """
-    rings, sectors = polar.shape[1:3]
+    radii, sectors = polar.shape[1:3]
     down, right = np.mgrid[: grid.height, : grid.width]
     up, right = (grid.height - 1) / 2 - down, right - (grid.width - 1) / 2
     radius_cells = min(grid.height, grid.width) / 2
-    ring = np.hypot(up, right) * (rings / radius_cells) - 0.5
+    radius = np.hypot(up, right) * (radii / radius_cells) - 0.5
     sector = np.arctan2(up, right) % (2 * np.pi) * (sectors / (2 * np.pi)) - 0.5
-    taps = _bilinear(ring.clip(0, rings - 1), sector, rings, sectors)
+    taps = _bilinear(radius.clip(0, radii - 1), sector, radii, sectors)
     inside = (np.hypot(up, right) < radius_cells).reshape(-1)
     taps = Taps(taps.pixel, taps.weight * inside)
-    back = _transposed(taps, rings * sectors)
+    back = _transposed(taps, radii * sectors)
 
     @jax.custom_vjp
     def read(flat: Array) -> Array:

@@ -3,56 +3,57 @@
 import dataclasses
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.models.config import HeadConfig, ModelConfig, RingConfig
+from sglpr_jax.models.backbones.rings import RingConfig
+from sglpr_jax.models.backbones.sglpr import SglprConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig
 
-_HEAD_B = HeadConfig(tap="pixels", channels=(128, 256, 512), kernels=(4, 3, 3), strides=(4, 2, 2))
 _PAPER = ModelConfig()
+_SMALL_SWIN = SwinConfig(patch=8, embed_dim=64, depths=(2, 2, 2), heads=(2, 4, 8), window=4, drop_path=0.0)
 _SMALL = ModelConfig(
     grid=Grid(resolution_m=0.4, height=128, width=128),
     field="circle",
     blind_m=2.6,
     range_channel=True,
     polar=(64, 256),
-    patch=8,
-    embed_dim=64,
-    depths=(2, 2, 2),
-    heads=(2, 4, 8),
-    window=4,
-    drop_path=0.0,
-    detail=32,
+    backbone=_SMALL_SWIN,
     head=HeadConfig(tap="tokens", channels=(64, 128, 256), kernels=(3, 3, 3), strides=(1, 1, 2)),
-)
-_RINGS = dataclasses.replace(
-    _SMALL,
-    image="density",
-    rings=RingConfig(),
-    head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
+    detail=32,
 )
 
 MODELS: dict[str, ModelConfig] = {
     # The paper's model, its head read literally: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
     "paper": _PAPER,
     # A third of that head's cost: the first convolution undoes the x4 expansion in one step.
-    "paper-head-b": dataclasses.replace(_PAPER, head=_HEAD_B),
+    "paper-head-b": dataclasses.replace(_PAPER, head=HeadConfig(kernels=(4, 3, 3), strides=(4, 2, 2))),
     # The paper says "projection radius 11.2 m", which its own eq. 1 gives only with cells of 0.1 m.
     "paper-11m": dataclasses.replace(_PAPER, grid=Grid(resolution_m=0.1)),
     # Trains on two CPU cores within the hour; its window is that of the ready-made KITTI images (+-25.6 m).
     "small": _SMALL,
     # With convolutions in front, which learn the semantic map better (docs/results.md); a step takes longer.
-    "small-stem": dataclasses.replace(_SMALL, stem=(16, 32, 64)),
-    # A convolutional backbone that turns with the scan.
-    "rings": _RINGS,
+    "small-stem": dataclasses.replace(_SMALL, backbone=dataclasses.replace(_SMALL_SWIN, stem=(16, 32, 64))),
+    # A convolutional backbone that a rotation of the scan only shifts.
+    "rings": dataclasses.replace(
+        _SMALL,
+        image="density",
+        backbone=RingConfig(),
+        head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
+    ),
+    # The paper's parts in a form that follows a rotation: circular convolutions, then windows, CBAM, NetVLAD.
+    "sglpr": dataclasses.replace(
+        _SMALL,
+        image="density",
+        backbone=SglprConfig(),
+        head=HeadConfig(tap="tokens", channels=(96, 128, 160), strides=(2, 1, 1), means=(1, 2, 1)),
+        detail=0,
+    ),
     # Smaller still, for bin/demo.
-    "demo": dataclasses.replace(_SMALL, embed_dim=32, heads=(1, 2, 4)),
+    "demo": dataclasses.replace(_SMALL, backbone=dataclasses.replace(_SMALL_SWIN, embed_dim=32, heads=(1, 2, 4))),
     # For tests: every part of the model, next to no arithmetic.
     "tiny": ModelConfig(
         grid=Grid(resolution_m=1.6, height=32, width=32),
-        embed_dim=8,
-        depths=(1, 1),
-        heads=(1, 2),
-        window=4,
-        drop_path=0.1,
-        head=HeadConfig(channels=(8, 8, 16), kernels=(4, 3, 3), strides=(4, 2, 1), clusters=4, descriptor_size=256),
+        backbone=SwinConfig(embed_dim=8, depths=(1, 1), heads=(1, 2), window=4, drop_path=0.1),
+        head=HeadConfig(channels=(8, 8, 16), kernels=(4, 3, 3), strides=(4, 2, 1), clusters=4),
     ),
 }
 

@@ -1,46 +1,32 @@
-"""SG-LPR whole (figure 2): shared Swin-Unet features, the place head, and the segmentation head of training time."""
+"""SG-LPR whole (figure 2): a shared backbone, the place head, and the segmentation head of training time."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
-import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from sglpr_jax.bev import Grid
 from sglpr_jax.labels import UNLABELLED
+from sglpr_jax.models.backbones.interface import Backbone, Seen
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.detail import Detail
-from sglpr_jax.models.layers import Linear, torch_uniform
-from sglpr_jax.models.place_head import PlaceHead
-from sglpr_jax.models.polar import from_polar, to_polar
+from sglpr_jax.models.heads.place import PlaceHead
+from sglpr_jax.models.heads.raw_input import raw_input
+from sglpr_jax.models.heads.segmentation import segmentation_head
+from sglpr_jax.models.input_image import backbone_view, field_of_view, prepare
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.raw_place import RawPlace
-from sglpr_jax.models.ring_net import RingDecoder, RingNet
-from sglpr_jax.models.stem import Stem, StemDecoder
-from sglpr_jax.models.swin import FinalPatchExpand
-from sglpr_jax.models.swin_unet import SwinUnet
-
-CLIP_COUNT = 10.0
-
-
-@flax.struct.dataclass
-class Params:
-    """Weights together with the model they belong to: a pytree whose static part is `config`."""
-
-    weights: Any
-    config: ModelConfig = flax.struct.field(pytree_node=False)
 
 
 class Outputs(NamedTuple):
-    """What one pass gives: descriptors (b, 256), logits (b, h, w, classes) if asked for, and every named map."""
+    """What one pass gives: descriptors, logits where asked for, and every map on the way."""
 
-    descriptor: Array
+    descriptor: Float[Array, "b d"]
+    """Of length 1; 256 numbers in the paper."""
     logits: Any
+    """(b, h, w, classes), or None where they were not asked for or the model has no segmentation head."""
     intermediates: dict[str, Array]
+    """Every map by name."""
 
 
 class SGLPR(nn.Module):
@@ -49,101 +35,40 @@ class SGLPR(nn.Module):
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, image: Float[Array, "b h w c"], *, segment: int = 0, train: bool = False) -> Outputs:
-        """`segment` n: semantic logits of every n-th image (True: of all); 0: that head does not exist."""
-        config, seen, circular = self.config, image, self.config.polar is not None
-        if config.polar:
-            seen = to_polar(image, config.grid, *config.polar)
-        seen = seen.astype(config.compute)
-        tokens, maps, intermediates = self._backbone(seen, train)
-        expand = self._expansion()
-        reads_pixels = config.head.tap == "pixels"
-        features = expand(tokens, maps) if reads_pixels else tokens
-        descriptor, head = PlaceHead(config.head, circular, name="place_head")(features)
-        logits = None
-        if segment:
-            pixels = (
-                features[::segment] if reads_pixels else expand(*jax.tree.map(lambda x: x[::segment], (tokens, maps)))
-            )
-            intermediates["pixels"] = pixels
-            logits = self._logits(pixels, image[::segment])
-        return Outputs(descriptor, logits, intermediates | head)
+    def __call__(
+        self,
+        image: Float[Array, "b h w c"],
+        labels: Int[Array, "b h w"] | None = None,
+        *,
+        segment: int = 1,
+        train: bool = False,
+    ) -> Outputs:
+        """`segment` n: semantic logits of every n-th image, where there is such a head; 0: of none.
 
-    def _backbone(self, seen: Float[Array, "b p q c"], train: bool) -> tuple[Array, list[Array], dict[str, Array]]:
-        """Features, the maps on the way that the segmentation head looks at again, and every named map."""
-        config, circular = self.config, self.config.polar is not None
-        if config.rings:
-            maps = RingNet(config.rings, name="rings")(seen)
-            return maps[-1], maps, {f"ring_block{i}": seen for i, seen in enumerate(maps[1:])}
-        maps = Stem(config.stem, circular, name="stem")(seen) if config.stem else []
-        tokens, intermediates = SwinUnet(
-            embed_dim=config.embed_dim,
-            depths=config.depths,
-            heads=config.heads,
-            window=config.window,
-            mlp_ratio=config.mlp_ratio,
-            patch=config.token_pixels,
-            drop_path=config.drop_path,
-            circular=circular,
-            name="backbone",
-        )(maps[-1] if maps else seen, train=train)
-        return tokens, maps, intermediates
-
-    def _expansion(self) -> Callable[[Array, list[Array]], Array]:
-        """From tokens to pixels: a linear layer, or past the maps of the stem."""
-        config = self.config
-        if config.rings:
-            decoder = RingDecoder(name="decoder")
-            return lambda _, maps: decoder(maps)
-        if config.stem:
-            return StemDecoder(config.token_pixels, config.polar is not None, name="decoder")
-        expand = FinalPatchExpand(config.patch, name="expand")
-        return lambda tokens, _: expand(tokens)
-
-    def _logits(self, pixels: Float[Array, "b p q c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w k"]:
-        """The segmentation head. Few channels cross from the polar image to the grid: a linear layer comes first.
-
-        The logits, and what is resampled, are float32.
+        `labels` are for a place head that reads them, which stands alone: it has no backbone (table 6).
         """
         config = self.config
-        to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
-        crossing = Linear(config.detail, name="narrow")(pixels) if config.detail else to_logits(pixels)
-        on_grid = crossing.astype(jnp.float32)
-        on_grid = from_polar(on_grid, config.grid) if config.polar else on_grid
-        if not config.detail:
-            return on_grid
-        detailed = Detail(config.detail, name="detail")(on_grid.astype(config.compute), image)
-        return to_logits(detailed).astype(jnp.float32)
+        place_head = PlaceHead(config.head, circular=config.polar is not None, name="place_head")
+        if not config.head.reads_features:
+            features = raw_input(image, labels, config)
+            descriptor, maps = place_head(features)
+            return Outputs(descriptor, None, {"raw_input": features, **maps})
+        backbone = config.backbone.build(circular=config.polar is not None)
+        seen = backbone(backbone_view(image, config), train=train)
+        pixels = backbone.decode(seen) if config.head.tap == "pixels" else None
+        descriptor, maps = place_head(seen.features if pixels is None else pixels)
+        maps = {**seen.named, **maps}
+        if not (segment and config.segments):
+            return Outputs(descriptor, None, maps)
+        pixels = _decode_every(segment, backbone, seen) if pixels is None else pixels[::segment]
+        logits = segmentation_head(pixels, image[::segment], config)
+        return Outputs(descriptor, logits, {**maps, "pixels": pixels})
 
 
-def prepare(
-    bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfig
-) -> Float[Array, "b h w {config.channels}"]:
-    """Point counts as network input: rescaled as `config.counts` says, blank where it does not see."""
-    image = jnp.asarray(bev, jnp.float32)
-    if config.counts == "log1p":
-        image = jnp.log1p(image)
-    elif config.counts == "clipped":
-        image = jnp.minimum(image, CLIP_COUNT) / CLIP_COUNT
-    image = jnp.where(field_of_view(config), image, 0.0)[..., None]
-    if config.range_channel:
-        distance = cell_distance(config.grid) / cell_distance(config.grid).max()
-        image = jnp.concatenate([image, jnp.broadcast_to(distance[None, ..., None], image.shape)], axis=-1)
-    return image
-
-
-def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
-    """Which cells the network sees: all, or those inside the largest circle, but not those of the vehicle itself."""
-    grid, distance = config.grid, cell_distance(config.grid)
-    seen = (distance < grid.resolution_m * min(grid.height, grid.width) / 2) | (config.field == "square")
-    return (seen & (distance >= config.blind_m))[None]
-
-
-def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
-    """How far the middle of each cell lies from the sensor, metres."""
-    down, right = np.mgrid[: grid.height, : grid.width]
-    cells = np.hypot(down - (grid.height - 1) / 2, right - (grid.width - 1) / 2)
-    return (grid.resolution_m * cells).astype(np.float32)
+def _decode_every(n: int, backbone: Backbone, seen: Seen) -> Float[Array, "b p q c"]:
+    """The pixels of every n-th image."""
+    finer = [one[::n] for one in seen.finer]
+    return backbone.decode(Seen(seen.features[::n], finer, named={}))
 
 
 @jax.jit
@@ -191,13 +116,14 @@ def forward(
     image = prepare(bev.reshape(-1, grid.height, grid.width), config)
     if labels is not None:
         labels = jnp.where(field_of_view(config), labels.reshape(image.shape[:-1]), UNLABELLED)
-    variables = {"params": params.weights}
-    outputs: Any
-    if config.head.input != "features":
-        outputs = RawPlace(config).apply(variables, image, labels)
-        return Outputs(outputs[0], None, outputs[1])
-    train, rngs = key is not None, None if key is None else {"drop_path": key}
-    outputs = SGLPR(config).apply(variables, image, segment=config.segments and segment, train=train, rngs=rngs)
+    outputs: Any = SGLPR(config).apply(
+        {"params": params.weights},
+        image,
+        labels,
+        segment=segment,
+        train=key is not None,
+        rngs=None if key is None else {"drop_path": key},
+    )
     return outputs
 
 
@@ -217,9 +143,5 @@ def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None
     """Fresh weights for a named preset, or for a `config` of your own; only those that it needs."""
     config = model_preset(preset) if config is None else config
     image = jnp.zeros((1, config.grid.height, config.grid.width, config.channels))
-    if config.head.input != "features":
-        weights = jax.jit(RawPlace(config).init)(key, image, jnp.zeros(image.shape[:-1], jnp.int32))["params"]
-    else:
-        make = jax.jit(SGLPR(config).init, static_argnames="segment")
-        weights = make(key, image, segment=config.segments)["params"]
-    return Params(weights, config)
+    labels = jnp.zeros(image.shape[:-1], jnp.int32) if config.head.reads_labels else None
+    return Params(jax.jit(SGLPR(config).init)(key, image, labels)["params"], config)

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import flax.traverse_util
 import jax
 import numpy as np
 
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.sglpr import SGLPR, Params
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import SGLPR
+from sglpr_jax.models.weights import as_tree, by_name
 
 _RULES = (
     (r"^backbone/", ""),
@@ -122,15 +124,16 @@ def from_torch_names(
         weights[name] = _flax_layout(name, state[source], input_channels)
         if weights[name].shape != shape:
             raise ValueError(f"{source}: expected shape {shape} (in Flax's order), found {weights[name].shape}")
-    return flax.traverse_util.unflatten_dict(weights, sep="/")
+    return as_tree(weights)
 
 
 def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
     """A Swin-T by its PyTorch names into `params`; see `import_swin_t`."""
-    last = len(params.config.depths) - 1
-    weights = _flatten(params.weights)
+    expected = _expected_shapes(params.config, 1)
+    last = len(_swin(params.config).depths) - 1
+    weights = by_name(params.weights)
     copied, used, misshapen = [], set(), set()
-    for name in _expected_shapes(params.config, 1):
+    for name in expected:
         source = re.sub(r"^layers_up\.(\d+)\.blocks", lambda m: f"layers.{last - int(m[1])}.blocks", torch_name(name))
         if source not in state:
             continue
@@ -144,8 +147,7 @@ def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
     unused = sorted(set(state) - used)
     _check_swin_t(copied, [name for name in unused if name not in misshapen and not _SWIN_T_ONLY.fullmatch(name)])
     kept = tuple(sorted(set(weights) - set(copied)))
-    tree = flax.traverse_util.unflatten_dict(weights, sep="/")
-    return SwinTImport(dataclasses.replace(params, weights=tree), tuple(copied), kept, tuple(unused))
+    return SwinTImport(dataclasses.replace(params, weights=as_tree(weights)), tuple(copied), kept, tuple(unused))
 
 
 def torch_name(name: str) -> str:
@@ -157,15 +159,19 @@ def torch_name(name: str) -> str:
 
 def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tuple[int, ...]]:
     """Shapes of all weights that a Swin-Unet shares with the model: all but the place head's."""
-    if config.head.input != "features":
-        raise ValueError(f"expected a model with a backbone, found one that describes a place from {config.head.input}")
+    _swin(config)
     image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, input_channels), np.float32)
-    init = jax.eval_shape(lambda key, x: SGLPR(config).init(key, x, segment=config.segments), jax.random.key(0), image)
-    return {name: leaf.shape for name, leaf in _flatten(init["params"]).items() if not name.startswith("place_head/")}
+    shapes = jax.eval_shape(SGLPR(config).init, jax.random.key(0), image)["params"]
+    return {name: leaf.shape for name, leaf in by_name(shapes).items() if not name.startswith("place_head/")}
 
 
-def _flatten(weights: Any) -> dict[str, Any]:
-    return flax.traverse_util.flatten_dict(weights, sep="/")
+def _swin(config: ModelConfig) -> SwinConfig:
+    """The backbone, where it is a Swin-Unet; ValueError where it is another, or there is none."""
+    if not config.head.reads_features:
+        raise ValueError(f"expected a model with a backbone, found one that describes a place from {config.head.input}")
+    if not isinstance(config.backbone, SwinConfig):
+        raise ValueError(f"expected a model with the backbone 'swin', found {config.backbone.kind!r}")
+    return config.backbone
 
 
 def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The descriptor file: what embedding writes and evaluation reads, whatever method made the descriptors."""
 
 import json
-import os
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.files import writing
+from sglpr_jax.files import replacing
 
 FORMAT = "sglpr-jax descriptors 2"
 """Stands in every file; its number grows when an older reader could no longer understand one."""
@@ -45,7 +44,7 @@ class DescriptorFile:
     weights_hash: str
     """Names the weights; empty for a method without any."""
     distance: str = "l2"
-    """The name in `evaluation.distances` of the function that compares two descriptors."""
+    """The name in `retrieval.distances` of the function that compares two descriptors."""
 
     def __post_init__(self):
         n = len(self.ids)
@@ -60,25 +59,21 @@ class DescriptorFile:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write the file whole or not at all: a broken run leaves what was at `path` before."""
         about = {"format": FORMAT, **{name: getattr(self, name) for name in ABOUT}}
         arrays = {"descriptors": self.descriptors, "positions": self.positions, "times": self.times}
         present = {name: array for name, array in arrays.items() if array is not None}
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            with writing(path), temporary.open("wb") as stream:
-                np.savez(stream, about=np.array(json.dumps(about)), ids=np.array(self.ids), **present)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replacing(Path(path)) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, about=np.array(json.dumps(about)), ids=np.array(self.ids), **present)
 
     @classmethod
-    def load(cls, path: Path) -> "DescriptorFile":
+    def load(cls, path: Path | str) -> "DescriptorFile":
         """Read a file that `save` wrote.
 
         Raises FileNotFoundError, or ValueError naming the file, what was expected and what was found.
         """
+        path = Path(path)
         arrays = _read_archive(path)
         if not set(REQUIRED) <= set(arrays):
             raise ValueError(f"{path}: expected arrays {', '.join(REQUIRED)}; found {', '.join(arrays) or 'none'}")

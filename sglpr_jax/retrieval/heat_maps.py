@@ -7,28 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
+from sglpr_jax.models.input_image import field_of_view
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.polar import from_polar
-from sglpr_jax.models.sglpr import Params, field_of_view, forward
+from sglpr_jax.models.sglpr import forward
 
 
 def heat_maps(
     params: Params, bev: Num[Array | np.ndarray, "h w"], labels: Int[Array | np.ndarray, "h w"] | None = None
 ) -> Mapping[str, Float[np.ndarray, "h w"]]:
-    """Return by name the root mean square over the channels of a feature map, from 0 to 1; NaN where it does not look.
+    """The root mean square over the channels of some feature maps, by name; from 0 to 1, NaN where the model is blind.
 
-    The maps are those after the first and the last stage of the encoder, after the decoder, and after CBAM, of those
-    that the model has, and after the first convolution of a place head without CBAM. `labels` as `describe` needs them.
+    The model says which maps they are (`config.pictures`): those of its backbone, and the first of its place head.
+    `bev` is one image of point counts, `labels` its map of classes where `describe` needs one.
     """
     found = jax.device_get(_maps(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
-    return {name: _scaled(found[layer]) for name, layer in _layers(params).items()}
-
-
-def _layers(params: Params) -> dict[str, str]:
-    """Return which intermediate is shown under which name; a normalised one would be as strong everywhere."""
-    last = len(params.config.depths) - 1
-    backbone = {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
-    head = {"CBAM": "cbam"} if params.config.head.cbam else {"place head, first": "head_convolution0"}
-    return backbone | head if params.config.head.input == "features" else head
+    return {title: _scaled(found[name]) for title, name in params.config.pictures.items()}
 
 
 def _scaled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -38,15 +32,15 @@ def _scaled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 @jax.jit
 def _maps(params: Params, bev: Num[Array, "h w"], labels: Int[Array, "h w"] | None) -> dict[str, Float[Array, "h w"]]:
-    grid = params.config.grid
+    config, grid = params.config, params.config.grid
     outputs = forward(params, bev, labels, segment=0)
 
     def on_grid(features: Float[Array, "1 p q c"]) -> Float[Array, "h w"]:
         strength = jnp.sqrt(jnp.mean(features.astype(jnp.float32) ** 2, axis=-1, keepdims=True))
-        if params.config.polar:
+        if config.polar:
             whole = from_polar(strength, grid)[0, ..., 0]
         else:
             whole = jax.image.resize(strength[0, ..., 0], (grid.height, grid.width), "linear")
-        return jnp.where(field_of_view(params.config)[0], whole, jnp.nan)
+        return jnp.where(field_of_view(config)[0], whole, jnp.nan)
 
-    return {layer: on_grid(outputs.intermediates[layer]) for layer in set(_layers(params).values())}
+    return {name: on_grid(outputs.intermediates[name]) for name in config.pictures.values()}

@@ -1,17 +1,25 @@
 """From a scan or a ready-made image to its semantic map, by the head that training uses."""
 
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Array, Bool, Float, Int
+from PIL import Image
 
-from sglpr_jax.bev import centre_crop, even_cells
-from sglpr_jax.data.sequence import Drive, ScanSequence
-from sglpr_jax.labels import UNLABELLED, to_classes
-from sglpr_jax.models.sglpr import Params, field_of_view, segment
-from sglpr_jax.retrieval.scan_views import scan_views
+from sglpr_jax.bev import uncropped
+from sglpr_jax.data.formats.label_images import label_image_pixels
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.views import view
+from sglpr_jax.files import replacing
+from sglpr_jax.labels import UNLABELLED, to_raw
+from sglpr_jax.models.input_image import field_of_view
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import segment
 
 
 class SemanticMap(NamedTuple):
@@ -29,39 +37,49 @@ class SemanticMap(NamedTuple):
         return self.predicted != UNLABELLED
 
 
-def semantic_map(
+def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0) -> SemanticMap:
+    """Predict the class of every cell of a scan, or of a ready-made image, that holds a point.
+
+    An image is cut to the model's grid, and its pixels above 0 are the cells that hold a point. Labels of the record
+    become the true map. Cells whose likeliest class is less probable than `min_confidence` are left unlabelled.
+
+    Example:
+      found = semantic_map(params, recording.record(0))
+    """
+    config = params.config
+    categories = 0 if record.labels is None else config.categories
+    counts, truth = view(record, config.grid, image=config.image, categories=categories)
+    truth = jnp.zeros(counts.shape, jnp.int32) if truth is None else truth
+    return SemanticMap(*jax.device_get((counts, *_maps(params, counts, truth, jnp.float32(min_confidence)))))
+
+
+def semantic_maps(
     params: Params,
-    points: Float32[np.ndarray, "n 3"],
-    classes: Int[np.ndarray, " n"] | None = None,
+    recording: Recording,
+    rows: Sequence[int] | None = None,
     *,
     min_confidence: float = 0.0,
-) -> SemanticMap:
-    """Predict the class of every cell that holds a point. `classes` are the points' true ones, if known.
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Iterator[tuple[int, Record, SemanticMap]]:
+    """Yield the row, the record and the semantic map of every scan of a recording, or of those in `rows`.
 
-    Cells whose likeliest class is less probable than `min_confidence` are left unlabelled.
+    `on_progress` is told how many are done. See `semantic_map`.
     """
-    classes = np.zeros(len(points), np.int32) if classes is None else classes
-    counts, truth = scan_views(points, params.config.grid, image=params.config.image, classes=classes)
-    return _semantic_map(params, counts, truth, min_confidence)
+    for done, row in enumerate(range(len(recording)) if rows is None else rows):
+        record = recording.record(row)
+        yield row, record, semantic_map(params, record, min_confidence=min_confidence)
+        on_progress(done + 1)
 
 
-def read_semantic_map(params: Params, sequence: Drive, row: int, *, min_confidence: float = 0.0) -> SemanticMap:
-    """Read a scan or an image of a sequence, with its labels if it has any, and predict as `semantic_map` does.
-
-    A ready-made image is cut to the model's grid, and its pixels above 0 are the cells that hold a point.
-    """
-    raw, grid = sequence.labels(row), params.config.grid
-    classes = None if raw is None else to_classes(raw, categories=params.config.categories)
-    if isinstance(sequence, ScanSequence):
-        return semantic_map(params, sequence.points(row), classes, min_confidence=min_confidence)
-    image = sequence.image(row)
-    whole = image, np.zeros(image.shape, np.int32) if classes is None else classes
-    counts, truth = (centre_crop(even_cells(jnp.asarray(x)), height=grid.height, width=grid.width) for x in whole)
-    return _semantic_map(params, counts, truth, min_confidence)
-
-
-def _semantic_map(params: Params, counts: Array, truth: Array, min_confidence: float) -> SemanticMap:
-    return SemanticMap(*jax.device_get((counts, *_maps(params, counts, truth, jnp.float32(min_confidence)))))
+def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int) -> None:
+    """Write a map as a PNG: class ids on the model's grid; of a ready-made image its label image, 0 beyond the grid."""
+    if record.image is None:
+        pixels = found.predicted.astype(np.uint8)
+    else:
+        raw = to_raw(found.predicted, categories=categories)
+        pixels = label_image_pixels(uncropped(raw, shape=record.image.shape))
+    with replacing(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")
 
 
 @jax.jit

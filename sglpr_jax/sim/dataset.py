@@ -1,20 +1,19 @@
 """Simulated drives on disk, resumable: the same seed gives the same bytes."""
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import json
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from sglpr_jax.files import replacing
 from sglpr_jax.sim.drive import RATE_HZ, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
+from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
-from sglpr_jax.sim.sequence import SimulatedSequence, simulate_sequence
 from sglpr_jax.sim.sessions import plan_sessions
 
 SETTINGS_FILE = "simulation.json"
@@ -41,7 +40,7 @@ def write_dataset(
     """Write the routes `names`, and the drives along the pose files `along`, into the folder `root`; return `root`.
 
     Every drive has a town of its own, drawn from `seed` and the drive's name, and `scans` scans (along a pose file: at
-    most so many, see `simulate_sequence`). `layout` is "scans" or "images", see `LAYOUTS`. Files that are there already
+    most so many, see `simulate_recording`). `layout` is "scans" or "images", see `LAYOUTS`. Files that are there
     are kept, so a run that was cut off goes on where it stopped, to the same bytes; every file is whole or not there.
     `progress(name, done, scans)` is called as scans are done.
 
@@ -61,7 +60,7 @@ def write_dataset(
     for name, file in files.items():
         options = {"along": file, "scans": scans, "sensor": sensor, "seed": seed, "rate_hz": rate_hz}
         count = scans if file is None else len(thinned(read_path(file), scans).times)
-        simulate = functools.partial(simulate_sequence, name, **options)
+        simulate = functools.partial(simulate_recording, name, **options)
         show = functools.partial(progress, name) if progress else lambda done, scans: None
         ids = tuple(f"{i:06d}" for i in range(count))
         _write_drive(root, name, simulate, ids=ids, layout=LAYOUTS[layout], progress=show)
@@ -131,7 +130,7 @@ def _read_settings(path: Path) -> dict:
 def _write_drive(
     root: Path,
     name: str,
-    simulate: Callable[[], SimulatedSequence],
+    simulate: Callable[[], SimulatedRecording],
     *,
     ids: Sequence[str],
     layout: Layout,
@@ -143,10 +142,10 @@ def _write_drive(
     progress(scans - len(missing), scans)
     if not missing and layout.is_finished(root, name):
         return
-    sequence = simulate()
+    recording = simulate()
 
     def write_scan(i: int) -> None:
-        contents = layout.scan_contents(*sequence.render(i))
+        contents = layout.scan_contents(*recording.render(i))
         for file, content in zip(layout.files_of_scan(root, name, ids[i]), contents, strict=True):
             _write(file, content)
 
@@ -157,19 +156,11 @@ def _write_drive(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    for file, content in layout.drive_contents(sequence.drive).items():
+    for file, content in layout.drive_contents(recording.poses).items():
         _write(layout.file_of_drive(root, name, file), content)
 
 
 def _write(path: Path, content: bytes) -> None:
     """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
         temporary.write_bytes(content)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OSError(f"{path}: could not write this file of the simulated dataset ({error})") from error
-    finally:
-        with contextlib.suppress(OSError):  # it is gone where all went well
-            temporary.unlink()

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.pose_files import read_poses, read_times
+from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.poses import positions_from_camera
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.routes import ROLES, STEP_M, plan_route, travelled
@@ -36,7 +36,7 @@ FREE_SPEED = 1.35
 """Speed on a free street, as a multiple of the mean one."""
 
 
-class Trajectory(NamedTuple):
+class PlanarPath(NamedTuple):
     """The vehicle's way in the plane."""
 
     xy: np.ndarray  # (n, 2) metres, of the LiDAR
@@ -44,14 +44,14 @@ class Trajectory(NamedTuple):
     times: np.ndarray  # (n,) seconds, from 0
 
 
-class Drive(NamedTuple):
+class TimedPoses(NamedTuple):
     """Where the LiDAR was, and when."""
 
     world_from_lidar: np.ndarray  # (n, 4, 4) float64; x forward, y left, z up, metres
     times: np.ndarray  # (n,) seconds
 
 
-def plan_trajectory(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> Trajectory:
+def plan_scan_path(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> PlanarPath:
     """Return where the `scans` scans of route `name` are taken, evenly spread in time.
 
     The route is as long as a car gets in `scans / rate_hz` seconds, but takes SHORTEST_S at least. The vehicle keeps to
@@ -63,8 +63,8 @@ def plan_trajectory(rng: np.random.Generator, name: str, *, scans: int, rate_hz:
 
 def plan_path(
     rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ, days: int = 1
-) -> Trajectory:
-    """Return the whole way of `plan_trajectory`, a pose about every 0.1 s: a whole multiple of `scans * days` poses.
+) -> PlanarPath:
+    """Return the whole way of `plan_scan_path`, a pose about every 0.1 s: a whole multiple of `scans * days` poses.
 
     With more than one `days`, equal parts of it are that many drives through the same streets, one after the other.
     """
@@ -78,10 +78,10 @@ def plan_path(
     poses = scans * days
     times = np.linspace(0, clock[-1], poses * max(1, round(clock[-1] * PATH_HZ / poses)))
     x, y, yaw = (np.interp(times, clock, values) for values in (*path.T, heading))
-    return Trajectory(np.stack([x, y], axis=1), yaw, times)
+    return PlanarPath(np.stack([x, y], axis=1), yaw, times)
 
 
-def read_path(file: Path) -> Trajectory:
+def read_path(file: Path) -> PlanarPath:
     """Return the way of a KITTI pose file: 12 numbers a line, the camera's pose; 0.1 s a line.
 
     Where a `times.txt` lies beside it, the times are its. Distances in x and y are exactly the file's; heights, pitch
@@ -98,7 +98,7 @@ def read_path(file: Path) -> Trajectory:
         line = int(np.argmin(np.diff(times))) + 2
         raise ValueError(f"{times_file}, line {line}: expected a time > {times[line - 2]}, found {times[line - 1]}")
     yaw = np.arctan2(-poses[:, 0, 2], poses[:, 2, 2])  # where the camera's z axis points
-    return Trajectory(positions_from_camera(poses)[:, :2], yaw, times - times[0])
+    return PlanarPath(positions_from_camera(poses)[:, :2], yaw, times - times[0])
 
 
 def name_of_path(file: Path) -> str:
@@ -106,17 +106,17 @@ def name_of_path(file: Path) -> str:
     return file.resolve().parent.name if file.name == "poses.txt" else file.stem
 
 
-def thinned(path: Trajectory, scans: int) -> Trajectory:
+def thinned(path: PlanarPath, scans: int) -> PlanarPath:
     """Every k-th pose, with the smallest k that leaves at most `scans` of them."""
-    return Trajectory(*(values[every_kth(path, scans)] for values in path))
+    return PlanarPath(*(values[every_kth(path, scans)] for values in path))
 
 
-def every_kth(path: Trajectory, scans: int) -> slice:
+def every_kth(path: PlanarPath, scans: int) -> slice:
     """Which poses of `path` are those of `thinned`."""
     return slice(None, None, -(-len(path.times) // scans))
 
 
-def speeds(path: Trajectory) -> Float[np.ndarray, " n"]:
+def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
     """How fast the vehicle is at every pose, in metres per second."""
     return np.linalg.norm(np.gradient(path.xy, path.times, axis=0), axis=1)
 

@@ -1,4 +1,4 @@
-"""How a simulated drive lies on disk: scans in KITTI's layout or NCLT's, or images with label maps in BEVPlace's."""
+"""How a simulated drive lies on disk: scans in KITTI's layout or NCLT's, or images with label images in BEVPlace's."""
 
 import io
 from collections.abc import Callable
@@ -10,9 +10,9 @@ from jaxtyping import Float, UInt
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.density_image import density_image, density_label_map
-from sglpr_jax.data.scan_files import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
-from sglpr_jax.sim.drive import Drive
+from sglpr_jax.data.density_image import density_image, density_label_image
+from sglpr_jax.data.formats.scan_files import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
+from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -28,7 +28,7 @@ class Layout(NamedTuple):
     """Of scan `{id}`."""
     scan_contents: Callable[[np.ndarray, np.ndarray], tuple[bytes, ...]]
     """What is in them, from points (n, 4) and labels (n,)."""
-    drive_contents: Callable[[Drive], dict[str, bytes]]
+    drive_contents: Callable[[TimedPoses], dict[str, bytes]]
     """The files of the drive as a whole, by their names, written when all its scans are there."""
     last_file: str
     """Of these; says that the drive is finished."""
@@ -54,7 +54,7 @@ def _image_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray) -> t
     """A density image and the raw ids of what its pixels show; an empty pixel shows nothing."""
     xyz = points[:, :3].astype(np.float32)
     image = density_image(xyz)
-    shown = np.where(image > 0, density_label_map(xyz, labels), 0)
+    shown = np.where(image > 0, density_label_image(xyz, labels), 0)
     return _png(image), _png(shown.astype(np.uint16))
 
 
@@ -68,22 +68,22 @@ def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
     return " ".join(f"{value:.9g}" for value in matrix[:3].ravel()) + "\n"
 
 
-def _kitti_files(drive: Drive) -> dict[str, bytes]:
+def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
     """Calibration, times and poses; nothing here has a camera, so its projections are identities.
 
     A line of poses.txt is world_from_camera, in a world whose axes are a camera's as well.
     """
     projections = "".join(f"P{i}: {_row(np.eye(4))}" for i in range(4))
-    poses = CAMERA_FROM_LIDAR @ drive.world_from_lidar @ CAMERA_FROM_LIDAR.T
+    world_from_camera = CAMERA_FROM_LIDAR @ poses.world_from_lidar @ CAMERA_FROM_LIDAR.T
     return {
         "calib.txt": f"{projections}Tr: {_row(CAMERA_FROM_LIDAR)}".encode(),
-        "times.txt": "".join(f"{time:.6e}\n" for time in drive.times).encode(),
-        "poses.txt": "".join(_row(pose) for pose in poses).encode(),
+        "times.txt": "".join(f"{time:.6e}\n" for time in poses.times).encode(),
+        "poses.txt": "".join(_row(pose) for pose in world_from_camera).encode(),
     }
 
 
-def _bevplace_files(drive: Drive) -> dict[str, bytes]:
-    return {"pose.txt": "".join(_row(pose) for pose in drive.world_from_lidar).encode()}
+def _bevplace_files(poses: TimedPoses) -> dict[str, bytes]:
+    return {"pose.txt": "".join(_row(pose) for pose in poses.world_from_lidar).encode()}
 
 
 def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray) -> tuple[bytes, ...]:
@@ -100,15 +100,15 @@ def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray) -> tuple[by
     return (records.tobytes(),)
 
 
-def _nclt_files(drive: Drive) -> dict[str, bytes]:
+def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
     """The ground truth, north, east, down: one row per scan, where NCLT has a hundred a second."""
     lidar_from_body = np.eye(4)
     lidar_from_body[2, 3] = -NCLT_HEIGHT_M
-    world_from_body = drive.world_from_lidar @ lidar_from_body
+    world_from_body = poses.world_from_lidar @ lidar_from_body
     turns = np.diag(Z_UP_FROM_Z_DOWN) @ world_from_body[:, :3, :3] @ np.diag(Z_UP_FROM_Z_DOWN)
     angles = Rotation.from_matrix(turns).as_euler("ZYX")[:, ::-1]
     places = world_from_body[:, :3, 3] * Z_UP_FROM_Z_DOWN
-    rows = zip(drive.times, np.concatenate([places, angles], axis=1), strict=True)
+    rows = zip(poses.times, np.concatenate([places, angles], axis=1), strict=True)
     lines = (f"{to_utime(time)}," + ",".join(f"{value:.9g}" for value in row) for time, row in rows)
     return {"groundtruth_{name}.csv": "".join(f"{line}\n" for line in lines).encode()}
 
@@ -141,5 +141,5 @@ LAYOUTS = {
         last_file="groundtruth_{name}.csv",
     ),
 }
-"""KITTI odometry's and SemanticKITTI's layout; BEVPlace's density images, which have no times, with label maps; NCLT's
-sessions, which have no labels."""
+"""KITTI odometry's and SemanticKITTI's layout; BEVPlace's density images, which have no times, with label images;
+NCLT's sessions, which have no labels."""

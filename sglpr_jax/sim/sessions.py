@@ -12,10 +12,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from sglpr_jax.sim.drive import RATE_HZ, Trajectory, drive_seed, plan_path
+from sglpr_jax.sim.drive import RATE_HZ, PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.layouts import to_utime
+from sglpr_jax.sim.recording import SimulatedRecording, drive_through
 from sglpr_jax.sim.sensor import SENSORS, Sensor
-from sglpr_jax.sim.sequence import SimulatedSequence, drive_through
 from sglpr_jax.sim.world import World, build_world
 
 PAUSE_S = 1800.0
@@ -29,7 +29,7 @@ class Session(NamedTuple):
 
     date: str
     ids: tuple[str, ...]
-    simulate: Callable[[], SimulatedSequence]
+    simulate: Callable[[], SimulatedRecording]
 
 
 def plan_sessions(
@@ -66,7 +66,7 @@ def plan_sessions(
 def _session(
     date: str,
     start_s: float,
-    path: Trajectory,
+    path: PlanarPath,
     rows: np.ndarray,
     town: Callable[[], World],
     sensor: Sensor,
@@ -75,7 +75,7 @@ def _session(
     times = start_s + path.times[rows] - path.times[rows[0]]
     ids = tuple(str(to_utime(time)) for time in times.tolist())
 
-    def simulate() -> SimulatedSequence:
+    def simulate() -> SimulatedRecording:
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seeds[0]), seeds[1]), seeds[2])
         rng = np.random.default_rng((*seeds, 2))
         return drive_through(town(), path, rows, name=date, ids=ids, times=times, sensor=sensor, key=key, rng=rng)
@@ -83,7 +83,7 @@ def _session(
     return Session(date, ids, simulate)
 
 
-def _with_pauses(path: Trajectory, days: int) -> Trajectory:
+def _with_pauses(path: PlanarPath, days: int) -> PlanarPath:
     """The same way with PAUSE_S between every two of `days` equal parts."""
     day = np.arange(len(path.times)) * days // len(path.times)
     return path._replace(times=path.times + PAUSE_S * day)

@@ -23,16 +23,16 @@ PRESET = """
 import dataclasses
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.train.config import OptimizerConfig, TrainConfig
+from sglpr_jax.training.config import OptimizerConfig, TrainConfig
 
 MODEL = dataclasses.replace(
     model_preset("tiny"),
     grid=Grid(resolution_m=3.2, height=16, width=16),
-    depths=(1,),
-    heads=(2,),
+    backbone=SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1),
     head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4),
 )
 CONFIG = TrainConfig(
@@ -83,7 +83,7 @@ def assert_one_line_error(ended: Ended, *words: object) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory):
-    """Compiled programs and simulated drives go to a folder of this session, not to the user's."""
+    """Compiled programs and simulated recordings go to a folder of this session, not to the user's."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(os.environ, "XDG_CACHE_HOME", str(folder))
@@ -98,13 +98,13 @@ def _own_cache(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def town(tmp_path_factory) -> Path:
-    """Drives 00, 05 and 08 of 40 thin scans, with labels; 08 revisits places."""
+    """Recordings 00, 05 and 08 of 40 thin scans, with labels; 08 revisits places."""
     return write_dataset(tmp_path_factory.mktemp("data") / "town", scans=SCANS, sensor=SENSOR)
 
 
 @pytest.fixture(scope="session")
 def images(tmp_path_factory) -> Path:
-    """Ready-made BEV images of two straight drives, 00 and 06, which never come back."""
+    """Ready-made BEV images of two straight recordings, 00 and 06, which never come back."""
     root = tmp_path_factory.mktemp("data") / "images"
     write_images(root)
     return root
@@ -112,7 +112,7 @@ def images(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def labelled_images(tmp_path_factory) -> Path:
-    """The same with label maps: buildings where an image is bright, cars that move where it is not, and empty cells."""
+    """The same with label images: buildings where an image is bright, moving cars where it is not, and empty cells."""
     root = tmp_path_factory.mktemp("data") / "labelled"
     write_images(root, labels=True)
     return root

@@ -9,7 +9,9 @@ import pytest
 import sglpr_jax
 from sglpr_jax.cli import train as train_command
 from sglpr_jax.cli.train import parse
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.evaluation import learning_curves
+from sglpr_jax.training import recipe
+from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import assert_one_line_error, run_command
 
@@ -46,8 +48,8 @@ def runs(town, preset, tmp_path_factory):
             folder = made[name] = tmp_path_factory.mktemp("ablation") / "run"
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(train_command, "final_test", lambda *_, **__: None)
-                patch.setattr(train_command, "training_recall", lambda *_: lambda _: {"score": 0.0})
-                patch.setattr(train_command, "draw_learning_curves", lambda _: None)
+                patch.setattr(recipe, "training_recall", lambda *_: lambda _: {"score": 0.0})
+                patch.setattr(learning_curves, "draw_learning_curves", lambda _: None)
                 flags = ("--data", town, "--preset", preset, "--out", folder, "--steps", 2, *flags_of(name))
                 ended = run_command("train", "--seq", "08", *flags)
             assert ended.status == 0, ended.error
@@ -56,6 +58,7 @@ def runs(town, preset, tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_setting_trains_and_says_what_it_is(runs, name):
     folder, flags, (_, parts, terms) = runs(name), flags_of(name), SETTINGS[name]
@@ -78,17 +81,18 @@ def test_no_categories_are_the_triplet_alone():
     assert none.model == alone.model and none.model.classes == 0 and not none.model.segments
 
 
+@pytest.mark.slow
 def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(runs, command, town, preset, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(runs("RB+RS, 15"), folder)
     flags = ("--data", town, "--preset", preset, "--out", folder, "--resume", *flags_of("RB+RS, 15"))
-    resumed = command("train", "--seq", "08", *flags, "--steps", 3)  # to the end: the test drive has labels
+    resumed = command("train", "--seq", "08", *flags, "--steps", 3)  # to the end: the test recording has labels
     assert resumed.status == 0, resumed.error
     report = json.loads((folder / "test" / "results.json").read_text())
     assert "segmentation" not in report and report["rotated"]["sglpr"][0]["counts"]["revisits"] > 0
 
     options = ("--weights", folder, "--data", town, "--seq", "08", "--out", tmp_path / "08.npz")
-    ended = command("embed", *options, "--rotate-seed", 0)
+    ended = command("embed", *options, "--rotate", "--seed", 0)
     assert ended.status == 0, ended.error
     found, tested = (
         sglpr_jax.DescriptorFile.load(path) for path in (tmp_path / "08.npz", folder / "test" / "sglpr-rotated.npz")
@@ -106,16 +110,18 @@ def test_a_head_that_reads_labels_resumes_and_embeds_a_drive_with_labels_only(ru
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 def test_maps_scores_and_pages_are_of_the_weights_categories(runs, command, town, tmp_path):
     weights = runs("nor NetVLAD, 25, Dice, not turned")
     options = ("--data", town, "--seq", "08")
     ended = command("segment", "--weights", weights, *options, "--out", tmp_path / "maps")
     assert ended.status == 0, ended.error
     scores = json.loads((tmp_path / "maps" / "segmentation.json").read_text())
-    names = sglpr_jax.label_map(25).names
+    names = sglpr_jax.taxonomy(25).names
     assert tuple(scores["iou"]) == names and scores["shares"]["moving"] > 0 and scores["majority"] in names
 
 
+@pytest.mark.slow
 def test_weights_without_a_segmentation_head_are_refused_by_segment(runs, command, town, tmp_path):
     folder = runs("RS, 6")
     ended = command("segment", "--weights", folder, "--data", town, "--seq", "08", "--out", tmp_path / "maps")
@@ -123,6 +129,7 @@ def test_weights_without_a_segmentation_head_are_refused_by_segment(runs, comman
     assert not (tmp_path / "maps").exists()
 
 
+@pytest.mark.slow
 def test_a_page_shows_what_there_is_of_weights_that_read_labels(runs, command, town, tmp_path):
     folder, out = runs("RS, 6"), tmp_path / "08.npz"
     options = ("--weights", folder, "--data", town, "--seq", "08")

@@ -7,15 +7,15 @@ from sglpr_jax.cli.datasets import dataset_root, leave_one_out
 
 
 def test_all_drives_but_one_are_trained_on(town, capsys):
-    drives, test = leave_one_out(town, "08")
-    assert [drive.name for drive in drives] == ["00", "05"]
+    recordings, test = leave_one_out(town, "08")
+    assert [recording.name for recording in recordings] == ["00", "05"]
     assert test.name == "08"
     assert capsys.readouterr().err == "training on 00, 05; testing on 08, never seen\n"
 
 
 def test_the_training_drives_can_be_named(town):
-    drives, _ = leave_one_out(town, "00", train_seqs=("08",))
-    assert [drive.name for drive in drives] == ["08"]
+    recordings, _ = leave_one_out(town, "00", train_seqs=("08",))
+    assert [recording.name for recording in recordings] == ["08"]
 
 
 def test_a_drive_that_is_tested_is_never_trained_on(town):

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from sglpr_jax.cli import demo
-from sglpr_jax.cli.presets import load_preset
+from sglpr_jax.training.presets import load_preset
 
 
 @pytest.fixture
@@ -23,6 +23,7 @@ def tiny_demo(monkeypatch, town, preset):
     return asked
 
 
+@pytest.mark.slow
 def test_the_demo_ends_with_a_table_and_its_pictures_and_can_be_run_again(command, tiny_demo, tmp_path):
     out = tmp_path / "demo"
     first = command("demo", "--out", out, "--scans", 40, "--steps", 2)

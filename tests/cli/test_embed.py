@@ -8,8 +8,8 @@ import safetensors.numpy
 
 import sglpr_jax
 from sglpr_jax.cli.embed import MethodName
-from sglpr_jax.evaluation.baselines import BASELINES
-from sglpr_jax.evaluation.distances import distance_function
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.retrieval.distances import distance_function
 
 from .conftest import assert_one_line_error
 
@@ -61,7 +61,7 @@ def test_a_descriptor_does_not_depend_on_the_batch(embed, trained, town):
 
 
 def test_rotations_follow_their_seed(embed, town):
-    options = ("--method", "thumbnail", "--data", town, "--seq", "08", "--rotate-seed")
+    options = ("--method", "thumbnail", "--data", town, "--seq", "08", "--rotate", "--seed")
     first, again, other = (load(embed(*options, seed, out=f"{i}.npz")[1]) for i, seed in enumerate((3, 3, 4)))
     np.testing.assert_array_equal(first.descriptors, again.descriptors)
     assert np.abs(first.descriptors - other.descriptors).max() > 0.1
@@ -148,7 +148,7 @@ def test_weights_of_another_model_or_damaged_ones_are_named(embed, town, trained
     shutil.copytree(trained.folder / "weights", folder)
     options = ("--data", town, "--seq", "08", "--weights", folder)
     config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "embed_dim": 16}))
+    (folder / "config.json").write_text(json.dumps({**config, "backbone": {**config["backbone"], "embed_dim": 16}}))
     assert_one_line_error(embed(*options)[0], folder / "model.safetensors", "should have shape", "found")
     (folder / "config.json").write_text(json.dumps({**config, "unknown": 1}))
     assert_one_line_error(embed(*options)[0], folder / "config.json", "ModelConfig", "unknown")
@@ -174,21 +174,21 @@ def test_images_smaller_than_the_models_window_are_refused(embed, images, traine
 
 
 def test_every_baseline_can_be_chosen():
-    assert get_args(MethodName) == ("sglpr", *BASELINES)
+    assert get_args(MethodName) == ("sglpr", *HANDCRAFTED)
 
 
-@pytest.mark.parametrize("name", BASELINES)
+@pytest.mark.parametrize("name", HANDCRAFTED)
 def test_a_baseline_describes_a_sequence_and_names_its_distance(embed, town, name):
     ended, out = embed("--method", name, "--data", town, "--seq", "08")
     assert ended.status == 0, ended.error
     file = load(out)
-    assert file.config["method"] == name and file.distance == BASELINES[name].distance and len(file) == 40
+    assert file.config["method"] == name and file.distance == HANDCRAFTED[name].distance_name and len(file) == 40
     distances = distance_function(file.distance)(file.descriptors[:2], file.descriptors)
     assert distances.shape == (2, 40)
     assert distances[0, 0] < 1e-3 < distances[0, 1:].min()
 
 
-@pytest.mark.parametrize("name", [name for name, method in BASELINES.items() if method.input != "images"])
+@pytest.mark.parametrize("name", [name for name, method in HANDCRAFTED.items() if method.takes != "images"])
 def test_methods_on_points_refuse_images(embed, images, name):
     ended, out = embed("--method", name, "--data", images, "--seq", "06", "--skip-bad")
     assert_one_line_error(ended, f"{name} needs points", "only images in sequence 06", "polar-fft, thumbnail, random")
@@ -202,5 +202,5 @@ def test_semantic_scan_context_needs_labels(embed, scans):
 
 def test_turned_points_have_other_descriptors(embed, town):
     options = ("--method", "scan-context", "--data", town, "--seq", "08")
-    raw, turned = (load(embed(*options, *more)[1]) for more in ((), ("--rotate-seed", 1)))
+    raw, turned = (load(embed(*options, *more)[1]) for more in ((), ("--rotate", "--seed", 1)))
     assert (raw.descriptors != turned.descriptors).any(axis=1).all()

@@ -18,7 +18,7 @@ BIN = Path(__file__).resolve().parents[2] / "bin"
 
 
 @pytest.fixture
-def drive() -> DescriptorFile:
+def recording() -> DescriptorFile:
     """Two equal laps, described so that every place is found."""
     angle = np.arange(800) * (2 * np.pi / 400)
     place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -34,8 +34,8 @@ def drive() -> DescriptorFile:
     )
 
 
-def test_every_protocol_is_printed_written_and_drawn(command, drive, tmp_path):
-    drive.save(tmp_path / "08.npz")
+def test_every_protocol_is_printed_written_and_drawn(command, recording, tmp_path):
+    recording.save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz")
     assert ended.status == 0, ended.error
     for words in ("top-1 F1max", "pairs F1max", "Recall@1", "3 m / 20 m", "400 revisits", "3-D", "2-D"):
@@ -52,16 +52,16 @@ def test_every_protocol_is_printed_written_and_drawn(command, drive, tmp_path):
             assert min(picture.size) > 200
 
 
-def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, drive, tmp_path):
-    dataclasses.replace(drive, times=None).save(tmp_path / "08.npz")
+def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, recording, tmp_path):
+    dataclasses.replace(recording, times=None).save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz", "--out", tmp_path / "a" / "b")
     assert ended.status == 0 and (tmp_path / "a" / "b" / "results.json").is_file()
     assert "290 frames" in ended.out
 
 
-def test_a_drive_without_revisits_says_so(command, drive, tmp_path):
+def test_a_drive_without_revisits_says_so(command, recording, tmp_path):
     straight = np.arange(800.0)[:, None] * [[6.0, 0.0, 0.0]]  # farther apart than any "same place"
-    dataclasses.replace(drive, positions=straight).save(tmp_path / "08.npz")
+    dataclasses.replace(recording, positions=straight).save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz")
     assert ended.status == 0, ended.error
     assert ended.out.count("no revisit") == 3
@@ -69,8 +69,8 @@ def test_a_drive_without_revisits_says_so(command, drive, tmp_path):
     assert not (tmp_path / "08" / "precision-recall.png").exists()
 
 
-def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, drive, tmp_path, monkeypatch):
-    drive.save(tmp_path / "08.npz")
+def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, recording, tmp_path, monkeypatch):
+    recording.save(tmp_path / "08.npz")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     ended = command("evaluate", tmp_path / "08.npz")
     assert ended.status == 0 and "sglpr-jax[viz]" in ended.error
@@ -78,8 +78,8 @@ def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, dri
     assert "sglpr-jax[viz]" in (tmp_path / "08" / "report.html").read_text()
 
 
-def test_descriptors_without_positions_cannot_be_scored(command, drive, tmp_path):
-    dataclasses.replace(drive, positions=None, pose_source=None).save(tmp_path / "mine.npz")
+def test_descriptors_without_positions_cannot_be_scored(command, recording, tmp_path):
+    dataclasses.replace(recording, positions=None, pose_source=None).save(tmp_path / "mine.npz")
     assert_one_line_error(
         command("evaluate", tmp_path / "mine.npz"), tmp_path / "mine.npz", "positions", "without poses"
     )
@@ -100,6 +100,6 @@ def test_every_script_of_bin_starts_a_command(command):
     for path in BIN.iterdir():
         assert path.stat().st_mode & 0o111, path
         module = re.search(r"-m (sglpr_jax\.cli\.)(\w+)", path.read_text())
-        assert module or path.name in ("_python", "test")
+        assert module or path.name in ("_python", "docs", "test")
         if module:
             assert module[2] == path.name and command(module[2], "--help").status == 0

@@ -59,7 +59,7 @@ def test_poses_of_every_format_give_the_same_scores(score, laps):
         "tum.txt": (),
         "poses.csv": (),
     }.items():
-        ended, folder = score("mine.npy", "--poses", laps / name, *options, "--protocols", "top1-f1max", "ssc-recall")
+        ended, folder = score("mine.npy", "--poses", laps / name, *options, "--protocol", "top1-f1max", "ssc-recall")
         assert ended.status == 0, ended.error
         assert "last 30 s excluded" in ended.out and "2-D" in ended.out
         found[name] = {title: (entry["score"], entry["counts"]) for title, entry in results(folder).items()}
@@ -94,7 +94,7 @@ def test_a_top_k_list_and_scored_pairs(score, laps):
 
 def test_methods_are_compared_on_one_page(score, laps):
     ended, folder = score("mine.npy", "--poses", laps / "tum.txt", "--compare", laps / "blind.npy", laps / "topk.txt",
-                          "--protocols", "top1-f1max", "bevplace-recall-at-1", "--distance", "l2")  # fmt: skip
+                          "--protocol", "top1-f1max", "bevplace-recall-at-1", "--distance", "l2")  # fmt: skip
     assert ended.status == 0, ended.error
     report = json.loads((folder / "results.json").read_text())
     assert list(report["compared"]) == ["blind", "topk"]
@@ -107,7 +107,7 @@ def test_methods_are_compared_on_one_page(score, laps):
 
 
 def test_all_protocols(score, laps):
-    ended, folder = score("mine.npy", "--poses", laps / "tum.txt", "--protocols", "all")
+    ended, folder = score("mine.npy", "--poses", laps / "tum.txt", "--protocol", "all")
     assert ended.status == 0, ended.error
     assert len(results(folder)) == 13
 
@@ -117,13 +117,13 @@ def test_all_protocols(score, laps):
     [
         (("mine.npy",), ("mine.npy", "--poses", "found none")),
         (("mine.npy", "--poses", "lidar.txt"), ("lidar.txt", "--pose-format kitti", "or lidar")),
-        (("mine.npy", "--poses", "tum.txt", "--protocols", "top1"), ("no protocol 'top1'", "'top1-f1max'")),
+        (("mine.npy", "--poses", "tum.txt", "--protocol", "top1"), ("no protocol 'top1'", "'top1-f1max'")),
         (("mine.npy", "--poses", "tum.txt", "--distance", "cos"), ("expected a distance among l2, cosine", "'cos'")),
         (("mine.npy", "--poses", "pairs.txt"), ("pairs.txt", "found 4")),
         (("mine.npy", "--times", "times.txt"), ("times.txt", "expected --poses beside --times")),
         (("mine.npy", "--poses", "tum.txt", "--weights", "run"), ("run", "expected --data beside --weights")),
         (("pairs.txt", "--poses", "one.csv"), ("pairs.txt, line 1", "expected frames from 0 to 0", "found 200")),
-        (("topk.txt", "--poses", "tum.txt", "--protocols", "pairs-f1max"), ("for a top-k list", "pairs-f1max")),
+        (("topk.txt", "--poses", "tum.txt", "--protocol", "pairs-f1max"), ("for a top-k list", "pairs-f1max")),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(score, laps, arguments, words):
@@ -148,7 +148,7 @@ def test_a_list_without_an_ending_gets_a_folder_of_another_name(command, laps, t
 
 def test_data_and_weights_add_pictures(command, trained, town, tmp_path):
     np.save(tmp_path / "blind.npy", np.ones((40, 2)))  # every query is answered, mostly with another place
-    options = ("--data", town, "--seq", "08", "--protocols", "top1-f1max")
+    options = ("--data", town, "--seq", "08", "--protocol", "top1-f1max")
     ended = command("evaluate", tmp_path / "blind.npy", *options)
     assert ended.status == 0, ended.error
     page = (tmp_path / "blind" / "report.html").read_text()

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sglpr_jax import DescriptorFile, model_preset, open_sequence, save
+from sglpr_jax import DescriptorFile, model_preset, open_recording, save
 
 from .conftest import Ended, assert_one_line_error, run_command
 
@@ -47,10 +47,10 @@ def files(folder):
 
 def test_days_are_simulated_in_nclts_layout(days):
     assert days.ended.status == 0, days.ended.error
-    assert "simulating 3 drives of 12 scans, about 0 MB" in days.ended.error
-    assert days.ended.out == f"{days.root}: drives {MAP}, {DAYS[0]}, {DAYS[1]}\n"
+    assert "simulating 3 recordings of 12 scans, about 0 MB" in days.ended.error
+    assert days.ended.out == f"{days.root}: recordings {MAP}, {DAYS[0]}, {DAYS[1]}\n"
     for day in (MAP, *DAYS):
-        session = open_sequence(days.root, day)
+        session = open_recording(days.root, day)
         assert len(session) == SCANS and len(session.points(0)) > 100
     again = run_command("simulate", "--out", days.root, "--sessions", MAP, *DAYS, *THIN)
     assert again.status == 0 and "simulating" not in again.error
@@ -63,7 +63,7 @@ def test_methods_on_images_and_on_points_read_a_session(days, command, tmp_path,
     assert ended.status == 0, ended.error
     file = DescriptorFile.load(out)
     assert file.sequence == DAYS[0] and file.pose_source == f"groundtruth_{DAYS[0]}.csv"
-    np.testing.assert_array_equal(file.positions, open_sequence(days.root, DAYS[0]).positions)
+    np.testing.assert_array_equal(file.positions, open_recording(days.root, DAYS[0]).positions)
 
 
 def test_a_network_reads_a_session_whatever_its_sensor(days, random_params, command, tmp_path):
@@ -86,7 +86,11 @@ def test_a_table_has_a_column_for_each_session(embedded, command, tmp_path):
     recall = report["results"]["bevplace-nclt-recall"]
     scores = [recall["sessions"][day]["score"] for day in DAYS]
     known = [score for score in scores if score is not None]  # null: no revisit
-    assert recall["mean"] == pytest.approx(np.mean(known)) and report["map"] == MAP and "published" not in report
+    assert (
+        recall["mean"] == pytest.approx(np.mean(known))
+        and report["database_session"] == MAP
+        and "published" not in report
+    )
     assert f'<td class="number">{recall["mean"]:.3f}</td>' in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -138,7 +142,7 @@ def test_wrong_sessions_are_refused(embedded, command, tmp_path):
 
     dataclasses.replace(day, positions=day.positions + 1e5).save(tmp_path / "far.npz")
     ended = refused(tmp_path / "far.npz", "--database", database)
-    assert_one_line_error(ended, DAYS[0], "the world frame of the map", MAP, "no place is in both")
+    assert_one_line_error(ended, DAYS[0], "the world frame of the database", MAP, "no place is in both")
     dataclasses.replace(day, descriptors=day.descriptors[:, :40]).save(tmp_path / "short.npz")
     assert_one_line_error(refused(tmp_path / "short.npz", "--database", database), "1200 numbers", "found 40")
     dataclasses.replace(day, sequence="2012-02-05").save(tmp_path / "other.npz")
@@ -150,7 +154,7 @@ def test_wrong_sessions_are_refused(embedded, command, tmp_path):
     ended = refused(embedded / f"{DAYS[0]}.npz", "--database", database, "--seq", "00")
     assert_one_line_error(ended, "descriptor files alone", "--seq")
     assert_one_line_error(refused(database, embedded / f"{DAYS[0]}.npz"), "--database", "--compare")
-    ended = refused(database, "--protocols", "bevplace-nclt-recall")
+    ended = refused(database, "--protocol", "bevplace-nclt-recall")
     assert_one_line_error(ended, "expected --database", "bevplace-nclt-recall")
     assert not (tmp_path / "out").exists()
 
@@ -160,5 +164,5 @@ def test_wrong_days_are_refused_before_anything_is_written(command, tmp_path):
     assert_one_line_error(command("simulate", *out, "--sessions", "2012-1-32"), "dates such as", "'2012-1-32'")
     ended = command("simulate", *out, "--sessions", MAP, "--seq", "00", "05")
     assert_one_line_error(ended, "at most one route")
-    assert_one_line_error(command("simulate", *out, "--sessions", MAP, "--images"), "--images")
+    assert_one_line_error(command("simulate", *out, "--sessions", MAP, "--images"), "no images, found", "images True")
     assert not (tmp_path / "town").exists()

@@ -20,7 +20,8 @@ def weights(random_params, tmp_path_factory) -> Path:
     tiny = sglpr_jax.model_preset("tiny")
     head = dataclasses.replace(tiny.head, channels=(16,), kernels=(4,), strides=(4,))
     grid = sglpr_jax.Grid(resolution_m=3.2, height=16, width=16)
-    config = dataclasses.replace(tiny, grid=grid, depths=(1,), heads=(2,), head=head)
+    backbone = dataclasses.replace(tiny.backbone, depths=(1,), heads=(2,))
+    config = dataclasses.replace(tiny, grid=grid, backbone=backbone, head=head)
     return sglpr_jax.save(random_params(config), tmp_path_factory.mktemp("runs") / "weights")
 
 
@@ -75,3 +76,16 @@ def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path
     data = () if tool == "export" else ("--data", town, "--seq", "08")
     ended = command(tool, *file, "--weights", "simulatd", *data, "--out", tmp_path / "out.npz")
     assert_one_line_error(ended, "simulatd: expected a folder", "(simulated), found neither")
+
+
+def test_whitened_weights_describe_with_the_layer_fitted_to_a_dataset(command, weights, town, tmp_path):
+    ended = command("export", "--weights", weights, "--whiten", town, "--out", tmp_path / "out")
+    assert ended.status == 0, ended.error
+    params = sglpr_jax.load(tmp_path / "out")
+    assert params.config.head.whiten
+    options = ("--weights", tmp_path / "out", "--data", town, "--seq", "08", "--out", tmp_path / "08.npz")
+    assert command("embed", *options).status == 0
+    descriptors = load(tmp_path / "08.npz").descriptors
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-4)
+    again = command("export", "--weights", tmp_path / "out", "--whiten", town, "--out", tmp_path / "again")
+    assert again.status == 0, again.error  # in place of the layer that is there

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sglpr_jax.cli.presets import load_preset, preset_names
-from sglpr_jax.train.config import TrainConfig
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.presets import load_preset, preset_names
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.py"))
 

@@ -1,4 +1,4 @@
-"""Semantics from images: their own label maps, those of a second dataset, and those that a model made."""
+"""Semantics from images: their own label images, those of a second dataset, and those that a model made."""
 
 import json
 
@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.cli import train as train_command
-from sglpr_jax.cli import training_batches
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.training import batches as training_batches
+from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import assert_one_line_error
 
@@ -36,6 +36,7 @@ def steps_of(folder) -> list[dict]:
     return [line for line in read_metrics(folder / "metrics.jsonl") if "loss" in line]
 
 
+@pytest.mark.slow
 def test_images_with_label_maps_are_trained_on_alone(command, labelled_images, preset, tmp_path, labelled_places):
     out = tmp_path / "run"
     options = ("--seq", "06", "--data", labelled_images, "--preset", preset, "--out", out)
@@ -45,6 +46,7 @@ def test_images_with_label_maps_are_trained_on_alone(command, labelled_images, p
     assert len(labelled_places) == 2 and np.all(labelled_places)
 
 
+@pytest.mark.slow
 def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
     command, images, labelled_images, trained, preset, tmp_path, labelled_places
 ):
@@ -54,7 +56,7 @@ def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
     for frame in range(0, 30, 2):
         (pseudo / "00" / f"{frame:06d}.png").unlink()
     (pseudo / "06").mkdir()
-    (pseudo / "06" / "000000.png").write_text("of the drive that is tested, and never read")
+    (pseudo / "06" / "000000.png").write_text("of the recording that is tested, and never read")
     mixed = ("--also", labelled_images, "--tuples", 3, "--also-tuples", 1)
     options = ("--seq", "06", "--data", images, "--pseudo-labels", pseudo, "--preset", preset, "--out", out, *mixed)
     ended = command("train", *options, "--steps", 2)

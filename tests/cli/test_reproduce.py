@@ -4,19 +4,19 @@ import json
 
 import pytest
 
-from sglpr_jax.cli.presets import load_preset
-from sglpr_jax.cli.reproduction.experiments import EXPERIMENTS, VARIANTS, variant_config
-from sglpr_jax.cli.reproduction.scores import published_rows
-from sglpr_jax.cli.reproduction.tables import OURS, PUBLISHED, Row, as_json, markdown
 from sglpr_jax.evaluation.published import KITTI, TABLES
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
+from sglpr_jax.reproduce.scores import published_rows
+from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import write_sessions
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.presets import load_preset
 
 from .conftest import SENSOR, assert_one_line_error
 
 DAYS = ("2012-01-15", "2012-02-04")
 WANTED = ("table1", "table2", "table3", "table5", "figure5", "figure6", "figure7", "figure8")
-OPTIONS = ("--seqs", "08", "--baselines", "polar-fft", "ssc")
+OPTIONS = ("--seq", "08", "--method", "polar-fft", "ssc")
 
 
 @pytest.fixture(scope="module")
@@ -35,17 +35,19 @@ def reproduced(town, preset, sessions, tmp_path_factory):
     return folder, ended, options
 
 
+@pytest.mark.slow
 def test_the_plan_says_what_is_trained_and_only_that_is(reproduced):
     folder, ended, _ = reproduced
     assert "3 leave-one-out runs of 4 steps, 0 of them there already" in ended.error
     assert "s a step" in ended.error and "run 3 of 3" in ended.error
     assert {path.parent.parent.name for path in folder.glob("*/08/trained.json")} == {
         "full",
-        "no-turning",
+        "no-rotation",
         "no-segmentation",
     }
 
 
+@pytest.mark.slow
 def test_tables_have_ours_and_the_papers_rows(reproduced):
     folder, ended, _ = reproduced
     table = json.loads((folder / "table5.json").read_text())
@@ -61,6 +63,7 @@ def test_tables_have_ours_and_the_papers_rows(reproduced):
     assert "without semantic segmentation" in ended.out and "| with | here |" in (folder / "table5.md").read_text()
 
 
+@pytest.mark.slow
 def test_table_1_stands_beside_methods_without_training_and_table_2_says_what_turning_costs(reproduced):
     folder, _, _ = reproduced
     raw, turned = (json.loads((folder / f"table{n}.json").read_text()) for n in (1, 2))
@@ -73,6 +76,7 @@ def test_table_1_stands_beside_methods_without_training_and_table_2_says_what_tu
             assert row["change"] is None
 
 
+@pytest.mark.slow
 def test_table_3_asks_the_later_sessions_and_leaves_out_what_needs_labels(reproduced):
     folder, _, _ = reproduced
     table = json.loads((folder / "table3.json").read_text())
@@ -81,6 +85,7 @@ def test_table_3_asks_the_later_sessions_and_leaves_out_what_needs_labels(reprod
     assert next(row for row in table if row["method"] == "BEVPlace++")["scores"][DAYS[1]] == 0.953
 
 
+@pytest.mark.slow
 def test_figures_are_pictures_of_the_drives_and_sessions(reproduced):
     folder, ended, _ = reproduced
     wanted = {"figure5-08", "figure6-08", "figure7-08", "figure8-08", f"figure8-{DAYS[1]}"}
@@ -89,6 +94,7 @@ def test_figures_are_pictures_of_the_drives_and_sessions(reproduced):
         assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG") and f"{name}.png" in ended.out
 
 
+@pytest.mark.slow
 def test_what_is_there_is_used_again(reproduced, command):
     folder, _, options = reproduced
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/*/weights/*")}
@@ -97,6 +103,7 @@ def test_what_is_there_is_used_again(reproduced, command):
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*/weights/*")} == before
 
 
+@pytest.mark.slow
 def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
     folder, _, options = reproduced
     other = command("reproduce", "table5", *options, "--optimizer.learning-rate", "0.5")
@@ -112,9 +119,9 @@ def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, t
         return command("reproduce", *arguments, "--preset", preset, "--out", tmp_path / "out")
 
     assert_one_line_error(refused("--data", town), "expected tables or figures", "table1")
-    assert_one_line_error(refused("table1", "--data", town, "--baselines", "bow"), "'bow'", "scan-context")
-    assert_one_line_error(refused("table1", "--data", town, "--seqs", "99"), "99")
-    assert_one_line_error(refused("table1", "--data", images, "--baselines", "m2dp"), "m2dp needs points", "00")
+    assert_one_line_error(refused("table1", "--data", town, "--method", "bow"), "'bow'", "scan-context")
+    assert_one_line_error(refused("table1", "--data", town, "--seq", "99"), "99")
+    assert_one_line_error(refused("table1", "--data", images, "--method", "m2dp"), "m2dp needs points", "00")
     assert_one_line_error(refused("table5", "--data", images), "table5 is about semantics", "expected labels")
     assert refused("table9", "--data", town).status == 2
     assert not (tmp_path / "out").exists()
@@ -138,5 +145,6 @@ def test_every_table_of_the_paper_has_its_rows_here_in_the_same_order():
 
 def test_a_mean_needs_every_column():
     rows = [Row("whole", OURS, {"00": 0.5, "08": 0.75}), Row("part", OURS, {"00": 0.5, "08": None})]
-    assert [row["mean"] for row in as_json(rows, ("00", "08"))] == [0.625, None]
-    assert "| part | here | 0.500 |  |  |" in markdown("title", rows, ("00", "08"), caption="")
+    table = PaperTable("title", rows, ("00", "08"), caption="")
+    assert [row["mean"] for row in table.to_json()] == [0.625, None]
+    assert "| part | here | 0.500 |  |  |" in table.markdown()

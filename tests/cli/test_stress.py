@@ -1,4 +1,4 @@
-"""bin/stress on a simulated drive with a sensor of 64 rings, of few points each."""
+"""bin/stress on a simulated recording with a sensor of 64 rings, of few points each."""
 
 import json
 import os
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data.disturbances import DISTURBANCES
+from sglpr_jax.data.corruption.corruptions import CORRUPTIONS
 from sglpr_jax.sim import Sensor, write_dataset
 
 from .conftest import assert_one_line_error
@@ -18,7 +18,7 @@ load = sglpr_jax.DescriptorFile.load
 
 @pytest.fixture(scope="session")
 def rings(tmp_path_factory):
-    """Drive 00 of 100 scans with 64 rings of 30 points."""
+    """Recording 00 of 100 scans with 64 rings of 30 points."""
     root = tmp_path_factory.mktemp("data") / "rings"
     return write_dataset(root, names=("00",), scans=100, sensor=Sensor(azimuth_steps=30))
 
@@ -35,14 +35,14 @@ def stress(command, tmp_path):
 
 def test_everything_on_the_network_and_a_baseline(stress, rings, trained):
     options = ("--data", rings, "--weights", trained.folder, "--method", "polar-fft", "solid")
-    ended, out = stress(*options, "--protocols", "pairs-all-f1max", "ssc-recall")
+    ended, out = stress(*options, "--protocol", "pairs-all-f1max", "ssc-recall")
     assert ended.status == 0, ended.error
     assert {path.name for path in out.iterdir()} == {"results.json", "config.json", "stress.png", "descriptors"}
-    names = ["clean", *(disturbance.name for disturbance in DISTURBANCES)]
+    names = ["clean", *(corruption.name for corruption in CORRUPTIONS)]
     files = {f"{name}-{method}.npz" for name in names for method in ("sglpr", "polar-fft", "solid")}
     assert {path.name for path in (out / "descriptors").iterdir()} == files
     rows = json.loads((out / "results.json").read_text())
-    assert [row["disturbance"] for row in rows] == names
+    assert [row["corruption"] for row in rows] == names
     clean = rows[0]["methods"]["solid"]
     for row in rows:
         assert list(row["methods"]) == ["sglpr", "polar-fft", "solid"]
@@ -56,10 +56,10 @@ def test_everything_on_the_network_and_a_baseline(stress, rings, trained):
 
 
 def test_descriptors_are_those_of_embed_and_change_when_disturbed(stress, rings, command, tmp_path):
-    ended, out = stress("--data", rings, "--method", "solid", "--only", "rotation", "dropout-0.9", "--seed", 3)
+    ended, out = stress("--data", rings, "--method", "solid", "--corruption", "rotation", "dropout-0.9", "--seed", 3)
     assert ended.status == 0, ended.error
     options = ("--data", rings, "--method", "solid", "--out", tmp_path / "one.npz")
-    for name, more in (("clean", ()), ("rotation", ("--rotate-seed", 3))):
+    for name, more in (("clean", ()), ("rotation", ("--rotate", "--seed", 3))):
         assert command("embed", *options, *more).status == 0
         np.testing.assert_array_equal(
             load(tmp_path / "one.npz").descriptors, load(out / "descriptors" / f"{name}-solid.npz").descriptors
@@ -70,7 +70,7 @@ def test_descriptors_are_those_of_embed_and_change_when_disturbed(stress, rings,
 
 
 def test_a_second_run_takes_the_descriptors_that_are_there(stress, rings):
-    options = ("--data", rings, "--method", "solid", "--only", "beams")
+    options = ("--data", rings, "--method", "solid", "--corruption", "beams")
     first, out = stress(*options)
     file = out / "descriptors" / "beams-16-solid.npz"
     clean = out / "descriptors" / "clean-solid.npz"
@@ -81,12 +81,12 @@ def test_a_second_run_takes_the_descriptors_that_are_there(stress, rings):
     assert again == first and again.status == 0
     assert clean.stat().st_mtime_ns == written
     np.testing.assert_array_equal(load(file).descriptors, before.descriptors)
-    assert stress(*options, "--protocols", "ssc-recall")[0].status == 0, "other protocols need no new descriptors"
+    assert stress(*options, "--protocol", "ssc-recall")[0].status == 0, "other protocols need no new descriptors"
     assert clean.stat().st_mtime_ns == written
 
 
 def test_descriptors_of_other_settings_are_never_taken(stress, rings, trained, random_params, tmp_path):
-    options = ("--method", "solid", "--only", "dropout-0.5")
+    options = ("--method", "solid", "--corruption", "dropout-0.5")
     _, out = stress(*options, "--data", rings)
     ended, _ = stress(*options, "--data", rings, "--seed", 1)
     assert_one_line_error(ended, out / "descriptors" / "dropout-0.5-solid.npz", "seed 1, found 0", "--out")
@@ -103,30 +103,32 @@ def test_descriptors_of_other_settings_are_never_taken(stress, rings, trained, r
 
     weights = tmp_path / "weights"
     shutil.copytree(trained.folder / "weights", weights)
-    assert stress("--weights", weights, "--data", rings, "--only", "rotation")[0].status == 0
+    assert stress("--weights", weights, "--data", rings, "--corruption", "rotation")[0].status == 0
     sglpr_jax.save(random_params(sglpr_jax.load(weights).config), weights)
-    ended, _ = stress("--weights", weights, "--data", rings, "--only", "rotation")
+    ended, _ = stress("--weights", weights, "--data", rings, "--corruption", "rotation")
     assert_one_line_error(ended, "clean-sglpr.npz", "made with weights")
 
 
 def test_ready_made_images_can_only_be_turned(stress, images):
     options = ("--data", images, "--seq", "06", "--method", "thumbnail")
-    ended, out = stress(*options, "--only", "beams-16")
+    ended, out = stress(*options, "--corruption", "beams-16")
     assert_one_line_error(ended, "beams-16 needs points, found only images in sequence 06", "rotation")
     assert not out.exists()
 
 
 def test_a_drive_that_never_comes_back_has_nothing_to_lose(stress, images):
     ended, out = stress("--data", images, "--seq", "06", "--method", "thumbnail")
-    assert "only images, which can only be turned" in ended.error
+    assert "only images, which can only be rotated" in ended.error
     assert_one_line_error(ended, "sequence 06", "visited twice", "top1-f1max, pairs-f1max")
     assert not (out / "results.json").exists()
 
 
 def test_wrong_names_are_refused_before_any_work(stress, rings, tmp_path):
     options = ("--data", rings, "--method", "solid")
-    assert_one_line_error(stress(*options, "--only", "beams-61")[0], "no disturbance 'beams-61'", "mean 'beams-16'")
-    assert_one_line_error(stress(*options, "--protocols", "top1")[0], "no protocol 'top1'", "mean 'top1-f1max'")
+    assert_one_line_error(
+        stress(*options, "--corruption", "beams-61")[0], "no corruption 'beams-61'", "mean 'beams-16'"
+    )
+    assert_one_line_error(stress(*options, "--protocol", "top1")[0], "no protocol 'top1'", "mean 'top1-f1max'")
     assert_one_line_error(stress("--data", rings)[0], "--weights", "--method", "found neither")
     assert_one_line_error(stress("--data", rings, "--method", "sglpr")[0], "--weights")
     assert not (tmp_path / "out").exists()

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.training.metrics_log import read_metrics
 
+pytestmark = pytest.mark.slow
 KILLS = 21
 STEPS = 60
 SCORE_EVERY = 3
@@ -127,7 +128,7 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninte
             with runs.metrics.open("a") as file:
                 file.write('{"step": 59, "lo')
             (runs.folder / ".config.json.1.tmp").write_text("{")
-            (runs.folder / ".weights-1" / "new").mkdir(parents=True)
+            (runs.folder / ".weights.1.tmp" / "new").mkdir(parents=True)
     assert in_a_write >= KILLS // 6 and len(steps) >= KILLS // 3, (in_a_write, steps)
     assert runs.finish() == 0, runs.errors.read_text()
     assert_equal(runs, uninterrupted)

@@ -12,13 +12,13 @@ from PIL import Image
 
 import sglpr_jax
 from sglpr_jax.cli import train as train_command
-from sglpr_jax.cli import training_batches
-from sglpr_jax.cli.presets import load_preset
 from sglpr_jax.cli.train import TrainCommand, parse
-from sglpr_jax.data.bev_images import open_sequence
-from sglpr_jax.data.tuples import TuplePool
-from sglpr_jax.models.params import weights_hash
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.data.readers.bev_images import open_recording
+from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.training import batches as training_batches
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.presets import load_preset
 
 from .conftest import assert_one_line_error
 
@@ -27,7 +27,7 @@ METHODS = ("sglpr", "untrained", "thumbnail", "polar-fft")
 
 def test_without_flags_the_small_preset_runs_and_08_stays_a_string():
     assert parse([]) == TrainCommand(seq="08", preset="small", config=load_preset("small"))
-    assert parse(["--seq", "00", "--train-seqs", "02", "08"]).train_seqs == ("02", "08")
+    assert parse(["--seq", "00", "--train-seq", "02", "08"]).train_seq == ("02", "08")
 
 
 def test_flags_override_the_preset_and_the_preset_the_defaults(preset):
@@ -100,16 +100,18 @@ def test_a_run_shows_how_it_went_and_where(trained):
     assert said and float(said[2]) == pytest.approx(2 * float(said[1]), rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_names_the_step_and_the_frames(command, images, preset, tmp_path):
     options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
     ended = command("train", *options, "--optimizer.learning-rate", "1e38")
-    pool = TuplePool([open_sequence(images, "00").positions], load_preset(str(preset)).sampling)
+    pool = TuplePool([open_recording(images, "00").positions], load_preset(str(preset)).sampling)
     frames = np.unique(pool.draw(seed=0, step=0, tuples=2))
     named = " ".join(f"{frame:06d}" for frame in frames)
-    assert_one_line_error(ended, "step 1: ", "update_norm", "not finite", f"(batch: drive 00 frames {named})")
+    assert_one_line_error(ended, "step 1: ", "update_norm", "not finite", f"(batch: recording 00 frames {named})")
     assert len(frames) > 4
 
 
+@pytest.mark.slow
 def test_event_files_are_written_when_asked_for_and_do_not_hinder_a_resume(
     command, images, preset, tmp_path, monkeypatch
 ):
@@ -122,6 +124,7 @@ def test_event_files_are_written_when_asked_for_and_do_not_hinder_a_resume(
     assert command("train", *options, "--resume").status == 0
 
 
+@pytest.mark.slow
 def test_a_cache_changes_only_where_scans_are_read(command, trained, town, preset, tmp_path, monkeypatch):
     monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
     out, cache = tmp_path / "run", tmp_path / "cache"
@@ -131,13 +134,15 @@ def test_a_cache_changes_only_where_scans_are_read(command, trained, town, prese
     assert sorted(path.name[:3] for path in cache.iterdir()) == [
         "00-",
         "05-",
-    ]  # the drive that is tested is read as it is
+    ]  # the recording that is tested is read as it is
     assert (out / "config.json").read_bytes() == (trained.folder / "config.json").read_bytes()
     weights = (folder / "weights" / "model.safetensors" for folder in (out, trained.folder))
     assert len({path.read_bytes() for path in weights}) == 1
     for path in cache.rglob("points.bin"):
         path.write_bytes(b"")
-    assert_one_line_error(command("train", *options, "--resume"), cache, "expected a packed drive, found a damaged one")
+    assert_one_line_error(
+        command("train", *options, "--resume"), cache, "expected a packed recording, found a damaged one"
+    )
 
 
 def test_a_run_is_not_overwritten(command, trained, town, preset):
@@ -149,13 +154,14 @@ def test_a_run_is_not_overwritten(command, trained, town, preset):
 
 def test_a_run_is_resumed_with_its_own_settings_only(command, trained, town, preset, tmp_path):
     options = ("--data", town, "--preset", preset, "--resume", "--out")
-    ended = command("train", *options, trained.folder, "--optimizer.learning-rate", 1, "--model.embed-dim", 16)
-    assert_one_line_error(ended, "config.json", "config.model.embed_dim, config.optimizer.learning_rate")
+    ended = command("train", *options, trained.folder, "--optimizer.learning-rate", 1, "--model.backbone.embed-dim", 16)
+    assert_one_line_error(ended, "config.json", "config.model.backbone.embed_dim, config.optimizer.learning_rate")
     other = command("train", "--seq", "05", *options, trained.folder)
     assert_one_line_error(other, "others: seq")
     assert_one_line_error(command("train", *options, tmp_path), tmp_path / "config.json", "expected a run to resume")
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, town, preset, tmp_path, monkeypatch):
     monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
     read_batch = training_batches.read_batch
@@ -190,6 +196,7 @@ def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, tow
     assert json.loads((out / "config.json").read_text())["config"]["steps"] == 5
 
 
+@pytest.mark.slow
 def test_bad_labels_end_a_training_that_can_go_on_once_they_are_right(command, town, preset, tmp_path, monkeypatch):
     monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
     root = tmp_path / "town"
@@ -197,7 +204,7 @@ def test_bad_labels_end_a_training_that_can_go_on_once_they_are_right(command, t
     good = {path: path.read_bytes() for path in (root / "sequences" / "00" / "labels").iterdir()}
     for path, content in good.items():
         path.write_bytes(content[:-4])
-    options = ("--data", root, "--preset", preset, "--out", tmp_path / "run", "--steps", 1, "--train-seqs", "00")
+    options = ("--data", root, "--preset", preset, "--out", tmp_path / "run", "--steps", 1, "--train-seq", "00")
     ended = command("train", *options)
     assert_one_line_error(ended, root / "sequences" / "00" / "labels", "one per point", "bytes")
     for path, content in good.items():
@@ -207,7 +214,8 @@ def test_bad_labels_end_a_training_that_can_go_on_once_they_are_right(command, t
     assert (tmp_path / "run" / "weights" / "model.safetensors").is_file()
 
 
-def test_ready_made_images_train_too_and_a_drive_without_revisits_says_so(command, images, preset, tmp_path):
+@pytest.mark.slow
+def test_ready_made_images_train_too_and_a_recording_without_revisits_says_so(command, images, preset, tmp_path):
     out = tmp_path / "run"
     ended = command("train", "--seq", "06", "--data", images, "--preset", preset, "--out", out, "--steps", 2)
     assert ended.status == 0, ended.error
@@ -222,14 +230,15 @@ def test_ready_made_images_train_too_and_a_drive_without_revisits_says_so(comman
     ]
 
 
+@pytest.mark.slow
 def test_a_run_starts_with_the_weights_it_is_given(command, trained, images, preset, tmp_path):
-    options = ("--data", images, "--preset", preset, "--seq", "06", "--steps", 1, "--no-references")
+    options = ("--data", images, "--preset", preset, "--seq", "06", "--steps", 1, "--method")
     options = (*options, "--optimizer.learning-rate", "0", "--optimizer.weight-decay", "0")
-    begun = command("train", *options, "--start", trained.folder, "--out", tmp_path / "run")
+    begun = command("train", *options, "--weights", trained.folder, "--out", tmp_path / "run")
     assert begun.status == 0, begun.error
     assert weights_hash(sglpr_jax.load(tmp_path / "run")) == weights_hash(sglpr_jax.load(trained.folder))
     assert set(json.loads((tmp_path / "run" / "test" / "results.json").read_text())["raw"]) == {"sglpr"}
-    other = ("--model.head.clusters", 3, "--start", trained.folder, "--out", tmp_path / "other")
+    other = ("--model.head.clusters", 3, "--weights", trained.folder, "--out", tmp_path / "other")
     assert_one_line_error(command("train", *options, *other), "place_head/netvlad", "expected")
 
 
@@ -238,7 +247,7 @@ def test_what_cannot_be_trained_on_leaves_no_run(command, town, preset, tmp_path
     root, out = tmp_path / "town", tmp_path / "run"
     shutil.copytree(town, root)
     poses = root / "sequences" / "00" / "poses.txt"
-    flags = ("--train-seqs", "00")
+    flags = ("--train-seq", "00")
     if missing == "poses":
         poses.unlink()
         words = (root, "sequences/00/poses.txt", "poses/00.txt")

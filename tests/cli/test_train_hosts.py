@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import safetensors.numpy
 
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import Ended, assert_one_line_error
 
@@ -47,6 +48,7 @@ def written(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for depth in ("*", "[!c]*/*", "checkpoints/*") for path in folder.glob(depth)}
 
 
+@pytest.mark.slow
 def test_two_hosts_make_the_run_of_one(trained, town, preset, tmp_path):
     out = tmp_path / "run"
     first, second = on_two_hosts("--seq", "08", "--data", town, "--preset", preset, "--out", out)
@@ -64,9 +66,12 @@ def test_two_hosts_make_the_run_of_one(trained, town, preset, tmp_path):
     assert weights.keys() == of_one.keys()
     for name in of_one:
         if not name.endswith("qkv/bias"):  # nothing feels the keys' bias: its steps are rounding
-            np.testing.assert_allclose(weights[name], of_one[name], rtol=0, atol=1e-5)
+            np.testing.assert_allclose(
+                weights[name], of_one[name], rtol=0, atol=5e-5
+            )  # sums of floats in another order
 
 
+@pytest.mark.slow
 def test_an_error_of_one_host_ends_both(trained, town, preset):
     first, second = on_two_hosts("--seq", "08", "--data", town, "--preset", preset, "--out", trained.folder)
     assert_one_line_error(first, trained.folder, "--resume", "--out")

@@ -9,8 +9,8 @@ import pytest
 import safetensors.numpy
 
 from sglpr_jax.cli import train as train_command
-from sglpr_jax.cli import training_batches
-from sglpr_jax.train.metrics_log import read_metrics
+from sglpr_jax.training import batches as training_batches
+from sglpr_jax.training.metrics_log import read_metrics
 
 from .conftest import assert_one_line_error, run_command
 
@@ -42,6 +42,7 @@ def mixed(town, images, preset, tmp_path_factory):
     return out, options, ended
 
 
+@pytest.mark.slow
 def test_a_run_of_two_sources_learns_places_and_semantics(mixed, town):
     out, _, ended = mixed
     assert "training on 00; testing on 06" in ended.error and f"training on 00, 05, 08 of {town} too" in ended.error
@@ -56,6 +57,7 @@ def test_a_run_of_two_sources_learns_places_and_semantics(mixed, town):
     assert json.loads((out / "weights" / "config.json").read_text())["compute"] == "bfloat16"
 
 
+@pytest.mark.slow
 def test_a_stopped_run_of_the_recipe_goes_on_to_the_same_weights(mixed, command, tmp_path, monkeypatch):
     whole, options, _ = mixed
     out = tmp_path / "run"
@@ -83,8 +85,8 @@ def test_a_stopped_run_of_the_recipe_goes_on_to_the_same_weights(mixed, command,
 
 def test_also_needs_its_tuples_and_may_not_be_the_tested_dataset(command, town, images, preset, tmp_path):
     options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
-    assert_one_line_error(command("train", *options, "--also", town), "--also-tuples", "1 datasets and 0 tuples")
-    assert_one_line_error(command("train", *options, "--also-tuples", 1), "0 datasets and 1 tuples")
+    assert_one_line_error(command("train", *options, "--also", town), "3 of its recordings and 0 tuples")
+    assert_one_line_error(command("train", *options, "--also-tuples", 1), "0 of its recordings and 1 tuples")
     assert_one_line_error(command("train", *options, "--also", images), images, "expected another dataset")
     assert_one_line_error(command("train", *options, "--also-tuples", 2), "fewer than the 2 tuples")
     assert not (tmp_path / "run").exists()

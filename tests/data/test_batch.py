@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import of_images, of_scans
 
 from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels
-from sglpr_jax.data.batch import read_batch, views
 from sglpr_jax.data.density_image import density_bev, density_label_bev
-from sglpr_jax.data.label_maps import label_map_pixels
-from sglpr_jax.data.sequence import ImageSequence, ScanSequence
-from sglpr_jax.data.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.formats.label_images import label_image_pixels
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.sampling.batch import read_batch, views
+from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
@@ -28,7 +29,7 @@ def clouds(seed: int) -> list[np.ndarray]:
 
 
 def positions() -> np.ndarray:
-    """A straight drive with 2 m between frames, so that only the next frame is a positive."""
+    """A straight recording with 2 m between frames, so that only the next frame is a positive."""
     return np.column_stack([np.arange(len(SIZES)) * STEP_M, np.zeros((len(SIZES), 2))])
 
 
@@ -36,29 +37,20 @@ def labels_of(cloud: np.ndarray) -> np.ndarray:
     return RAW_LABELS[np.arange(len(cloud)) % len(RAW_LABELS)]
 
 
-def scan_sequence(folder: Path, scans: list[np.ndarray], *, labelled: bool) -> ScanSequence:
-    """A drive with scans in memory and label files on disk."""
+def scan_sequence(folder: Path, scans: list[np.ndarray], *, labelled: bool) -> Recording:
+    """A recording with scans in memory and label files on disk."""
     folder.mkdir()
     by_path = {folder / f"{i:06d}.bin": cloud for i, cloud in enumerate(scans)}
     label_paths = tuple(path.with_suffix(".label") if labelled else None for path in by_path)
     for path, cloud in zip(label_paths, scans, strict=True):
         if path is not None:
             labels_of(cloud).tofile(path)
-    return ScanSequence(
-        name=folder.name,
-        ids=tuple(path.stem for path in by_path),
-        positions=positions(),
-        times=None,
-        pose_source=None,
-        scan_paths=tuple(by_path),
-        label_paths=label_paths,
-        read_scan=by_path.__getitem__,
-    )
+    return of_scans(by_path, name=folder.name, positions=positions(), label_paths=label_paths)
 
 
 @pytest.fixture
-def drives(tmp_path) -> list[ScanSequence]:
-    """A drive with labels and one without."""
+def recordings(tmp_path) -> list[Recording]:
+    """A recording with labels and one without."""
     return [
         scan_sequence(tmp_path / name, clouds(seed), labelled=labelled)
         for seed, (name, labelled) in enumerate([("00", True), ("05", False)])
@@ -66,19 +58,19 @@ def drives(tmp_path) -> list[ScanSequence]:
 
 
 @pytest.fixture
-def pool(drives) -> TuplePool:
-    return TuplePool([drive.positions for drive in drives], TupleConfig(positives=1, negatives=2))
+def pool(recordings) -> TuplePool:
+    return TuplePool([recording.positions for recording in recordings], TupleConfig(positives=1, negatives=2))
 
 
 FRAMES = np.array([[0, 1, 12, 20], [18, 17, 5, 31]])
 
 
-def read(drives, pool, frames=FRAMES, *, max_points=9, share_negatives=False):
-    return read_batch(drives, pool, frames, max_points=max_points, share_negatives=share_negatives)
+def read(recordings, pool, frames=FRAMES, *, max_points=9, share_negatives=False):
+    return read_batch(recordings, pool, frames, max_points=max_points, share_negatives=share_negatives)
 
 
-def test_clouds_are_padded_and_say_how_many_points_count(drives, pool):
-    batch = read(drives, pool, max_points=12)
+def test_clouds_are_padded_and_say_how_many_points_count(recordings, pool):
+    batch = read(recordings, pool, max_points=12)
     every = clouds(0) + clouds(1)
     assert batch.points.shape == (8, 12, 3) and batch.images is None
     for row, frame in enumerate(FRAMES.reshape(-1)):
@@ -91,15 +83,15 @@ def test_clouds_are_padded_and_say_how_many_points_count(drives, pool):
     np.testing.assert_array_equal(batch.labelled, FRAMES.reshape(-1) < len(SIZES))
 
 
-def test_large_clouds_are_thinned_evenly_with_their_labels(drives, pool):
-    batch = read(drives, pool, max_points=5)
+def test_large_clouds_are_thinned_evenly_with_their_labels(recordings, pool):
+    batch = read(recordings, pool, max_points=5)
     np.testing.assert_array_equal(batch.count, [min(n, 5) for n in np.tile(SIZES, 2)[FRAMES.reshape(-1)]])
     kept = [0, 2, 4, 6, 8]  # of the nine points of frame 1
     np.testing.assert_array_equal(batch.points[1], clouds(0)[1][kept])
     np.testing.assert_array_equal(batch.classes[1], to_classes(labels_of(clouds(0)[1]).astype(np.int32))[kept])
 
 
-def test_without_any_labels_there_are_no_classes(drives, pool, tmp_path):
+def test_without_any_labels_there_are_no_classes(recordings, pool, tmp_path):
     bare = [scan_sequence(tmp_path / name, clouds(0), labelled=False) for name in ("06", "07")]
     batch = read(bare, pool)
     assert batch.classes is None
@@ -108,9 +100,9 @@ def test_without_any_labels_there_are_no_classes(drives, pool, tmp_path):
 
 
 @pytest.mark.parametrize("share_negatives", [False, True])
-def test_the_negatives_of_each_anchor_are_those_of_brute_force(drives, pool, share_negatives):
+def test_the_negatives_of_each_anchor_are_those_of_brute_force(recordings, pool, share_negatives):
     frames = np.array([[0, 1, 12, 5], [3, 4, 15, 31], [18, 17, 5, 30]])  # frame 5 is too near to the first anchor
-    batch = read(drives, pool, frames, share_negatives=share_negatives)
+    batch = read(recordings, pool, frames, share_negatives=share_negatives)
     expected = np.zeros((3, 12), bool)
     every = np.concatenate([positions(), positions()])
     for t, anchor in enumerate(frames[:, 0]):
@@ -119,24 +111,24 @@ def test_the_negatives_of_each_anchor_are_those_of_brute_force(drives, pool, sha
             far = other_drive or np.linalg.norm(every[anchor] - every[frame]) > 20
             own = place // 4 == t and place % 4 >= 2
             expected[t, place] = far and (own or share_negatives)
-    np.testing.assert_array_equal(batch.far, expected)
-    assert batch.far.sum() == (21 if share_negatives else 5)
+    np.testing.assert_array_equal(batch.negatives, expected)
+    assert batch.negatives.sum() == (21 if share_negatives else 5)
     assert batch.positives == 1
 
 
 @pytest.mark.parametrize("share_negatives", [False, True])
-def test_the_parts_of_two_hosts_are_the_whole_batch(drives, pool, share_negatives):
+def test_the_parts_of_two_hosts_are_the_whole_batch(recordings, pool, share_negatives):
     options = {"max_points": 9, "share_negatives": share_negatives}
-    whole = read_batch(drives, pool, FRAMES, **options)
-    parts = [read_batch(drives, pool, FRAMES, **options, part=slice(i, i + 1)) for i in range(2)]
-    assert parts[0].far.shape == (1, 8) and parts[0].points.shape == (4, 9, 3)
-    assert parts[1].classes is not None  # the second host reads the second drive alone, which has no labels
+    whole = read_batch(recordings, pool, FRAMES, **options)
+    parts = [read_batch(recordings, pool, FRAMES, **options, part=slice(i, i + 1)) for i in range(2)]
+    assert parts[0].negatives.shape == (1, 8) and parts[0].points.shape == (4, 9, 3)
+    assert parts[1].classes is not None  # the second host reads the second recording alone, which has no labels
     joined = jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
     jax.tree.map(np.testing.assert_array_equal, joined, whole)
 
 
-def test_views_are_the_rasterised_turned_points(drives, pool):
-    batch = read(drives, pool)
+def test_views_are_the_rasterised_turned_points(recordings, pool):
+    batch = read(recordings, pool)
     angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 8).astype(np.float32)
     images, maps = jax.jit(views, static_argnames="grid")(batch, jnp.asarray(angles), grid=GRID)
     assert images.dtype == jnp.float32
@@ -153,20 +145,11 @@ def test_views_are_the_rasterised_turned_points(drives, pool):
 
 def test_images_are_turned_whole_and_then_cropped():
     pictures = np.random.default_rng(0).uniform(0, 10, (len(SIZES), 20, 20)).astype(np.float32)
-    paths = tuple(Path(f"{i:06d}.png") for i in range(len(SIZES)))
-    drive = ImageSequence(
-        name="06",
-        ids=tuple(path.stem for path in paths),
-        positions=positions(),
-        times=None,
-        pose_source=None,
-        image_paths=paths,
-        resolution_m=1.0,
-        read_image=lambda path: pictures[int(path.stem)],
-    )
+    by_path = {Path(f"{i:06d}.png"): picture for i, picture in enumerate(pictures)}
+    recording = of_images(by_path, name="06", positions=positions())
     frames = np.array([[0, 1, 12, 13]])
     pool = TuplePool([positions()], TupleConfig(negatives=2))
-    batch = read([drive], pool, frames)
+    batch = read([recording], pool, frames)
     assert batch.points is None and not batch.labelled.any()
     np.testing.assert_array_equal(batch.images, pictures[frames[0]])
 
@@ -181,48 +164,41 @@ def test_images_are_turned_whole_and_then_cropped():
     np.testing.assert_allclose(turned, whole[:, 2:18, 2:18], atol=1e-5)
 
 
-def image_drive(folder: Path, *, labelled: range) -> ImageSequence:
-    """Images in memory, and label maps on disk of some: a car wherever the image is above 5."""
+def image_drive(folder: Path, *, labelled: range) -> Recording:
+    """Images in memory, and label images on disk of some: a car wherever the image is above 5."""
     folder.mkdir()
     pictures = np.random.default_rng(len(folder.name)).uniform(0, 10, (len(SIZES), 20, 22)).astype(np.float32)
     label_paths = tuple(folder / f"{i:06d}.png" if i in labelled else None for i in range(len(SIZES)))
     for path, picture in zip(label_paths, pictures, strict=True):
         if path is not None:
-            Image.fromarray(label_map_pixels(np.where(picture > 5, 252, 0))).save(path)
-    return ImageSequence(
-        name=folder.name,
-        ids=tuple(f"{i:06d}" for i in range(len(SIZES))),
-        positions=positions(),
-        times=None,
-        pose_source=None,
-        image_paths=tuple(Path(f"{i:06d}.png") for i in range(len(SIZES))),
-        resolution_m=1.0,
-        read_image=lambda path: pictures[int(path.stem)],
-        label_paths=label_paths,
-    )
+            Image.fromarray(label_image_pixels(np.where(picture > 5, 252, 0))).save(path)
+    by_path = {Path(f"{i:06d}.png"): picture for i, picture in enumerate(pictures)}
+    return of_images(by_path, name=folder.name, positions=positions(), label_paths=label_paths)
 
 
 @pytest.mark.parametrize(("categories", "moving_car"), [(20, 1), (25, 25)])
 def test_images_come_with_the_maps_that_there_are(pool, tmp_path, categories, moving_car):
-    drives = [image_drive(tmp_path / "06", labelled=range(3)), image_drive(tmp_path / "07", labelled=range(0))]
+    recordings = [image_drive(tmp_path / "06", labelled=range(3)), image_drive(tmp_path / "07", labelled=range(0))]
     options = {"max_points": 9, "share_negatives": False}
-    batch = read_batch(drives, pool, FRAMES, **options, categories=categories)
+    batch = read_batch(recordings, pool, FRAMES, **options, categories=categories)
     np.testing.assert_array_equal(batch.labelled, FRAMES.reshape(-1) < 3)
     assert batch.labelled.any() and batch.maps.dtype == np.int32
     expected = np.where(batch.images > 5, moving_car, 0) * batch.labelled[:, None, None]
     np.testing.assert_array_equal(batch.maps, expected)
-    alone = read_batch(drives, pool, FRAMES, **options, part=slice(1, 2))  # without one labelled frame, as another host
+    alone = read_batch(
+        recordings, pool, FRAMES, **options, part=slice(1, 2)
+    )  # without one labelled frame, as another host
     assert alone.maps is not None and not alone.labelled.any()
 
-    unread = read_batch(drives, pool, FRAMES, **options, categories=0)
+    unread = read_batch(recordings, pool, FRAMES, **options, categories=0)
     assert unread.maps is None and not unread.labelled.any()
-    bare = read_batch(drives[1:] * 2, pool, FRAMES, **options)
+    bare = read_batch(recordings[1:] * 2, pool, FRAMES, **options)
     assert bare.maps is None and not bare.labelled.any()
 
 
 def test_maps_are_turned_and_cropped_with_their_images(pool, tmp_path):
-    drives = [image_drive(tmp_path / name, labelled=range(99)) for name in ("06", "07")]
-    batch = read(drives, pool)
+    recordings = [image_drive(tmp_path / name, labelled=range(99)) for name in ("06", "07")]
+    batch = read(recordings, pool)
     angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 8).astype(np.float32)
     images, maps = jax.jit(views, static_argnames="grid")(batch, jnp.asarray(angles), grid=GRID)
     assert images.shape == maps.shape == (8, 16, 16)
@@ -232,8 +208,8 @@ def test_maps_are_turned_and_cropped_with_their_images(pool, tmp_path):
     assert same_angle > 5.5 > 4.5 > np.asarray(images)[np.asarray(maps) == 0].mean()
 
 
-def test_scans_become_density_images_of_all_their_points(drives, pool):
-    bare, frames = drives[1], np.array([[0, 1, 12, 13]])
+def test_scans_become_density_images_of_all_their_points(recordings, pool):
+    bare, frames = recordings[1], np.array([[0, 1, 12, 13]])
     alone = TuplePool([bare.positions], TupleConfig(negatives=2))
     batch = read_batch([bare], alone, frames, max_points=2, share_negatives=False, image="density")
     assert batch.points is None and not batch.labelled.any() and batch.places == 4
@@ -241,20 +217,20 @@ def test_scans_become_density_images_of_all_their_points(drives, pool):
     assert batch.images.sum() > 0
     middle = even_cells(jnp.asarray(batch.images))[:, 68:84, 68:84]
     np.testing.assert_allclose(views(batch, jnp.zeros(4), GRID)[0], middle, atol=1e-4)
-    labelled = read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, image="density")
+    labelled = read_batch(recordings, pool, FRAMES, max_points=9, share_negatives=False, image="density")
     for row, frame in enumerate(FRAMES.reshape(-1)):
-        drive, number = drives[int(pool.drive[frame])], int(pool.frame[frame])
-        assert labelled.labelled[row] == (drive.labels(number) is not None)
+        recording, number = recordings[int(pool.recording[frame])], int(pool.frame[frame])
+        assert labelled.labelled[row] == (recording.labels(number) is not None)
         if labelled.labelled[row]:
-            classes = to_classes(drive.labels(number))
-            np.testing.assert_array_equal(labelled.maps[row], density_label_bev(drive.points(number), classes))
-    unread = read_batch(drives, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
+            classes = to_classes(recording.labels(number))
+            np.testing.assert_array_equal(labelled.maps[row], density_label_bev(recording.points(number), classes))
+    unread = read_batch(recordings, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
     assert unread.images.shape == (8, 151, 151)
 
 
-def test_scans_and_images_do_not_mix(drives, pool):
-    pictures = ImageSequence("06", ("0",), None, None, None, (Path("0.png"),), 1.0, lambda path: np.zeros((20, 20)))
-    with pytest.raises(ValueError, match="expected all drives of a batch to be scans, found images in 06"):
-        read([drives[0], pictures], pool)
-    with pytest.raises(ValueError, match="expected all drives of a batch to be images, found scans in 05"):
-        read([pictures, drives[1]], pool, np.array([[20, 21, 22, 23]]))
+def test_scans_and_images_do_not_mix(recordings, pool):
+    pictures = of_images({Path("0.png"): np.zeros((20, 20))}, name="06")
+    with pytest.raises(ValueError, match="expected all recordings of a batch to be scans, found images in 06"):
+        read([recordings[0], pictures], pool)
+    with pytest.raises(ValueError, match="expected all recordings of a batch to be images, found scans in 05"):
+        read([pictures, recordings[1]], pool, np.array([[20, 21, 22, 23]]))

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data.bev_images import open_sequence, read_image, sequence_names
+from sglpr_jax.data.readers.bev_images import open_recording, read_image, recording_names
 
 
 def test_a_sequence(bev_root):
-    assert sequence_names(bev_root) == ("06",)
-    sequence = open_sequence(bev_root, "06")
+    assert recording_names(bev_root) == ("06",)
+    sequence = open_recording(bev_root, "06")
     assert (sequence.name, sequence.ids, len(sequence)) == ("06", ("000000", "000001", "000002"), 3)
     assert (sequence.times, sequence.pose_source, sequence.resolution_m) == (None, "06/pose.txt", 0.4)
     assert not sequence.has_labels
@@ -31,7 +31,7 @@ def test_forward_points_right_and_left_points_up(tmp_path):
 
 def test_sparse_images_take_their_own_rows(bev_root):
     (bev_root / "06/imgs/000001.png").unlink()
-    sequence = open_sequence(bev_root, "06")
+    sequence = open_recording(bev_root, "06")
     assert sequence.ids == ("000000", "000002")
     np.testing.assert_array_equal(sequence.positions, [[0, 1, 2], [6, 7, 8]])
 
@@ -40,7 +40,7 @@ def test_labels_lie_beside_some_of_the_images(bev_root):
     (bev_root / "06/labels").mkdir()
     raw = np.arange(35, dtype=np.uint16).reshape(5, 7) // 34 * 252
     Image.fromarray(raw).save(bev_root / "06/labels/000001.png")
-    sequence = open_sequence(bev_root, "06")
+    sequence = open_recording(bev_root, "06")
     assert sequence.has_labels
     assert sequence.label_paths == (None, bev_root / "06/labels/000001.png", None)
     assert sequence.labels(0) is None
@@ -54,16 +54,16 @@ def test_too_few_poses_name_the_frame(bev_root):
     path = bev_root / "06/pose.txt"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
     with pytest.raises(ValueError, match=r"pose\.txt: expected at least 3 rows \(frame 2\), found 2"):
-        open_sequence(bev_root, "06")
+        open_recording(bev_root, "06")
 
 
 def test_missing_poses_or_images_are_named(bev_root):
     (bev_root / "06/pose.txt").unlink()
     with pytest.raises(FileNotFoundError, match=r"06/pose\.txt: no such file"):
-        open_sequence(bev_root, "06")
+        open_recording(bev_root, "06")
     (bev_root / "07/imgs").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match=r"07/imgs: expected images \(\*\.png\), found none"):
-        open_sequence(bev_root, "07")
+        open_recording(bev_root, "07")
 
 
 @pytest.mark.parametrize("kept", [0, 20, 50])
@@ -71,7 +71,7 @@ def test_a_cut_off_image_is_named(bev_root, kept):
     path = bev_root / "06/imgs/000000.png"
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(ValueError, match=r"000000\.png: expected an 8-bit grey PNG"):
-        open_sequence(bev_root, "06").image(0)
+        open_recording(bev_root, "06").image(0)
 
 
 def test_a_colour_image_is_refused(tmp_path):
@@ -84,8 +84,8 @@ def test_a_colour_image_is_refused(tmp_path):
 
 def test_the_real_images(shared):
     root = shared / "data/kitti_bev"
-    assert sequence_names(root) == ("00", "02", "06")
-    sequence = open_sequence(root, "06")
+    assert recording_names(root) == ("00", "02", "06")
+    sequence = open_recording(root, "06")
     assert (len(sequence), sequence.positions.shape) == (1101, (1101, 3))
     image = sequence.image(500)
     assert image.shape == (151, 151)
@@ -98,7 +98,7 @@ def test_the_real_images(shared):
 
 def test_the_real_images_look_along_their_scans(shared):
     """The image of frame 0 of 00 and a rasterised scan of it, both in eq. 1's orientation, show the same walls."""
-    images = open_sequence(shared / "data/kitti_bev", "00")
+    images = open_recording(shared / "data/kitti_bev", "00")
     points = np.fromfile(shared / "data/kitti_odometry/sequences/00/velodyne/000000.bin", "<f4").reshape(-1, 4)[:, :3]
     points = points[points[:, 2] > -1.2]
     edges = (np.arange(152) - 75.5) * 0.4

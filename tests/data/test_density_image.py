@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data.bev_images import read_image
-from sglpr_jax.data.density_image import density_bev, density_image, density_label_bev, density_label_map
+from sglpr_jax.data.density_image import density_bev, density_image, density_label_bev, density_label_image
+from sglpr_jax.data.readers.bev_images import read_image
 
 
 def cloud(*points: tuple[float, float, float]) -> np.ndarray:
@@ -67,18 +67,18 @@ def test_row_is_forward_and_eq_1_is_a_quarter_turn_away(tmp_path):
 def test_what_is_outside_the_crop_leaves_no_trace(outside):
     points = cloud(outside)
     assert not density_image(points).any()
-    assert not density_label_map(points, np.array([9])).any()
+    assert not density_label_image(points, np.array([9])).any()
     assert density_image(np.concatenate([points, cloud((1.0, 1.0, 0.0))])).sum() == 255
 
 
 def test_an_empty_scan_is_a_black_image():
     assert not density_image(cloud()).any()
-    assert not density_label_map(cloud(), np.zeros(0, np.int32)).any()
+    assert not density_label_image(cloud(), np.zeros(0, np.int32)).any()
 
 
 def test_labels_are_those_of_the_last_point_inside_the_crop():
     points = cloud((5.1, 5.1, 0.0), (5.2, 5.2, 1.0), (5.2, 5.2, -1.7), (-5.1, 5.1, 0.0))
-    labels = density_label_map(points, np.array([13, 14, 9, 1]))
+    labels = density_label_image(points, np.array([13, 14, 9, 1]))
     assert labels.dtype == np.int32
     assert {tuple(map(int, cell)): int(labels[tuple(cell)]) for cell in np.argwhere(labels)} == {
         (63, 63): 14,
@@ -88,7 +88,7 @@ def test_labels_are_those_of_the_last_point_inside_the_crop():
 
 def test_labels_lie_on_the_image():
     points = np.random.default_rng(0).uniform(-26, 26, (400, 3)).astype(np.float32)
-    labels = density_label_map(points, np.full(len(points), 7))
+    labels = density_label_image(points, np.full(len(points), 7))
     np.testing.assert_array_equal(labels > 0, density_image(points) > 0)  # so few points are their voxels' centroids
 
 

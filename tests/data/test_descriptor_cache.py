@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.descriptor_cache import DescriptorCache
+from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
 
 
 def cache_of(places: np.ndarray, seed: int = 0) -> DescriptorCache:

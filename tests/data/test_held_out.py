@@ -1,18 +1,18 @@
-"""What is held out of a drive is never seen from what is trained on."""
+"""What is held out of a recording is never seen from what is trained on."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.held_out import ValidationConfig, hold_out
-from sglpr_jax.data.tuples import TupleConfig
+from sglpr_jax.data.sampling.held_out import ValidationConfig, hold_out
+from sglpr_jax.data.sampling.tuples import TupleConfig
 
 SAMPLING = TupleConfig(revisit_gap=20)
 
 
 def wandering(seed: int, frames: int = 400) -> np.ndarray:
-    """A drive of 2 m between frames that turns at random, so that it may cross itself; heights are noise."""
+    """A recording of 2 m between frames that turns at random, so that it may cross itself; heights are noise."""
     rng = np.random.default_rng(seed)
     heading = np.cumsum(rng.normal(scale=0.15, size=frames))
     across = np.cumsum(2 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)

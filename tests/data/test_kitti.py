@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.kitti import open_sequence, read_trajectory, sequence_names
+from sglpr_jax.data.readers.kitti import open_recording, read_trajectory, recording_names
 
 
 def test_sparse_scans_take_their_own_rows(kitti_root):
-    sequence = open_sequence(kitti_root, "08")
+    sequence = open_recording(kitti_root, "08")
     assert (sequence.name, sequence.ids, len(sequence)) == ("08", ("000000", "000002", "000003"), 3)
     np.testing.assert_array_equal(sequence.positions, [[0, -1, -2], [20, -1, -2], [30, -1, -2]])
     np.testing.assert_array_equal(sequence.times, [0, 0.2, 0.3])
@@ -15,19 +15,19 @@ def test_sparse_scans_take_their_own_rows(kitti_root):
 
 
 def test_labels_where_there_are_any(kitti_root):
-    sequence = open_sequence(kitti_root, "08")
+    sequence = open_recording(kitti_root, "08")
     assert sequence.has_labels
     np.testing.assert_array_equal(sequence.labels(0), [48, 49, 50, 51, 52])
     assert sequence.labels(1) is None
     for path in (kitti_root / "sequences/08/labels").iterdir():
         path.unlink()
-    assert not open_sequence(kitti_root, "08").has_labels
+    assert not open_recording(kitti_root, "08").has_labels
 
 
 def test_labels_unlike_the_points_are_refused(kitti_root):
     (kitti_root / "sequences/08/labels/000000.label").write_bytes(bytes(12))
     with pytest.raises(ValueError, match=r"000000\.label: expected 5 labels of 4 bytes.*found 12 bytes"):
-        open_sequence(kitti_root, "08").labels(0)
+        open_recording(kitti_root, "08").labels(0)
 
 
 @pytest.mark.parametrize(
@@ -39,16 +39,16 @@ def test_labels_unlike_the_points_are_refused(kitti_root):
     ],
 )
 def test_the_pose_file_is_chosen_and_named(kitti_root, poses, source, height):
-    sequence = open_sequence(kitti_root, "08", poses=poses)
+    sequence = open_recording(kitti_root, "08", pose_source=poses)
     assert sequence.pose_source == source
     assert sequence.positions[0, 2] == height
 
 
 def test_poses_of_kitti_are_taken_where_there_are_no_others(kitti_root):
     (kitti_root / "sequences/08/poses.txt").unlink()
-    assert open_sequence(kitti_root, "08").pose_source == "poses/08.txt"
+    assert open_recording(kitti_root, "08").pose_source == "poses/08.txt"
     with pytest.raises(FileNotFoundError, match=r"expected poses in sequences/08/poses\.txt, found none"):
-        open_sequence(kitti_root, "08", poses="semantickitti")
+        open_recording(kitti_root, "08", pose_source="semantickitti")
 
 
 def test_missing_poses_name_both_places(kitti_root):
@@ -57,7 +57,7 @@ def test_missing_poses_name_both_places(kitti_root):
     with pytest.raises(
         FileNotFoundError, match=r"expected poses in sequences/08/poses\.txt or poses/08\.txt, found none"
     ):
-        open_sequence(kitti_root, "08")
+        open_recording(kitti_root, "08")
 
 
 @pytest.mark.parametrize("file, what", [("poses.txt", "poses"), ("times.txt", "times")])
@@ -65,7 +65,7 @@ def test_too_few_rows_name_the_frame(kitti_root, file, what):
     path = kitti_root / "sequences/08" / file
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     with pytest.raises(ValueError, match=rf"{what}\.txt: expected at least 4 rows \(frame 3\), found 3"):
-        open_sequence(kitti_root, "08")
+        open_recording(kitti_root, "08")
 
 
 def test_poses_that_are_not_numbers_name_the_line(kitti_root):
@@ -74,25 +74,25 @@ def test_poses_that_are_not_numbers_name_the_line(kitti_root):
     lines[1] = "nan " * 12
     path.write_text("\n".join(lines))
     with pytest.raises(ValueError, match=r"poses\.txt, line 2: expected finite numbers, found 'nan"):
-        open_sequence(kitti_root, "08")
+        open_recording(kitti_root, "08")
 
 
 def test_times_are_optional(kitti_root):
     (kitti_root / "sequences/08/times.txt").unlink()
-    assert open_sequence(kitti_root, "08").times is None
+    assert open_recording(kitti_root, "08").times is None
 
 
 def test_a_sequence_without_scans_is_refused(kitti_root):
     (kitti_root / "sequences/09/velodyne").mkdir(parents=True)
-    assert sequence_names(kitti_root) == ("08", "09")
+    assert recording_names(kitti_root) == ("08", "09")
     with pytest.raises(FileNotFoundError, match=r"09/velodyne: expected scans \(\*\.bin\), found none"):
-        open_sequence(kitti_root, "09")
+        open_recording(kitti_root, "09")
 
 
 def test_the_real_layout(shared):
     root = shared / "data/kitti_odometry"
-    assert sequence_names(root) == ("00", "08")
-    sequence = open_sequence(root, "00")
+    assert recording_names(root) == ("00", "08")
+    sequence = open_recording(root, "00")
     assert (len(sequence), sequence.ids[-1], sequence.pose_source) == (11, "004501", "sequences/00/poses.txt")
     labelled = [i for i in range(len(sequence)) if sequence.labels(i) is not None]
     assert [sequence.ids[i] for i in labelled] == ["000000", "000001", "000002", "000052", "000088", "000850", "004501"]
@@ -105,5 +105,5 @@ def test_the_real_layout(shared):
 
 
 def test_the_trajectory_needs_no_scans(shared):
-    positions, times, source = read_trajectory(shared / "data/kitti_odometry", "05", poses="kitti")
+    positions, times, source = read_trajectory(shared / "data/kitti_odometry", "05", pose_source="kitti")
     assert (positions.shape, times.shape, source) == ((2761, 3), (2761,), "poses/05.txt")

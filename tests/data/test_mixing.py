@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.bev import Grid
-from sglpr_jax.data.batch import Batch, views
-from sglpr_jax.data.mixing import mix
+from sglpr_jax.data.sampling.batch import Batch, views
+from sglpr_jax.data.sampling.mixing import mix
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 RNG = np.random.default_rng(0)
@@ -39,13 +39,13 @@ def test_the_views_are_those_of_each_source_one_after_the_other(first, second):
 
 
 def test_places_for_the_segmentation_alone_are_nobodys_negatives():
-    np.testing.assert_array_equal(mix(IMAGES, SCANS, triplets=False, share_negatives=True).far, IMAGES.far)
+    np.testing.assert_array_equal(mix(IMAGES, SCANS, triplets=False, share_negatives=True).negatives, IMAGES.negatives)
 
 
 @pytest.mark.parametrize("share_negatives", [False, True])
 def test_the_tuples_of_both_sources_lend_each_other_negatives_where_tuples_do(share_negatives):
-    far = mix(IMAGES, SCANS, triplets=True, share_negatives=share_negatives).far
-    assert far.shape == (3, 9)
-    np.testing.assert_array_equal(far[:2, :6], IMAGES.far)
-    np.testing.assert_array_equal(far[2:, 6:], SCANS.far)
-    assert (far[:2, 6:] == share_negatives).all() and (far[2:, :6] == share_negatives).all()
+    negatives = mix(IMAGES, SCANS, triplets=True, share_negatives=share_negatives).negatives
+    assert negatives.shape == (3, 9)
+    np.testing.assert_array_equal(negatives[:2, :6], IMAGES.negatives)
+    np.testing.assert_array_equal(negatives[2:, 6:], SCANS.negatives)
+    assert (negatives[:2, 6:] == share_negatives).all() and (negatives[2:, :6] == share_negatives).all()

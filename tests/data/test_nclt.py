@@ -8,7 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sglpr_jax.bev import Grid, rasterize
-from sglpr_jax.data import ScanSequence, nclt, open_sequence, read_scan, sequence_names
+from sglpr_jax.data import open_recording, read_scan, recording_names
+from sglpr_jax.data.corruption.corrupted import corrupted
+from sglpr_jax.data.corruption.corruptions import Corruption
+from sglpr_jax.data.formats.scan_files import NCLT_RECORD
+from sglpr_jax.data.readers import nclt
 
 DATE = "2012-01-15"
 FIRST = 1326652795280148
@@ -36,9 +40,9 @@ def root(tmp_path) -> Path:
 
 
 def test_each_scan_has_the_nearest_pose_and_those_without_are_left_out(root):
-    assert sequence_names(root) == (DATE,)
-    session = open_sequence(root, DATE)
-    assert isinstance(session, ScanSequence)
+    assert recording_names(root) == (DATE,)
+    session = open_recording(root, DATE)
+    assert not session.has_images
     assert session.ids == (str(FIRST), str(FIRST + 100_000)) and session.name == DATE
     np.testing.assert_array_equal(session.positions, [[4, -5, -6], [7.5, 8, -9]])  # north, west, up
     np.testing.assert_allclose(session.times, [FIRST / 1e6, FIRST / 1e6 + 0.1], rtol=1e-12)
@@ -47,19 +51,19 @@ def test_each_scan_has_the_nearest_pose_and_those_without_are_left_out(root):
 
 
 def test_the_largest_gap_can_be_chosen(root):
-    assert len(nclt.open_sequence(root, DATE, max_gap_s=9.9)) == 2
-    patient = nclt.open_sequence(root, DATE, max_gap_s=9.92)
+    assert len(nclt.open_recording(root, DATE, max_gap_s=9.9)) == 2
+    patient = nclt.open_recording(root, DATE, max_gap_s=9.92)
     assert len(patient) == 3 and patient.pose_source == f"groundtruth_{DATE}.csv"
-    assert nclt.open_sequence(root, DATE, max_gap_s=0.01).ids == (str(FIRST), str(FIRST + 100_000))
+    assert nclt.open_recording(root, DATE, max_gap_s=0.01).ids == (str(FIRST), str(FIRST + 100_000))
     with pytest.raises(ValueError, match=r"within 0.0099 s .* found the nearest 0.01 s away"):
-        nclt.open_sequence(root, DATE, max_gap_s=0.0099)
+        nclt.open_recording(root, DATE, max_gap_s=0.0099)
 
 
 @pytest.mark.parametrize("place", [".", DATE, "ground_truth"])
 def test_the_ground_truth_is_found_in_any_of_three_places(root, place):
     (root / place).mkdir(exist_ok=True)
     (root / DATE / f"groundtruth_{DATE}.csv").rename(root / place / f"groundtruth_{DATE}.csv")
-    assert len(open_sequence(root, DATE)) == 2
+    assert len(open_recording(root, DATE)) == 2
 
 
 @given(stamps=st.lists(st.integers(0, 200), min_size=1, max_size=30), asked=st.lists(st.integers(-20, 220), min_size=1))
@@ -79,7 +83,7 @@ def test_what_stands_on_the_left_is_on_the_left_of_the_image(root):
     records = np.zeros(1, dtype=[("xyz", "<u2", 3), ("rest", "u1", 2)])
     records["xyz"] = np.round((body + 100) / 0.005)
     records.tofile(root / DATE / "velodyne_sync" / f"{FIRST}.bin")
-    points = open_sequence(root, DATE).points(0)
+    points = open_recording(root, DATE).points(0)
     np.testing.assert_allclose(points, [[10, 5, 1]], atol=1e-5)
     image = np.asarray(rasterize(points, grid=Grid(resolution_m=1.0, height=40, width=40)))
     assert np.argwhere(image).tolist() == [[20 - 6, 20 + 10]]  # image[v, u]: forward to the right, left up
@@ -95,7 +99,7 @@ def test_a_landmark_seen_from_two_places_is_one_place_of_the_world(tmp_path):
         records.tofile(write_scan(tmp_path, utime))
     rows = (f"{utime},{x},{y},{z},0,0,0\n" for utime, (x, y, z) in zip(utimes, places.tolist(), strict=True))
     (tmp_path / f"groundtruth_{DATE}.csv").write_text("".join(rows))
-    session = open_sequence(tmp_path, DATE)
+    session = open_recording(tmp_path, DATE)
     seen = [session.positions[i] + session.points(i)[0] for i in range(2)]
     np.testing.assert_allclose(seen, [[30, -12, 4]] * 2, atol=1e-5)
 
@@ -118,32 +122,32 @@ def test_a_landmark_seen_from_two_places_is_one_place_of_the_world(tmp_path):
 def test_a_broken_ground_truth_is_named(root, text, words):
     (root / DATE / f"groundtruth_{DATE}.csv").write_text(text)
     with pytest.raises(ValueError, match=f"groundtruth_{DATE}.csv: {words}"):
-        open_sequence(root, DATE)
+        open_recording(root, DATE)
 
 
 def test_missing_files_are_named_with_the_places_looked_at(root):
     truth = root / DATE / f"groundtruth_{DATE}.csv"
     truth.unlink()
     with pytest.raises(FileNotFoundError, match=rf"groundtruth_{DATE}.csv or {DATE}/.* or ground_truth/.*found none"):
-        open_sequence(root, DATE)
+        open_recording(root, DATE)
     with pytest.raises(FileNotFoundError, match=r"2012-02-04/velodyne_sync: expected scans .*, found no such folder"):
-        nclt.open_sequence(root, "2012-02-04")
+        nclt.open_recording(root, "2012-02-04")
     with pytest.raises(FileNotFoundError, match=f"expected sequence '2012-02-04', found {DATE}"):
-        open_sequence(root, "2012-02-04")
+        open_recording(root, "2012-02-04")
     for path in (root / DATE / "velodyne_sync").iterdir():
         path.unlink()
     with pytest.raises(FileNotFoundError, match=r"velodyne_sync: expected scans .*, found none"):
-        open_sequence(root, DATE)
+        open_recording(root, DATE)
 
 
 def test_a_scan_cut_short_or_of_another_name_is_refused(root):
     path = root / DATE / "velodyne_sync" / f"{FIRST}.bin"
     path.write_bytes(path.read_bytes()[:-3])
     with pytest.raises(ValueError, match=rf"{FIRST}.bin: expected 8 bytes for each point \(nclt\), found 21"):
-        open_sequence(root, DATE).points(0)
+        open_recording(root, DATE).points(0)
     path.rename(path.with_name("first.bin"))
     with pytest.raises(ValueError, match=r"expected scans named by their time, .* found first.bin"):
-        open_sequence(root, DATE)
+        open_recording(root, DATE)
 
 
 def test_the_real_scan_is_what_numpy_makes_of_its_bytes(shared, tmp_path):
@@ -154,7 +158,7 @@ def test_the_real_scan_is_what_numpy_makes_of_its_bytes(shared, tmp_path):
     (tmp_path / f"groundtruth_{DATE}.csv").write_text(ROWS)
     raw = np.frombuffer(source.read_bytes(), dtype="<u2").reshape(-1, 4)[:, :3].astype(np.float64)
     x, y, z = (raw * 0.005 - 100).T
-    points = open_sequence(tmp_path, DATE).points(0)
+    points = open_recording(tmp_path, DATE).points(0)
     np.testing.assert_array_equal(points, np.stack([x, -y, -z], axis=1).astype(np.float32))
 
 
@@ -166,3 +170,28 @@ def test_the_real_sensor_is_upside_down_above_the_bodys_origin(shared):
     x, y, z = read_scan(path).T
     elevation = np.degrees(np.arctan2(z - 1.03, np.hypot(x, y)))
     assert np.median(np.abs(elevation + sheet)) < 0.05 < 1 < np.median(np.abs(elevation - sheet))
+
+
+def test_beams_are_told_apart_by_the_lasers_of_the_file(root):
+    """In an order that neither elevation nor the order of the points tells."""
+    scan = open_recording(root, DATE).paths[0]
+    rng = np.random.default_rng(0)
+    records = np.zeros(320, NCLT_RECORD)
+    records["xyz"] = rng.integers(18000, 22000, (320, 3))
+    records["laser"] = rng.permutation(np.repeat(np.arange(32), 10))
+    records.tofile(scan)
+    recording = open_recording(root, DATE)
+    np.testing.assert_array_equal(recording.record(0, lasers=True).lasers, records["laser"])
+    fewer = corrupted(recording, Corruption("beams", 16.0), seed=0).record(0, lasers=True)
+    assert len(np.unique(fewer.lasers)) == 16 and len(fewer.points) == 160
+
+
+def test_lasers_that_are_all_the_same_tell_nothing(root):
+    """As in simulated files; elevations that stand apart do."""
+    azimuth = np.linspace(0, 6, 20)
+    rings = [np.stack([9 * np.cos(azimuth), 9 * np.sin(azimuth), 0 * azimuth + z], 1) for z in (-2, -1, 0, 1)]
+    records = np.zeros(80, NCLT_RECORD)
+    records["xyz"] = np.round((np.concatenate(rings) * [1, -1, -1] + 100) / 0.005)
+    records.tofile(open_recording(root, DATE).paths[0])
+    fewer = corrupted(open_recording(root, DATE), Corruption("beams", 2.0), seed=0)
+    assert len(fewer.points(0)) == 40

@@ -1,4 +1,4 @@
-"""A packed drive is the drive of the files, to the bit; a pack is whole or not there, and follows its source."""
+"""A packed recording equals that of the files, to the bit; a pack is whole or not there, and follows its source."""
 
 import dataclasses
 import os
@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data import open_sequence
-from sglpr_jax.data import packed as packing
-from sglpr_jax.data.disturbances import DISTURBANCES
-from sglpr_jax.data.disturbed import disturbed
-from sglpr_jax.data.packed import packed
-from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.cache import packed as packing
+from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.data.corruption.corrupted import corrupted
+from sglpr_jax.data.corruption.corruptions import CORRUPTIONS
+from sglpr_jax.data.recording import Recording
 
 
-def require_same_scans(found: ScanSequence, expected: ScanSequence) -> None:
+def require_same_scans(found: Recording, expected: Recording) -> None:
     """The same points and labels, bit for bit; NaN is itself."""
     assert (found.name, found.ids, found.has_labels) == (expected.name, expected.ids, expected.has_labels)
     for i in range(len(expected)):
@@ -34,63 +34,63 @@ def packs(folder) -> list[str]:
 
 
 @pytest.fixture
-def drive(kitti_root) -> ScanSequence:
+def recording(kitti_root) -> Recording:
     """Three scans of different lengths, one without labels, with points that are not finite and an id of 16 bits."""
     folder = kitti_root / "sequences/08"
     points = np.array([[np.nan, 1, 2, 3], [np.inf, -0.0, 1e-42, 3]], "<f4")
     points.tofile(folder / "velodyne/000003.bin")
     np.array([0xFFFF, (7 << 16) + 252], "<u4").tofile(folder / "labels/000003.label")
-    return open_sequence(kitti_root, "08")
+    return open_recording(kitti_root, "08")
 
 
-def test_points_and_labels_are_those_of_the_files(drive, tmp_path):
+def test_points_and_labels_are_those_of_the_files(recording, tmp_path):
     told = []
-    found = packed(drive, tmp_path / "cache", on_progress=told.append)
+    found = packed(recording, tmp_path / "cache", on_progress=told.append)
     assert told == [1, 2, 3]
-    require_same_scans(found, drive)
-    np.testing.assert_array_equal(found.positions, drive.positions)
+    require_same_scans(found, recording)
+    np.testing.assert_array_equal(found.positions, recording.positions)
     assert not found.points(0).flags.writeable
-    shutil.rmtree(drive.scan_paths[0].parents[1])
+    shutil.rmtree(recording.paths[0].parents[1])
     np.testing.assert_array_equal(found.points(1), 200 + np.arange(20, dtype=np.float32).reshape(5, 4)[:, :3])
 
 
 def test_real_scans_are_those_of_the_files(shared, tmp_path):
-    drive = open_sequence(shared / "data/kitti_odometry", "08")
-    require_same_scans(packed(drive, tmp_path), drive)
+    recording = open_recording(shared / "data/kitti_odometry", "08")
+    require_same_scans(packed(recording, tmp_path), recording)
 
 
-def test_a_drive_without_labels_has_none(drive, tmp_path):
-    plain = dataclasses.replace(drive, label_paths=(None,) * 3)
+def test_a_drive_without_labels_has_none(recording, tmp_path):
+    plain = dataclasses.replace(recording, label_paths=(None,) * 3)
     found = packed(plain, tmp_path / "cache")
     assert not found.has_labels and found.labels(0) is None
     assert not list((tmp_path / "cache").rglob("labels.bin"))
 
 
 def test_images_are_those_of_the_files(bev_root, tmp_path):
-    drive = open_sequence(bev_root, "06")
-    found = packed(drive, tmp_path / "cache")
-    assert isinstance(found, ImageSequence) and found.resolution_m == drive.resolution_m
-    for i in range(len(drive)):
-        np.testing.assert_array_equal(found.image(i), drive.image(i), strict=True)
+    recording = open_recording(bev_root, "06")
+    found = packed(recording, tmp_path / "cache")
+    assert found.has_images and found.resolution_m == recording.resolution_m
+    for i in range(len(recording)):
+        np.testing.assert_array_equal(found.image(i), recording.image(i), strict=True)
 
 
 def test_images_of_different_widths_are_refused(bev_root, tmp_path):
     Image.fromarray(np.zeros((6, 7), np.uint8)).save(bev_root / "06/imgs/000001.png")
     with pytest.raises(ValueError, match=r"scan 000001 of sequence 06: expected .*\(5,\).*found .*\(6,\)"):
-        packed(open_sequence(bev_root, "06"), tmp_path / "cache")
+        packed(open_recording(bev_root, "06"), tmp_path / "cache")
     assert packs(tmp_path / "cache") == []
 
 
-def test_a_pack_is_made_once(drive, tmp_path, monkeypatch):
-    packed(drive, tmp_path / "cache")
+def test_a_pack_is_made_once(recording, tmp_path, monkeypatch):
+    packed(recording, tmp_path / "cache")
     monkeypatch.setattr(packing, "_make", lambda *_: pytest.fail("packed again"))
-    require_same_scans(packed(drive, tmp_path / "cache"), drive)
+    require_same_scans(packed(recording, tmp_path / "cache"), recording)
 
 
 @pytest.mark.parametrize("change", ["points", "time", "label", "fewer"])
-def test_a_changed_source_is_packed_anew(drive, kitti_root, tmp_path, change):
-    packed(drive, tmp_path / "cache")
-    scan, label = drive.scan_paths[1], drive.label_paths[0]
+def test_a_changed_source_is_packed_anew(recording, kitti_root, tmp_path, change):
+    packed(recording, tmp_path / "cache")
+    scan, label = recording.paths[1], recording.label_paths[0]
     if change == "points":
         np.ones((2, 4), "<f4").tofile(scan)
     elif change == "time":  # as many points as before
@@ -100,42 +100,42 @@ def test_a_changed_source_is_packed_anew(drive, kitti_root, tmp_path, change):
         label.unlink()
     else:
         scan.unlink()
-    changed = open_sequence(kitti_root, "08")
+    changed = open_recording(kitti_root, "08")
     require_same_scans(packed(changed, tmp_path / "cache"), changed)
     assert len(packs(tmp_path / "cache")) == 2
 
 
-def test_what_cannot_be_read_is_the_readers_error_and_leaves_nothing(drive, tmp_path):
-    drive.label_paths[2].write_bytes(bytes(4))
+def test_what_cannot_be_read_is_the_readers_error_and_leaves_nothing(recording, tmp_path):
+    recording.label_paths[2].write_bytes(bytes(4))
     with pytest.raises(ValueError, match=r"000003\.label: expected 2 labels"):
-        packed(drive, tmp_path / "cache")
+        packed(recording, tmp_path / "cache")
     assert packs(tmp_path / "cache") == []
 
 
-def test_an_interruption_leaves_nothing(drive, tmp_path):
+def test_an_interruption_leaves_nothing(recording, tmp_path):
     def interrupt(done: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        packed(drive, tmp_path / "cache", on_progress=interrupt)
+        packed(recording, tmp_path / "cache", on_progress=interrupt)
     assert packs(tmp_path / "cache") == []
 
 
 @pytest.mark.parametrize("size", [10, 400])
-def test_a_full_disk_is_one_error_that_names_the_file_and_leaves_nothing(drive, tmp_path, small_files, size):
+def test_a_full_disk_is_one_error_that_names_the_file_and_leaves_nothing(recording, tmp_path, small_files, size):
     small_files(size)  # too small for the points; for the list of files
     with pytest.raises(OSError, match=r"cache/.*08-.*: expected to write it, found: File too large"):
-        packed(drive, tmp_path / "cache")
+        packed(recording, tmp_path / "cache")
     small_files(10**6)
     assert packs(tmp_path / "cache") == []
 
 
-def test_two_that_pack_at_once_end_with_one_pack(drive, tmp_path):
+def test_two_that_pack_at_once_end_with_one_pack(recording, tmp_path):
     both, found = threading.Barrier(2, timeout=30), []
 
     def pack() -> None:
-        found.append(packed(drive, tmp_path / "cache", on_progress=lambda done: both.wait()))
+        found.append(packed(recording, tmp_path / "cache", on_progress=lambda done: both.wait()))
 
     threads = [threading.Thread(target=pack) for _ in range(2)]
     for thread in threads:
@@ -144,32 +144,32 @@ def test_two_that_pack_at_once_end_with_one_pack(drive, tmp_path):
         thread.join()
     assert len(packs(tmp_path / "cache")) == 1
     for each in found:
-        require_same_scans(each, drive)
+        require_same_scans(each, recording)
     assert len(found) == 2
 
 
-def test_what_a_killed_process_left_is_removed_once_it_is_old(drive, tmp_path):
-    packed(drive, tmp_path / "cache")
+def test_what_a_killed_process_left_is_removed_once_it_is_old(recording, tmp_path):
+    packed(recording, tmp_path / "cache")
     (name,) = packs(tmp_path / "cache")
     (tmp_path / "cache" / name).rename(tmp_path / "cache" / f".{name}.old.tmp")
     (tmp_path / "cache" / f".{name}.new.tmp").mkdir()
     for path in [*(tmp_path / "cache" / f".{name}.old.tmp").iterdir(), tmp_path / "cache" / f".{name}.old.tmp"]:
         os.utime(path, (0, 0))
-    packed(drive, tmp_path / "cache")
+    packed(recording, tmp_path / "cache")
     assert packs(tmp_path / "cache") == [f".{name}.new.tmp", name]
 
 
 @pytest.mark.parametrize("file", ["points.bin", "pack.json"])
-def test_a_damaged_pack_is_refused(drive, tmp_path, file):
-    packed(drive, tmp_path / "cache")
+def test_a_damaged_pack_is_refused(recording, tmp_path, file):
+    packed(recording, tmp_path / "cache")
     (path,) = (tmp_path / "cache").rglob(file)
     path.write_bytes(path.read_bytes()[:-5])
-    with pytest.raises(ValueError, match=r"cache/08-.*: expected a packed drive, found a damaged one"):
-        packed(drive, tmp_path / "cache")
+    with pytest.raises(ValueError, match=r"cache/08-.*: expected a packed recording, found a damaged one"):
+        packed(recording, tmp_path / "cache")
 
 
-def test_only_drives_as_they_lie_on_disk_are_packed(drive, tmp_path):
-    with pytest.raises(ValueError, match="sequence 08: expected a drive as it lies on disk, found a DisturbedSequence"):
-        packed(disturbed(drive, DISTURBANCES[-1], seed=0), tmp_path)
-    with pytest.raises(ValueError, match="found a PackedScans"):
-        packed(packed(drive, tmp_path), tmp_path)
+def test_only_drives_as_they_lie_on_disk_are_packed(recording, tmp_path):
+    with pytest.raises(ValueError, match="sequence 08: expected a recording as it lies on disk, found one that is"):
+        packed(corrupted(recording, CORRUPTIONS[-1], seed=0), tmp_path)
+    with pytest.raises(ValueError, match="found one that is packed"):
+        packed(packed(recording, tmp_path), tmp_path)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.pcd import read_pcd
+from sglpr_jax.data.formats.pcd import read_pcd
 
 HEADER = """# .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7

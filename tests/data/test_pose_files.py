@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 
 GOOD = "1 0 0 5 0 1 0 6 0 0 1 7\n"
 

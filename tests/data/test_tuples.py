@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.descriptor_cache import DescriptorCache
-from sglpr_jax.data.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
+from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 
 LAP = 60
 
 
 def circuit(laps: int, *, radius: float = 30, offset: float = 0.5, seed: int = 0) -> np.ndarray:
-    """A drive of several laps around one circle, about 3 m between frames, with some noise; heights are noise only."""
+    """Several laps around one circle, about 3 m between frames, with some noise; heights are noise only."""
     angle = np.arange(laps * LAP) * (2 * np.pi / LAP)
     noise = np.random.default_rng(seed).normal(scale=offset, size=(len(angle), 2))
     across = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1) + noise
@@ -42,9 +42,9 @@ def test_positives_are_near_and_negatives_far(seed, step, positives, negatives, 
     assert rows.shape == (6, 1 + positives + negatives)
     anchors, near, far = columns(rows, config)
     assert (horizontal(pool, anchors, near) < 3).all()
-    assert (pool.drive[anchors] == pool.drive[near]).all()
+    assert (pool.recording[anchors] == pool.recording[near]).all()
     assert (anchors != near).all()
-    assert ((horizontal(pool, anchors, far) > 20) | (pool.drive[anchors] != pool.drive[far])).all()
+    assert ((horizontal(pool, anchors, far) > 20) | (pool.recording[anchors] != pool.recording[far])).all()
     gap = np.abs(pool.frame[anchors] - pool.frame[near])
     if revisit_fraction == 1:
         assert (gap > config.revisit_gap).all()
@@ -54,13 +54,13 @@ def test_positives_are_near_and_negatives_far(seed, step, positives, negatives, 
 
 def test_all_pairs_within_three_metres_are_found_and_no_other():
     config = TupleConfig(revisit_gap=LAP // 2)
-    drives = [circuit(3), circuit(2, seed=1)]
-    pool = TuplePool(drives, config)
+    recordings = [circuit(3), circuit(2, seed=1)]
+    pool = TuplePool(recordings, config)
     for anchor in range(5 * LAP):
-        drive, frame = pool.drive[anchor], pool.frame[anchor]
-        near = np.flatnonzero(np.linalg.norm((drives[drive] - drives[drive][frame])[:, :2], axis=1) < 3)
+        recording, frame = pool.recording[anchor], pool.frame[anchor]
+        near = np.flatnonzero(np.linalg.norm((recordings[recording] - recordings[recording][frame])[:, :2], axis=1) < 3)
         found = [
-            np.sort(group.frames[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if drive == 0 else 3 * LAP)
+            np.sort(group.frames[group.starts[anchor] : group.starts[anchor + 1]]) - (0 if recording == 0 else 3 * LAP)
             for group in (pool.neighbours, pool.revisits)
         ]
         same_visit = np.abs(near - frame) <= config.revisit_gap
@@ -69,19 +69,19 @@ def test_all_pairs_within_three_metres_are_found_and_no_other():
 
 
 def test_three_metres_are_too_far_for_a_positive_and_twenty_too_near_for_a_negative():
-    drive = np.zeros((5, 3))
-    drive[:, 0] = [0, 3, 20, np.nextafter(3, 0), np.nextafter(20, 21)]
-    pool = TuplePool([drive], TupleConfig())
+    recording = np.zeros((5, 3))
+    recording[:, 0] = [0, 3, 20, np.nextafter(3, 0), np.nextafter(20, 21)]
+    pool = TuplePool([recording], TupleConfig())
     np.testing.assert_array_equal(pool.neighbours.frames[: pool.neighbours.starts[1]], [3])
     np.testing.assert_array_equal(pool.far_apart(np.array(0), np.arange(5)), [False, False, False, False, True])
 
 
 def test_places_of_different_drives_are_never_positives_and_always_negatives():
     config = TupleConfig(negatives=5)
-    drive = circuit(1)
-    pool = TuplePool([drive, drive], config)
+    recording = circuit(1)
+    pool = TuplePool([recording, recording], config)
     anchors, near, _ = columns(pool.draw(seed=0, step=0, tuples=20), config)
-    assert (pool.drive[anchors] == pool.drive[near]).all()
+    assert (pool.recording[anchors] == pool.recording[near]).all()
     assert pool.far_apart(np.arange(LAP), np.arange(LAP) + LAP).all()
 
 
@@ -113,19 +113,19 @@ def test_without_a_revisit_the_positives_are_neighbours_and_the_other_way_round(
 
 
 def test_positives_and_negatives_repeat_only_where_there_are_too_few():
-    drive = np.zeros((4, 3))
-    drive[:, 0] = [0, 1, 50, 100]
+    recording = np.zeros((4, 3))
+    recording[:, 0] = [0, 1, 50, 100]
     config = TupleConfig(positives=3, negatives=2)
-    anchors, near, far = columns(TuplePool([drive], config).draw(seed=0, step=0, tuples=8), config)
+    anchors, near, far = columns(TuplePool([recording], config).draw(seed=0, step=0, tuples=8), config)
     assert all(set(row) == {1 - anchor} for anchor, row in zip(anchors[:, 0], near.tolist(), strict=True))
     assert all(set(row) == {2, 3} for row in far.tolist())
 
 
 def test_one_far_frame_among_many_is_found():
-    drive = np.zeros((500, 3))
-    drive[77, 0] = 30
+    recording = np.zeros((500, 3))
+    recording[77, 0] = 30
     config = TupleConfig(negatives=1)
-    _, _, far = columns(TuplePool([drive], config).draw(seed=0, step=0, tuples=10), config)
+    _, _, far = columns(TuplePool([recording], config).draw(seed=0, step=0, tuples=10), config)
     assert (far == 77).all()
 
 
@@ -143,7 +143,7 @@ def test_the_anchors_of_a_cluster_lie_near_each_other_and_the_others_anywhere():
     pool = TuplePool([street, street], config)
     anchors = pool.draw(seed=0, step=0, tuples=40)[:, 0].reshape(10, 4)
     assert (horizontal(pool, anchors[:, :1], anchors) <= 60).all()
-    assert (pool.drive[anchors[:, :1]] == pool.drive[anchors]).all()
+    assert (pool.recording[anchors[:, :1]] == pool.recording[anchors]).all()
     assert np.ptp(pool.frame[anchors[:, 0]]) > 1000
     single = TuplePool([street, street], TupleConfig(negatives=0)).draw(seed=0, step=0, tuples=40)[:, 0]
     assert (np.abs(np.diff(pool.frame[single])) > 40).mean() > 0.8
@@ -168,7 +168,9 @@ def test_mined_negatives_are_the_nearest_far_frames_of_brute_force():
     anchors, near, far = columns(pool.draw(seed=0, step=0, tuples=20, cache=cache), config)
     assert (horizontal(pool, anchors, near) < 3).all()
     for anchor, row in zip(anchors[:, 0], far, strict=True):
-        apart = (pool.drive != pool.drive[anchor]) | (horizontal(pool, np.array(anchor), np.arange(len(pool))) > 20)
+        apart = (pool.recording != pool.recording[anchor]) | (
+            horizontal(pool, np.array(anchor), np.arange(len(pool))) > 20
+        )
         distance = np.linalg.norm(cache.descriptors - cache.descriptors[anchor], axis=1)
         expected = np.flatnonzero(apart)[np.argsort(distance[apart])[:5]]
         assert set(row.tolist()) == set(expected.tolist())
@@ -203,7 +205,9 @@ def test_mined_clusters_look_alike_and_lie_far_apart():
     pool = TuplePool([circuit(3), circuit(2, seed=1)], config)
     cache = described(pool)
     for row in pool.draw(seed=0, step=0, tuples=40, cache=cache)[:, 0].reshape(10, 4):
-        apart = horizontal(pool, row[:, None], row[None]) + 100 * (pool.drive[row][:, None] != pool.drive[row][None])
+        apart = horizontal(pool, row[:, None], row[None]) + 100 * (
+            pool.recording[row][:, None] != pool.recording[row][None]
+        )
         assert (apart[~np.eye(4, dtype=bool)] > 20).all()
         distance = np.linalg.norm(cache.descriptors - cache.descriptors[row[0]], axis=1)
         # the source of positives may know fewer anchors, and others of the row take places: near the front all the same
@@ -228,10 +232,10 @@ def test_mining_without_anything_to_choose_is_refused():
 def test_frames_left_out_are_in_no_tuple_and_the_others_keep_their_numbers():
     kept = np.r_[0:40, 100:180]
     config = TupleConfig(negatives=2, revisit_gap=LAP // 2)
-    drives = [circuit(3), circuit(1, seed=1)]
-    pool = TuplePool(drives, config, frames=[kept, np.arange(LAP)])
+    recordings = [circuit(3), circuit(1, seed=1)]
+    pool = TuplePool(recordings, config, frames=[kept, np.arange(LAP)])
     np.testing.assert_array_equal(pool.frame, np.r_[kept, 0:LAP])
-    np.testing.assert_array_equal(pool.positions, np.concatenate([drives[0][kept], drives[1]]))
+    np.testing.assert_array_equal(pool.positions, np.concatenate([recordings[0][kept], recordings[1]]))
     rows = pool.draw(seed=0, step=0, tuples=200)
     assert rows.max() < len(pool)
     for group, other_visit in ((pool.neighbours, False), (pool.revisits, True)):

@@ -8,7 +8,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
 def random_drive(seed, n=60):
-    """A drive in which frames are often 0 to 30 m from older ones; descriptors that know only part of it."""
+    """A recording in which frames are often 0 to 30 m from older ones; descriptors that know only part of it."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform(-15, 15, (n, 3)) * [1, 1, 0.2]
     descriptors = (positions + rng.normal(scale=4, size=(n, 3))) @ rng.normal(size=(3, 8)) / 20

@@ -2,7 +2,10 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.false_positives import worst_false_positives
-from sglpr_jax.evaluation.protocols import Decision, bevplace_recall_at_1, overlap_transformer_f1max, top1_f1max
+from sglpr_jax.evaluation.protocols import Decision
+from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
+from sglpr_jax.evaluation.protocols.overlap_transformer_f1max import overlap_transformer_f1max
+from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from PIL import Image
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Decision
-from sglpr_jax.labels import CATEGORIES, label_map
+from sglpr_jax.labels import CATEGORIES, taxonomy
 from sglpr_jax.metrics import classification_curve
 
 
@@ -88,18 +88,18 @@ def test_a_segmentation_panel_is_in_metres_and_in_the_classes_colours(tmp_path):
         assert axes.get_images()[0].get_extent() == [-10, 10, -5, 5]
     picture = pixels(figure, tmp_path / "classes.png")
     third = picture.shape[1] // 3
-    road, building = label_map().colors[[CATEGORIES.index("road"), CATEGORIES.index("building")]]
+    road, building = taxonomy().colors[[CATEGORIES.index("road"), CATEGORIES.index("building")]]
     middle = picture[: picture.shape[0] // 2]
     assert shows(middle[:, third : 2 * third], road) and not shows(middle[:, third : 2 * third], building)
     assert shows(middle[:, 2 * third :], building) and not shows(middle[:, 2 * third :], road)
 
 
 def test_a_segmentation_panel_has_the_names_and_colours_of_its_categories(tmp_path):
-    moving = label_map(25).names.index("moving")
+    moving = taxonomy(25).names.index("moving")
     found = np.full((8, 8), moving)
     figure = figures.segmentation_panel(found, None, found, resolution_m=1.0, categories=25)
     assert legend(figure) == ["moving"]
-    assert shows(pixels(figure, tmp_path / "moving.png"), label_map(25).colors[moving])
+    assert shows(pixels(figure, tmp_path / "moving.png"), taxonomy(25).colors[moving])
 
 
 def test_an_empty_image_can_be_drawn(tmp_path):

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sglpr_jax.data.trajectory import Trajectory
+from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs import read_input
-from sglpr_jax.evaluation.inputs.choice import check_names, chosen_protocols
-from sglpr_jax.evaluation.protocols import HEADLINES, PROTOCOLS, ScoredPairs, TopK, top1_f1max
+from sglpr_jax.evaluation.protocols import ScoredPairs, TopK, protocols_taking
+from sglpr_jax.evaluation.protocols.choice import check_names, chosen_protocols
+from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 
 
 @pytest.fixture
@@ -136,8 +137,8 @@ def test_a_distance_is_for_descriptors(read, tmp_path):
 def test_protocols_fit_the_input(read):
     matrix, pairs = read("a.npy", np.ones((800, 2))), read("p.txt", "5 0 .5\n")
     bare, scored = read("b.txt", "5: 0\n"), read("s.txt", "5: 0=.5\n")
-    assert chosen_protocols(matrix, ()) == list(HEADLINES)
-    assert chosen_protocols(matrix, ["all"]) == list(PROTOCOLS)
+    assert chosen_protocols(matrix, ()) == ["top1-f1max", "pairs-f1max", "bevplace-recall-at-1"]
+    assert chosen_protocols(matrix, ["all"]) == list(protocols_taking("descriptors"))
     assert chosen_protocols(scored, ()) == ["top1-f1max", "bevplace-recall-at-1"]
     assert chosen_protocols(bare, ()) == ["bevplace-recall-at-1"]
     assert chosen_protocols(bare, ["all"]) == ["bevplace-recall-at-1", "ssc-recall", "bevplace-v1-recall"]

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.evaluation.page import (
-    Evaluation,
     HeatPicture,
     Pictures,
     SemanticPicture,
@@ -17,7 +16,7 @@ from sglpr_jax.evaluation.page import (
     draw_trajectory,
     page,
 )
-from sglpr_jax.evaluation.report import evaluate
+from sglpr_jax.evaluation.scoring import Evaluation, score
 
 VOID = {"meta", "img", "br"}
 
@@ -56,7 +55,7 @@ def found(make_file, two_laps):
     descriptors = two_laps / 200
     descriptors[500] = descriptors[10]
     file = make_file(two_laps, descriptors)
-    return Evaluation("<town> & co", "about it", {"mine": evaluate(file, ["top1-f1max", "ssc-recall"])}, two_laps)
+    return Evaluation("<town> & co", "about it", {"mine": score(file, ["top1-f1max", "ssc-recall"])}, two_laps)
 
 
 def render(found, pictures=None):
@@ -87,7 +86,7 @@ def test_what_is_missing_is_said_with_its_option(found):
     _, seen = render(recall)
     assert "no protocol" in seen.texts["Precision and recall"].lower()
     assert "--poses" in seen.texts["Trajectory"]
-    assert "--protocols top1-f1max" in seen.texts["Worst false positives"]
+    assert "--protocol top1-f1max" in seen.texts["Worst false positives"]
     assert seen.images == []
 
 
@@ -114,7 +113,7 @@ def test_pictures_stand_where_they_belong(found):
 
 
 def test_methods_stand_side_by_side(found, make_file, two_laps):
-    blind = evaluate(make_file(two_laps, np.ones((800, 2))), ["top1-f1max", "ssc-recall"])
+    blind = score(make_file(two_laps, np.ones((800, 2))), ["top1-f1max", "ssc-recall"])
     both = Evaluation("town", "", found.methods | {"blind": blind}, two_laps)
     _, seen = render(both)
     for word in ("mine", "blind", f"{blind[0].score:.3f}"):
@@ -123,5 +122,5 @@ def test_methods_stand_side_by_side(found, make_file, two_laps):
 
 
 def test_a_method_without_mistakes_has_none_to_show(make_file, two_laps):
-    perfect = Evaluation("", "", {"mine": evaluate(make_file(two_laps, two_laps), ["top1-f1max"])}, two_laps)
+    perfect = Evaluation("", "", {"mine": score(make_file(two_laps, two_laps), ["top1-f1max"])}, two_laps)
     assert "none at the threshold" in render(perfect)[1].texts["Worst false positives"]

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation.distances import distance_function
-from sglpr_jax.evaluation.protocols import CROSS_SESSION_PROTOCOLS, PROTOCOLS
+from sglpr_jax.evaluation.protocols import PROTOCOLS, protocols_taking
 from sglpr_jax.evaluation.protocols.nearest import nearest_descriptors
 from sglpr_jax.evaluation.protocols.pairs import pair_distances
+from sglpr_jax.retrieval.distances import distance_function
 
 from .by_the_letter import random_drive
 
@@ -26,7 +26,7 @@ def of_unit_length(by_cosine):
     return replace(by_cosine, descriptors=by_cosine.descriptors / lengths, distance="l2")
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", protocols_taking("descriptors"))
 def test_cosine_is_l2_of_unit_length(by_cosine, of_unit_length, name):
     protocol = PROTOCOLS[name]
     expected = protocol(of_unit_length).score
@@ -34,11 +34,11 @@ def test_cosine_is_l2_of_unit_length(by_cosine, of_unit_length, name):
     assert expected > 0.05
 
 
-@pytest.mark.parametrize("name", CROSS_SESSION_PROTOCOLS)
+@pytest.mark.parametrize("name", protocols_taking("sessions"))
 def test_so_it_is_across_sessions(by_cosine, of_unit_length, name):
     def scored(file):
         other = replace(file, descriptors=file.descriptors[::-1], positions=file.positions[::-1] + 2.0)
-        return CROSS_SESSION_PROTOCOLS[name](file, other).score
+        return PROTOCOLS[name](file, other).score
 
     assert scored(by_cosine) == pytest.approx(scored(of_unit_length), abs=1e-6)
 

@@ -5,23 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation.protocols import (
-    CROSS_SESSION_PROTOCOLS,
-    PROTOCOLS,
-    TOP_K_PROTOCOLS,
-    Decision,
-    ScoredPairs,
-    TopK,
-    bevplace_recall_at_1,
-    overlap_transformer_f1max,
-    pointnetvlad_recall,
-    protocol_named,
-    scan_context_f1max,
-    score_listed_pairs,
-    scored_pairs_f1max,
-    ssc_recall,
-    top1_f1max,
-)
+from sglpr_jax.evaluation.protocols import PROTOCOLS, Decision, ScoredPairs, TopK, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
+from sglpr_jax.evaluation.protocols.listed_pairs_f1max import listed_pairs_f1max, score_listed_pairs
+from sglpr_jax.evaluation.protocols.overlap_transformer_f1max import overlap_transformer_f1max
+from sglpr_jax.evaluation.protocols.pointnetvlad_recall import pointnetvlad_recall
+from sglpr_jax.evaluation.protocols.scan_context_f1max import scan_context_f1max
+from sglpr_jax.evaluation.protocols.ssc_recall import ssc_recall
+from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 
 
 @pytest.fixture
@@ -40,7 +31,9 @@ def listed(file) -> TopK:
 
 
 # SSC's recall counts the rows of a list in another way: see below.
-@pytest.mark.parametrize("protocol", [TOP_K_PROTOCOLS[name] for name in TOP_K_PROTOCOLS if name != "ssc-recall"])
+@pytest.mark.parametrize(
+    "protocol", [other for name, other in protocols_taking("scored top-k list").items() if name != "ssc-recall"]
+)
 def test_a_list_scores_as_the_descriptors_it_was_made_of(file, listed, protocol):
     by_descriptors, by_list = protocol(file), protocol(listed)
     assert by_list.score == pytest.approx(by_descriptors.score)
@@ -88,12 +81,12 @@ def test_a_threshold_needs_scores(listed):
 def test_pairs_without_labels_are_labelled_by_position(file):
     pairs = np.array([[400, 0], [401, 0], [405, 0], [100, 0], [1, 0], [700, 300]])  # 0, 3.1, 16, 200, 3.1, 0 m
     labels = np.array([True, False, True])
-    given = scored_pairs_f1max(score_listed_pairs(file, pairs[[0, 3, 5]], labels))
-    told = scored_pairs_f1max(score_listed_pairs(file, pairs))
+    given = listed_pairs_f1max(score_listed_pairs(file, pairs[[0, 3, 5]], labels))
+    told = listed_pairs_f1max(score_listed_pairs(file, pairs))
     assert told.counts == given.counts == {"positive pairs": 2, "negative pairs": 1}
     assert told.score == given.score == 1.0
     assert (told.dimensions, given.dimensions) == (2, None)
-    assert np.isnan(scored_pairs_f1max(ScoredPairs(pairs, np.zeros(6), np.zeros(6, dtype=bool))).score)
+    assert np.isnan(listed_pairs_f1max(ScoredPairs(pairs, np.zeros(6), np.zeros(6, dtype=bool))).score)
 
 
 @pytest.mark.parametrize("frame", [-1, 800])
@@ -173,33 +166,33 @@ def test_an_unknown_protocol_names_the_nearest(name, nearest):
 
 
 def test_protocols_go_by_their_name():
-    assert protocol_named("ssc-recall") is ssc_recall
-    assert protocol_named("pointnetvlad-recall", CROSS_SESSION_PROTOCOLS) is pointnetvlad_recall
+    assert protocol_named("ssc-recall").score is ssc_recall
+    assert protocol_named("pointnetvlad-recall", protocols_taking("sessions")).score is pointnetvlad_recall
 
 
-@pytest.mark.parametrize("name", CROSS_SESSION_PROTOCOLS)
+@pytest.mark.parametrize("name", protocols_taking("sessions"))
 def test_sessions_must_be_described_alike(make_file, two_laps, name):
     database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
     with pytest.raises(ValueError, match="of 4 numbers, compared by l2, in later as in town; found 5, l2"):
-        CROSS_SESSION_PROTOCOLS[name](database, queries)
+        PROTOCOLS[name](database, queries)
     with pytest.raises(ValueError, match="compared by l2, in town as in town; found 4, cosine"):
-        CROSS_SESSION_PROTOCOLS[name](database, replace(database, distance="cosine"))
+        PROTOCOLS[name](database, replace(database, distance="cosine"))
     with pytest.raises(ValueError, match="expected positions to score sequence town"):
-        CROSS_SESSION_PROTOCOLS[name](replace(database, positions=None), database)
+        PROTOCOLS[name](replace(database, positions=None), database)
 
 
 def test_one_run_is_not_enough(file):
-    with pytest.raises(ValueError, match="expected at least two runs, found 1"):
+    with pytest.raises(ValueError, match="expected at least two sessions, found 1"):
         pointnetvlad_recall(file)
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", protocols_taking("descriptors"))
 def test_two_frames_are_too_few_to_find_anything_but_no_error(make_file, name):
     result = PROTOCOLS[name](make_file(np.array([[0.0, 0, 0], [100, 0, 0]]), np.ones((2, 4))))
     assert np.isnan(result.score) or name == "sgpr-pairs-f1max"
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", protocols_taking("descriptors"))
 def test_descriptors_that_are_all_alike_make_one_threshold(make_file, two_laps, name):
     result = PROTOCOLS[name](make_file(two_laps, np.ones((800, 4))))
     assert 0 <= result.interval[0] <= result.score <= result.interval[1] <= 1

@@ -5,16 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.evaluation.protocols import (
-    PROTOCOLS,
-    Decision,
-    bevplace_recall_at_1,
-    pairs_f1max,
-    top1_f1max,
-)
+from sglpr_jax.evaluation.protocols import PROTOCOLS, Decision, protocols_taking
+from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
+from sglpr_jax.evaluation.protocols.pairs_f1max import pairs_f1max
+from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 from .by_the_letter import distance, f1_max, random_drive
+
+DESCRIPTORS = protocols_taking("descriptors")
 
 
 def top1_by_the_letter(file: DescriptorFile) -> tuple[float, int]:
@@ -77,21 +76,19 @@ def test_pairs_follow_the_rule_to_the_letter(make_file, seed):
     assert result.score == pytest.approx(expected, nan_ok=True)
 
 
-THREE_D = {"top1-f1max", "top1-strict-f1max", "contour-context-f1max", "bevplace-recall-at-1"}
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", DESCRIPTORS)
 def test_descriptors_that_know_the_place_score_one(make_file, two_laps, name):
     result = PROTOCOLS[name](make_file(two_laps, two_laps / 200))
     assert result.score == 1.0
     assert result.interval == (1.0, 1.0)
     assert result.pose_source == "made up"
     assert result.published_on
-    assert result.dimensions == (3 if name in THREE_D else 2)
+    rule = PROTOCOLS[name].rule  # says in which plane, where it says so
+    assert result.dimensions in ((3,) if "3-D" in rule else (2,) if "x and y" in rule else (2, 3))
     assert sum(result.counts.values()) > 0
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", DESCRIPTORS)
 def test_the_interval_holds_the_score_and_every_result_has_another_name(make_file, two_laps, name):
     noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))
     file = make_file(two_laps, two_laps / 200 + noise)
@@ -102,13 +99,13 @@ def test_the_interval_holds_the_score_and_every_result_has_another_name(make_fil
     assert again.interval == result.interval
     if 0 < result.score < 1:
         assert other.interval != result.interval
-    assert [PROTOCOLS[other](file).name for other in PROTOCOLS].count(result.name) == 1
+    assert [PROTOCOLS[other](file).name for other in DESCRIPTORS].count(result.name) == 1
 
 
-# SGPR's positive pairs are mostly neighbours: it has a score on any drive.
-@pytest.mark.parametrize("protocol", [PROTOCOLS[name] for name in PROTOCOLS if name != "sgpr-pairs-f1max"])
+# SGPR's positive pairs are mostly neighbours: it has a score on any recording.
+@pytest.mark.parametrize("protocol", [PROTOCOLS[name] for name in DESCRIPTORS if name != "sgpr-pairs-f1max"])
 def test_without_a_revisit_there_is_no_score(make_file, straight, protocol):
-    # In the middle of the drive a gap of 20 m, so that the first query is far from the map.
+    # In the middle of the recording a gap of 20 m, so that the first query is far from the map.
     positions = straight + np.where(np.arange(800) >= 480, 20.0, 0.0)[:, None] * [1, 0, 0]
     result = protocol(make_file(positions, np.ones((800, 4))))
     assert np.isnan(result.score)
@@ -174,9 +171,9 @@ def test_negative_pairs_are_drawn_by_the_seed(make_file, two_laps):
 @pytest.mark.parametrize(
     ("sequence", "frames", "queries", "rule"),
     [
-        ("06", 1101, 301, "5 m, BEVPlace++ split: map 0 to 599, queries 800 to 1100"),
-        ("06", 1100, 440, "5 m, no published split: map is the first 60% of the frames"),
-        ("town", 1101, 441, "5 m, no published split: map is the first 60% of the frames"),
+        ("06", 1101, 301, "5 m, BEVPlace++ split: database 0 to 599, queries 800 to 1100"),
+        ("06", 1100, 440, "5 m, no published split: database is the first 60% of the frames"),
+        ("town", 1101, 441, "5 m, no published split: database is the first 60% of the frames"),
     ],
 )
 def test_bevplaces_split_is_used_for_kittis_sequences_alone(make_file, sequence, frames, queries, rule):
@@ -205,15 +202,16 @@ def test_recall_counts_only_queries_that_have_an_answer(make_file):
 def test_blocks_leave_no_seam(make_file, monkeypatch):
     positions, descriptors, times = random_drive(3)
     file = make_file(positions, descriptors, times=times)
-    whole = [protocol(file) for protocol in PROTOCOLS.values()]
-    for block in ("nearest.BLOCK", "nearest.POSITION_BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
+    whole = [protocol(file) for protocol in DESCRIPTORS.values()]
+    for block in ("nearest.BLOCK", "pairs.BLOCK", "pairs.PAIR_BLOCK"):
         monkeypatch.setattr(f"sglpr_jax.evaluation.protocols.{block}", 7)
-    for one, other in zip(whole, [protocol(file) for protocol in PROTOCOLS.values()], strict=True):
+    monkeypatch.setattr("sglpr_jax.poses.BLOCK", 7)
+    for one, other in zip(whole, [protocol(file) for protocol in DESCRIPTORS.values()], strict=True):
         assert one.score == pytest.approx(other.score, nan_ok=True)
         assert one.counts == other.counts
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS.values())
+@pytest.mark.parametrize("protocol", DESCRIPTORS.values())
 def test_positions_are_needed(make_file, two_laps, protocol):
     file = replace(make_file(two_laps, two_laps), positions=None)
     with pytest.raises(ValueError, match="expected positions to score sequence town against, found none"):

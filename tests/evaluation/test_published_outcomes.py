@@ -3,16 +3,13 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.kitti import read_trajectory
-from sglpr_jax.evaluation.protocols import (
-    TopK,
-    contour_context_f1max,
-    score_listed_pairs,
-    scored_pairs_f1max,
-    ssc_recall,
-    top1_f1max,
-)
-from sglpr_jax.evaluation.protocols.ssc import positive_pairs
+from sglpr_jax.data.readers.kitti import read_trajectory
+from sglpr_jax.evaluation.protocols import TopK
+from sglpr_jax.evaluation.protocols.contour_context_f1max import contour_context_f1max
+from sglpr_jax.evaluation.protocols.listed_pairs_f1max import listed_pairs_f1max, score_listed_pairs
+from sglpr_jax.evaluation.protocols.pairs_f1max import positive_pairs
+from sglpr_jax.evaluation.protocols.ssc_recall import ssc_recall
+from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 
 
 @pytest.mark.parametrize(
@@ -27,7 +24,7 @@ from sglpr_jax.evaluation.protocols.ssc import positive_pairs
     ],
 )
 def test_sscs_lists_give_its_recall(shared, sequence, rows, recall):
-    positions, times, source = read_trajectory(shared / "data/kitti_odometry", sequence, poses="semantickitti")
+    positions, times, source = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     listed = np.loadtxt(shared / f"data/protocol/ssc_top25_{sequence}.txt", dtype=np.int64)
     result = ssc_recall(TopK(sequence, positions, times, source, listed[:, 0], listed[:, 1:]))
     assert round(result.score, 4) == recall
@@ -64,7 +61,7 @@ def test_contour_contexts_outcome_gives_its_f1max(shared):
     ("sequence", "revisits"), [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
 )
 def test_revisits_are_logg3ds(shared, make_file, sequence, revisits):
-    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, poses="semantickitti")
+    positions, times, _ = read_trajectory(shared / "data/kitti_odometry", sequence, pose_source="semantickitti")
     result = top1_f1max(make_file(positions, positions, times=times, sequence=sequence))
     assert result.counts["revisits"] == revisits
 
@@ -81,7 +78,7 @@ def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
     published = {tuple(pair) for pair in pairs[positive].tolist()}
     found = {}
     for poses in ("kitti", "semantickitti"):
-        positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", poses=poses)
+        positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", pose_source=poses)
         found[poses] = set(zip(*np.divmod(positive_pairs(positions[:, :2]), len(positions)), strict=True))
     assert found["kitti"] == published
     assert len(published) == 1833
@@ -90,11 +87,11 @@ def test_positive_pairs_are_rinets_on_kittis_own_poses(shared, neg_100):
 
 def test_rinets_list_scores_descriptors(shared, make_file, neg_100):
     pairs, positive = neg_100
-    positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", poses="kitti")
+    positions, _, _ = read_trajectory(shared / "data/kitti_odometry", "07", pose_source="kitti")
     noise = np.random.default_rng(0).normal(scale=10, size=positions.shape)
     file = make_file(positions, positions + noise, sequence="07")
-    by_label = scored_pairs_f1max(score_listed_pairs(file, pairs, positive))
-    by_position = scored_pairs_f1max(score_listed_pairs(file, pairs))
+    by_label = listed_pairs_f1max(score_listed_pairs(file, pairs, positive))
+    by_position = listed_pairs_f1max(score_listed_pairs(file, pairs))
     assert by_label.counts == by_position.counts == {"positive pairs": 1833, "negative pairs": 183_300}
     assert by_label.score == by_position.score
     assert 0 < by_label.interval[0] < by_label.score < by_label.interval[1] < 1

@@ -5,18 +5,19 @@ import pytest
 from rich.console import Console
 
 from sglpr_jax.evaluation import report
-from sglpr_jax.evaluation.protocols import PROTOCOLS
+from sglpr_jax.evaluation.protocols import protocols_taking
+from sglpr_jax.evaluation.scoring import score
 
 
 @pytest.fixture
 def found(make_file, two_laps):
     rng = np.random.default_rng(0)
-    return report.evaluate(make_file(two_laps, two_laps / 200 + rng.normal(scale=0.02, size=(800, 3))))
+    return score(make_file(two_laps, two_laps / 200 + rng.normal(scale=0.02, size=(800, 3))))
 
 
 @pytest.fixture
 def nothing_to_find(make_file, straight):
-    return report.evaluate(make_file(straight * 10, np.ones((800, 4))))
+    return score(make_file(straight * 10, np.ones((800, 4))))
 
 
 def render(table):
@@ -33,7 +34,7 @@ def test_every_protocol_is_reported_with_what_it_rests_on(found):
         assert word in text
     for count in ("510 queries", "400 revisits", "400 positive pairs", "40000 negative pairs", "320 queries"):
         assert count in text
-    for rule in ("last 290 frames excluded", "100 negatives per positive", "map is the first 60% of the frames"):
+    for rule in ("last 290 frames excluded", "100 negatives per positive", "database is the first 60% of the frames"):
         assert rule in text
     for result in found:
         assert 0 < result.score <= 1
@@ -43,13 +44,13 @@ def test_every_protocol_is_reported_with_what_it_rests_on(found):
 
 def test_other_protocols_are_reported_where_they_are_named(make_file, two_laps):
     file = make_file(two_laps, two_laps / 200)
-    results = report.evaluate(file, ["ssc-recall", "scan-context-f1max"])
+    results = score(file, ["ssc-recall", "scan-context-f1max"])
     assert [result.name for result in results] == ["SSC Recall@1", "Scan Context F1max"]
     recall, top1 = report.to_json(results)
     assert list(recall["recall_at"].values()) == [1.0] * 25 and recall["average_precision"] is None
     assert list(top1["recall_at"]) == ["1"] and top1["average_precision"] == 1.0
     with pytest.raises(ValueError, match="did you mean 'ssc-recall'"):
-        report.evaluate(file, ["ssc-recal"])
+        score(file, ["ssc-recal"])
 
 
 def test_a_sequence_without_revisits_says_so(nothing_to_find):
@@ -66,7 +67,7 @@ def test_methods_stand_side_by_side(found, nothing_to_find):
 
 
 def test_many_protocols_stand_below_one_another_with_their_names_whole(make_file, two_laps):
-    results = report.evaluate(make_file(two_laps, two_laps / 200), list(PROTOCOLS))
+    results = score(make_file(two_laps, two_laps / 200), list(protocols_taking("descriptors")))
     console = Console(width=80)
     with console.capture() as capture:
         console.print(report.comparison({"ours": results, "other": results}))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.page.across_sessions import sessions_page
-from sglpr_jax.evaluation.protocols import bevplace_nclt_recall, pointnetvlad_recall
+from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
+from sglpr_jax.evaluation.protocols.pointnetvlad_recall import pointnetvlad_recall
 from sglpr_jax.evaluation.published import NCLT, TABLE_3
-from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, check_one_world, evaluate_sessions
+from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, check_one_world, evaluate_sessions, published_rows
 
 MAP = "2012-01-15"
 
@@ -55,35 +56,35 @@ def test_a_session_without_revisits_says_so_and_is_no_part_of_the_mean(session):
 
 
 def test_published_rows_are_table_3s_in_the_same_columns(session):
-    whole = evaluate_sessions(session(MAP), [session(name) for name in NCLT], ["bevplace-nclt-recall"])
-    assert [row[0] for row in whole.published_rows()] == [f"published: {row.method}" for row in TABLE_3.rows]
-    assert whole.published_rows()[-1][1:] == ("0.947", "0.936", "0.931", "0.916", "0.914", "0.913", "0.926")
-    part = evaluate_sessions(session(MAP), [session(NCLT[5]), session("2013-04-05"), session(NCLT[0])])
-    assert part.published_rows()[-1] == ("published: SG-LPR", "0.913", "", "0.947", "0.930")
+    queries = [session(name) for name in NCLT]
+    whole = evaluate_sessions(session(MAP), queries, ["bevplace-nclt-recall"], published=True)
+    assert [row[0] for row in whole.published] == [f"published: {row.method}" for row in TABLE_3.rows]
+    assert whole.published[-1][1:] == ("0.947", "0.936", "0.931", "0.916", "0.914", "0.913", "0.926")
+    part = published_rows(MAP, [NCLT[5], "2013-04-05", NCLT[0]])
+    assert part[-1] == ("published: SG-LPR", "0.913", "", "0.947", "0.930")
 
 
 def test_other_sessions_have_no_published_numbers(session):
-    elsewhere = evaluate_sessions(session(MAP), [session("2013-04-05")])
-    another_map = evaluate_sessions(session(NCLT[0]), [session(NCLT[1])])
-    for found in (elsewhere, another_map):
-        with pytest.raises(ValueError, match=r"expected map 2012-01-15 and queries among 2012-02-04, .* found map"):
-            found.published_rows()
+    for files in ((session(MAP), [session("2013-04-05")]), (session(NCLT[0]), [session(NCLT[1])])):
+        assert evaluate_sessions(*files).published == ()
+        with pytest.raises(ValueError, match=r"database 2012-01-15 and queries among 2012-02-04, .* found database"):
+            evaluate_sessions(*files, published=True)
 
 
 def test_the_page_holds_the_table_and_what_it_rests_on(session):
-    found = evaluate_sessions(session(MAP), [session(NCLT[0])])
-    page = sessions_page(found, title="<days>", about="made up", published=True)
+    found = evaluate_sessions(session(MAP), [session(NCLT[0])], published=True)
+    page = sessions_page(dataclasses.replace(found, about="<days>"))
     for words in ("&lt;days&gt;", "bevplace-nclt-recall", NCLT[0], "50 queries", "published: M2DP", "0.632"):
         assert words in page
     assert PUBLISHED_NOTE.partition("rule")[0].replace("'", "&#x27;") in page and "real NCLT" in PUBLISHED_NOTE
-    assert "published: M2DP" not in sessions_page(found, title="", about="", published=False)
+    assert "published: M2DP" not in sessions_page(dataclasses.replace(found, published=()))
 
 
 def test_sessions_of_two_worlds_or_named_twice_are_refused(session):
     database = session(MAP)
-    with pytest.raises(ValueError, match=r"2012-02-04 in the world frame of the map .* no place is in both"):
+    with pytest.raises(ValueError, match=r"2012-02-04 in the world frame of the database .* no place is in both"):
         evaluate_sessions(database, [session(NCLT[0], offset_m=2000)])
-    with pytest.raises(ValueError, match=f"expected different sessions, found map {MAP}, queries {MAP}"):
+    with pytest.raises(ValueError, match=f"expected different sessions, found database {MAP}, queries {MAP}"):
         evaluate_sessions(database, [database])
     with pytest.raises(ValueError, match="expected different sessions"):
         evaluate_sessions(database, [session(NCLT[0]), session(NCLT[0])])

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result
-from sglpr_jax.evaluation.stress import StressRow, changes_by_kind, score_changes, stress_json, stress_table
+from sglpr_jax.evaluation.stress_table import StressRow, changes_by_kind, score_changes, stress_json, stress_table
 
 
 def results(*scores):
@@ -51,7 +51,7 @@ def test_the_table_has_scores_and_changes(rows):
 
 def test_json_has_every_result_with_its_change(rows):
     found = json.loads(json.dumps(stress_json(rows), allow_nan=False))
-    assert [row["disturbance"] for row in found] == [row.name for row in rows]
+    assert [row["corruption"] for row in found] == [row.name for row in rows]
     f1, recall = found[1]["methods"]["poor"]
     assert (f1["protocol"], f1["score"]) == ("F1", 0.4) and f1["change"] == pytest.approx(-0.1)
     assert recall["score"] is None and recall["change"] is None

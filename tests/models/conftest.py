@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
@@ -51,11 +52,13 @@ def model_config():
         values = json.loads(str(golden["config"]))
         config = ModelConfig(
             grid=Grid(height=values["img_size"], width=values["img_size"]),
-            embed_dim=values["embed_dim"],
-            depths=tuple(values["depths"]),
-            heads=tuple(values["num_heads"]),
-            window=values["window_size"],
-            drop_path=values["drop_path_rate"],
+            backbone=SwinConfig(
+                embed_dim=values["embed_dim"],
+                depths=tuple(values["depths"]),
+                heads=tuple(values["num_heads"]),
+                window=values["window_size"],
+                drop_path=values["drop_path_rate"],
+            ),
             categories=values["num_classes"],
         )
         return config, values["in_chans"]

@@ -8,16 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.params import config_from_dict, load, save
-from sglpr_jax.models.place_head import PlaceHead
+from sglpr_jax.models.heads.place import PlaceHead
+from sglpr_jax.models.input_image import field_of_view, prepare
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.polar import to_polar
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params, describe, field_of_view, forward, init, prepare, segment
+from sglpr_jax.models.sglpr import describe, forward, init, segment
+from sglpr_jax.models.weights_file import load, save
 
 HEAD = HeadConfig(channels=(8, 16), kernels=(4, 3), strides=(4, 2), clusters=4, cbam_reduction=4, descriptor_size=32)
 TOKEN_HEAD = dataclasses.replace(HEAD, tap="tokens", kernels=(3, 3), strides=(1, 1))
-CONFIG = dataclasses.replace(model_preset("tiny"), depths=(1,), heads=(2,), head=HEAD)
+SWIN = SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1)
+CONFIG = dataclasses.replace(model_preset("tiny"), backbone=SWIN, head=HEAD)
 POLAR = dataclasses.replace(CONFIG, polar=(16, 32), field="circle", head=TOKEN_HEAD)
 SIZE = CONFIG.grid.height
 FAST_COMPILE = {"xla_backend_optimization_level": 0}
@@ -110,7 +114,7 @@ def test_a_polar_head_for_tokens_reads_patches_of_each_class_s_share(random_para
     patches = polar.reshape(4, 4, 4, 8, 4, 20).transpose(0, 1, 3, 2, 4, 5).reshape(4, 4, 8, -1)
     weights = jax.tree.map(np.asarray, params.weights)
     layer, norm = (weights["patch_embed"][name] for name in ("projection", "norm"))
-    tokens = patches @ layer["kernel"].reshape(-1, config.embed_dim) + layer["bias"]
+    tokens = patches @ layer["kernel"].reshape(-1, config.backbone.width) + layer["bias"]
     tokens = (tokens - tokens.mean(-1, keepdims=True)) / np.sqrt(tokens.var(-1, keepdims=True) + 1e-5)
     tokens = jnp.asarray(tokens * norm["scale"] + norm["bias"], jnp.float32)
     expected, _ = PlaceHead(config.head, circular=True).apply({"params": weights["place_head"]}, tokens)
@@ -184,11 +188,3 @@ def test_what_cannot_be_is_refused():
 def test_weights_of_an_ablation_come_back(random_params, config, tmp_path):
     found = load(save(random_params(config), tmp_path / "weights"))
     assert found.config == config
-
-
-def test_a_configuration_of_before_the_label_maps_still_loads():
-    values = dataclasses.asdict(CONFIG)
-    values["classes"] = values.pop("categories")
-    for name in ("cbam", "pooling", "input"):
-        del values["head"][name]
-    assert config_from_dict(values, source="here") == CONFIG

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.cbam import CBAM, ChannelGate, largest
+from sglpr_jax.models.heads.cbam import CBAM, ChannelGate, largest
 
 SPATIAL = "SpatialGate.spatial"
 
@@ -71,3 +71,15 @@ def test_the_gradient_of_the_maximum_survives_rounding():
     tied = jnp.asarray([2.0, 1.0, np.nextafter(np.float32(2), np.float32(0)), 2.0], jnp.float32)
     np.testing.assert_allclose(jax.grad(lambda x: largest(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
     assert largest(tied, (-1,)) == 2
+
+
+def test_a_circular_map_may_be_rolled_along_its_columns_and_no_other(random_variables):
+    image = jnp.asarray(np.random.default_rng(0).normal(size=(2, 8, 12, 6)), jnp.float32)
+    variables = random_variables(CBAM(reduction=3), image)
+    rolled = jnp.roll(image, 5, axis=2)
+    for circular in (True, False):
+        module = CBAM(reduction=3, circular=circular)
+        difference = module.apply(variables, rolled) - jnp.roll(module.apply(variables, image), 5, axis=2)
+        assert (jnp.abs(difference).max() < 1e-5) == circular
+    inner, whole = (CBAM(3, circular).apply(variables, image)[:, :, 3:-3] for circular in (True, False))
+    np.testing.assert_allclose(inner, whole, atol=1e-6)  # borders apart they are the same

@@ -10,17 +10,28 @@ import pytest
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.models import sglpr
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params
 
 HEAD = HeadConfig(tap="tokens", channels=(16,), kernels=(3,), strides=(1,), cbam_reduction=4, clusters=4)
+SWIN = SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.0)
 TINY = dataclasses.replace(
-    model_preset("tiny"), grid=Grid(resolution_m=3.2, height=16, width=16), depths=(1,), heads=(2,), drop_path=0.0
+    model_preset("tiny"),
+    grid=Grid(resolution_m=3.2, height=16, width=16),
+    backbone=SWIN,
 )
 MODELS: dict[str, ModelConfig] = {
     "pixels": dataclasses.replace(TINY, head=dataclasses.replace(HEAD, tap="pixels", strides=(4,), kernels=(4,))),
-    "polar, stem": dataclasses.replace(TINY, field="circle", polar=(16, 32), detail=4, stem=(4, 8), head=HEAD),
+    "polar, stem": dataclasses.replace(
+        TINY,
+        field="circle",
+        polar=(16, 32),
+        backbone=dataclasses.replace(SWIN, stem=(4, 8)),
+        detail=4,
+        head=HEAD,
+    ),
     "raw, mean": dataclasses.replace(TINY, head=dataclasses.replace(HEAD, input="counts", pooling="mean", cbam=False)),
 }
 EPSILON = 2.0**-8

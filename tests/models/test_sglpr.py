@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.input_image import field_of_view, prepare
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params, describe, field_of_view, forward, init, prepare, segment
+from sglpr_jax.models.sglpr import describe, forward, init, segment
 
 # One stage instead of two, so that a program compiles in a second.
 CONFIG = dataclasses.replace(
     model_preset("tiny"),
-    depths=(2,),
-    heads=(2,),
+    backbone=SwinConfig(embed_dim=8, depths=(2,), heads=(2,), window=4, drop_path=0.1),
     head=HeadConfig(channels=(8, 16), kernels=(4, 3), strides=(4, 2), clusters=4, cbam_reduction=4),
 )
 POLAR = dataclasses.replace(
@@ -97,7 +99,7 @@ def test_describe_computes_nothing_of_the_segmentation_head(params, images):
     backbone = {name: part for name, part in params.weights.items() if name != "segmentation_head"}
     without_head = operations(compiled(describe, Params(backbone, CONFIG), images))
     assert operations(compiled(describe, params, images)) == without_head
-    head = 2 * len(images) * SIZE**2 * CONFIG.embed_dim * CONFIG.classes
+    head = 2 * len(images) * SIZE**2 * CONFIG.backbone.width * CONFIG.classes
     assert operations(compiled(forward, params, images)) >= without_head + head
 
 
@@ -200,12 +202,12 @@ def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(random_p
 
 
 def test_init_makes_every_weight_of_its_preset_from_its_key(random_params):
-    config = dataclasses.replace(CONFIG, drop_path=0.0)
+    config = dataclasses.replace(CONFIG, backbone=dataclasses.replace(CONFIG.backbone, drop_path=0.0))
     params = init(jax.random.key(0), config=config)
     shapes = jax.tree.map(jnp.shape, params.weights)
     assert shapes == jax.tree.map(jnp.shape, random_params(config).weights)
     assert params.config is config
     kernel = params.weights["segmentation_head"]["kernel"]
-    assert 0.9 * config.embed_dim**-0.5 < np.abs(kernel).max() <= config.embed_dim**-0.5
+    assert 0.9 * config.backbone.width**-0.5 < np.abs(kernel).max() <= config.backbone.width**-0.5
     with pytest.raises(ValueError, match="no model preset 'huge'; there are paper, "):
         init(jax.random.key(0), preset="huge")

@@ -12,11 +12,14 @@ import pytest
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.models import shipped
+from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.params import CONFIG_FILE, WEIGHTS_FILE, for_places, load, save
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params, describe
+from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.shipped import shipped_weights, weights_folder
+from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 CARD_FILE = "README.md"
 FILES = [CARD_FILE, CONFIG_FILE, WEIGHTS_FILE]
@@ -24,7 +27,8 @@ LARGEST_BYTES = 15e6
 CARD = {"Licence": "Apache-2.0", "Training data": "None.", "Command": "`none`", "Numbers": "Recall@1 0.0"}
 
 HEAD = HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
-MODEL = dataclasses.replace(model_preset("tiny"), grid=Grid(3.2, 16, 16), depths=(1,), heads=(2,), detail=8, head=HEAD)
+SWIN = SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1)
+MODEL = dataclasses.replace(model_preset("tiny"), grid=Grid(3.2, 16, 16), backbone=SWIN, detail=8, head=HEAD)
 
 
 def assert_fit_to_ship(folder: Path) -> None:

@@ -7,19 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.backbones.stem import Stem, StemDecoder
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, forward, segment
-from sglpr_jax.models.stem import Stem, StemDecoder
 
 CONFIG = dataclasses.replace(
     model_preset("tiny"),
     field="circle",
     polar=(16, 32),
-    stem=(4, 8),
+    backbone=SwinConfig(stem=(4, 8), embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1),
     detail=6,
-    depths=(1,),
-    heads=(2,),
     head=HeadConfig(tap="tokens", channels=(8,), kernels=(3,), strides=(1,), clusters=4, cbam_reduction=4),
 )
 TRAINING_ONLY = {"decoder", "segmentation_head", "detail", "narrow"}
@@ -92,4 +91,4 @@ def test_every_weight_is_trained(params):
 
 def test_a_patch_that_the_stem_does_not_divide_is_refused():
     with pytest.raises(ValueError, match=r"stem of 4 widths makes pixels of 8 cells.*found patch 4"):
-        ModelConfig(stem=(8, 8, 8, 8))
+        SwinConfig(stem=(8, 8, 8, 8))

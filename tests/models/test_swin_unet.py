@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from sglpr_jax.models.swin import DropPath, PatchEmbed, SwinBlock
-from sglpr_jax.models.swin_unet import SwinUnet, drop_path_rates
+from sglpr_jax.models.backbones.attention import WindowAttention
+from sglpr_jax.models.backbones.swin_layers import DropPath, PatchEmbed, SwinBlock
+from sglpr_jax.models.backbones.swin_unet import SwinUnet, drop_path_rates
+from sglpr_jax.models.layers import LayerNorm
 
 MODEL = SwinUnet(embed_dim=8, depths=(2, 2), heads=(1, 2), window=4, drop_path=0.5)
 
@@ -60,6 +62,42 @@ def test_stochastic_depth_follows_its_key_and_is_off_outside_training(variables,
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
     assert np.abs(first - tokens).max() > 1e-3
+
+
+@pytest.mark.parametrize("height, down", [(4, 0), (8, 2)])
+def test_windows_are_shifted_in_each_direction_that_is_larger_than_them(height, down, random_variables):
+    """Against windows gathered token by token, in a circular map; a row may not see one that was rolled in."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(1, height, 12, 8)), jnp.float32)
+    block = SwinBlock(heads=2, window=4, shifted=True, circular=True, shift_each_way=True)
+    variables = random_variables(block, x)
+    normed = LayerNorm().apply({"params": variables["params"]["attention_norm"]}, x)[0]
+    attention = {"params": variables["params"]["attention"]}
+    expected = np.zeros(normed.shape, np.float32)
+    for top, left in np.ndindex(height // 4, 3):
+        rows = (np.arange(4) + 4 * top + down) % height
+        columns = (np.arange(4) + 4 * left + 2) % 12
+        tokens = np.ix_(rows, columns)
+        apart = np.repeat(np.abs(rows[:, None] - rows[None]) > 4, 4, 0).repeat(4, 1)
+        found = WindowAttention(heads=2).apply(attention, normed[tokens].reshape(1, 16, 8), apart[None])
+        expected[tokens] = np.reshape(found, (4, 4, 8))
+    middle = x[0] + expected
+    whole = middle + block_mlp(variables["params"], middle)
+    np.testing.assert_allclose(block.apply(variables, x)[0], whole, atol=1e-4)
+
+
+def block_mlp(params, x):
+    """The second branch of a block, from its weights."""
+    normed = np.asarray(LayerNorm().apply({"params": params["mlp_norm"]}, x))
+    hidden = jax.nn.gelu(normed @ params["mlp_in"]["kernel"] + params["mlp_in"]["bias"][None, None], approximate=False)
+    return np.asarray(hidden) @ params["mlp_out"]["kernel"] + params["mlp_out"]["bias"][None, None]
+
+
+def test_without_the_option_a_map_that_a_window_spans_is_not_shifted(random_variables):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(1, 4, 12, 8)), jnp.float32)
+    options = {"heads": 2, "window": 4, "circular": True}
+    variables = random_variables(SwinBlock(shifted=True, **options), x)
+    shifted, straight = (SwinBlock(shifted=shifted, **options).apply(variables, x) for shifted in (True, False))
+    np.testing.assert_array_equal(shifted, straight)
 
 
 def test_both_branches_of_a_block_are_dropped_per_sample_and_independently(random_variables):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax import losses
+from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand
+from sglpr_jax.models.backbones.swin_unet import SwinUnet
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.swin import FinalPatchExpand
-from sglpr_jax.models.swin_unet import SwinUnet
 from sglpr_jax.models.torch_import import from_torch_names, torch_name
 
 FILES = (
@@ -23,9 +23,10 @@ FILES = (
 
 def run(weights: dict, image: jax.Array, labels: jax.Array, config: ModelConfig):
     """The joint segmentation loss, with every named map and both of its terms."""
-    backbone = SwinUnet(config.embed_dim, config.depths, config.heads, config.window, drop_path=config.drop_path)
+    swin = config.backbone
+    backbone = SwinUnet(swin.embed_dim, swin.depths, swin.heads, swin.window, drop_path=swin.drop_path)
     tokens, seen = backbone.apply({"params": weights["backbone"]}, image)
-    pixels = FinalPatchExpand(config.patch).apply({"params": weights["expand"]}, tokens)
+    pixels = FinalPatchExpand(swin.patch).apply({"params": weights["expand"]}, tokens)
     logits = nn.Dense(config.classes, use_bias=False).apply({"params": weights["segmentation_head"]}, pixels)
     ce, dice = losses.cross_entropy(logits, labels).mean(), losses.dice(logits, labels)
     return 0.4 * ce + 0.6 * dice, {**seen, "up_x4": pixels, "logits": logits, "ce": ce, "dice": dice}

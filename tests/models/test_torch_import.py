@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.sglpr import Params, init
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.torch_import import from_swin_t, from_torch_names, import_swin_t, import_swin_unet, torch_name
 
 

@@ -7,14 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import of_images, of_scans, with_points
 
 from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
 from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.data.label_maps import label_map_pixels
-from sglpr_jax.data.sequence import ImageSequence, ScanSequence
+from sglpr_jax.data.formats.label_images import label_image_pixels
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.views import view
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import embed, embed_scans, read_views
+from sglpr_jax.retrieval.embed import embed_images, embed_scans
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 SCANS = 7
@@ -31,33 +33,17 @@ def clouds() -> list[np.ndarray]:
 
 
 @pytest.fixture
-def scans() -> ScanSequence:
+def scans() -> Recording:
     by_path = {Path(f"{2 * i:06d}.bin"): cloud for i, cloud in enumerate(clouds())}
-    return ScanSequence(
-        name="08",
-        ids=tuple(path.stem for path in by_path),
-        positions=np.arange(3.0 * SCANS).reshape(SCANS, 3),
-        times=np.arange(SCANS) / 10,
-        pose_source="poses/08.txt",
-        scan_paths=tuple(by_path),
-        label_paths=(None,) * SCANS,
-        read_scan=by_path.__getitem__,
-    )
+    positions, times = np.arange(3.0 * SCANS).reshape(SCANS, 3), np.arange(SCANS) / 10
+    return of_scans(by_path, positions=positions, times=times, pose_source="poses/08.txt")
 
 
 @pytest.fixture
-def pictures() -> ImageSequence:
+def pictures() -> Recording:
     values = np.random.default_rng(0).uniform(0, 10, (SCANS, 20, 24)).astype(np.float32)
-    return ImageSequence(
-        name="06",
-        ids=tuple(f"{i:06d}" for i in range(SCANS)),
-        positions=np.zeros((SCANS, 3)),
-        times=None,
-        pose_source="06/pose.txt",
-        image_paths=tuple(Path(f"{i}.png") for i in range(SCANS)),
-        resolution_m=0.4,
-        read_image=lambda path: values[int(path.stem)],
-    )
+    by_path = {Path(f"{i:06d}.png"): picture for i, picture in enumerate(values)}
+    return of_images(by_path, name="06", positions=np.zeros((SCANS, 3)), pose_source="06/pose.txt")
 
 
 def mean_point(points, classes):
@@ -65,13 +51,14 @@ def mean_point(points, classes):
     return np.append(points.mean(axis=0), [] if classes is None else classes.mean()).astype(np.float32)
 
 
-def with_bad_scan(sequence: ScanSequence, *bad: int) -> ScanSequence:
-    def read(path: Path) -> np.ndarray:
-        if sequence.scan_paths.index(path) in bad:
+def with_bad_scan(recording: Recording, *bad: int) -> Recording:
+    def points_of(path: Path) -> np.ndarray:
+        row = recording.paths.index(path)
+        if row in bad:
             raise ValueError(f"{path}: not a whole scan")
-        return sequence.read_scan(path)
+        return recording.points(row)
 
-    return dataclasses.replace(sequence, read_scan=read)
+    return with_points(recording, points_of)
 
 
 def drawn_angles(seed: int):
@@ -79,7 +66,7 @@ def drawn_angles(seed: int):
 
 
 def test_scans_are_rasterised_and_keep_what_evaluation_needs(scans, tmp_path):
-    found = embed(flatten, scans, GRID, config={"method": "pixels"}, weights_hash="abc")
+    found = embed_images(flatten, scans, GRID, config={"method": "pixels"}, weights_hash="abc")
     expected = [np.asarray(rasterize(jnp.asarray(cloud), grid=GRID)).reshape(-1) for cloud in clouds()]
     np.testing.assert_array_equal(found.descriptors, expected)
     assert found.descriptors.dtype == np.float32 and found.descriptors.sum() > 0
@@ -92,22 +79,22 @@ def test_scans_are_rasterised_and_keep_what_evaluation_needs(scans, tmp_path):
 
 
 def test_each_scan_is_turned_by_its_own_angle(scans):
-    found = embed(flatten, scans, GRID, config={}, rotation_seed=3)
+    found = embed_images(flatten, scans, GRID, config={}, rotation_seed=3)
     for cloud, angle, descriptor in zip(clouds(), drawn_angles(3), found.descriptors, strict=True):
         turned = rotate_points(jnp.asarray(cloud), jnp.float32(angle))
         np.testing.assert_array_equal(descriptor, np.asarray(rasterize(turned, grid=GRID)).reshape(-1))
     assert found.config == {"rotation_seed": 3}
-    other = embed(flatten, scans, GRID, config={}, rotation_seed=4)
+    other = embed_images(flatten, scans, GRID, config={}, rotation_seed=4)
     assert (other.descriptors != found.descriptors).any(axis=1).all()
 
 
 def test_images_are_turned_whole_and_cropped_to_the_grid(pictures):
     every = np.stack([pictures.image(i) for i in range(SCANS)])
-    whole = embed(flatten, pictures, None, config={})
+    whole = embed_images(flatten, pictures, None, config={})
     np.testing.assert_array_equal(whole.descriptors, every.reshape(SCANS, -1))
-    cropped = embed(flatten, pictures, GRID, config={})
+    cropped = embed_images(flatten, pictures, GRID, config={})
     np.testing.assert_array_equal(cropped.descriptors, every[:, 2:18, 4:20].reshape(SCANS, -1))
-    turned = embed(flatten, pictures, GRID, config={}, rotation_seed=3)
+    turned = embed_images(flatten, pictures, GRID, config={}, rotation_seed=3)
     expected = rotate_image(jnp.asarray(every), jnp.asarray(drawn_angles(3)))[:, 2:18, 4:20]
     np.testing.assert_allclose(turned.descriptors, expected.reshape(SCANS, -1), atol=1e-4)
     assert turned.times is None
@@ -121,15 +108,15 @@ def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch):
         shapes.add(images.shape)
         return flatten(images)
 
-    found = embed(describe, scans, GRID, config={}, batch=batch)
-    np.testing.assert_array_equal(found.descriptors, embed(flatten, scans, GRID, config={}).descriptors)
+    found = embed_images(describe, scans, GRID, config={}, batch=batch)
+    np.testing.assert_array_equal(found.descriptors, embed_images(flatten, scans, GRID, config={}).descriptors)
     assert shapes == {(batch, GRID.height, GRID.width)}
 
 
 @pytest.mark.parametrize("seed", [None, 3])
 def test_scans_become_density_images_of_the_turned_points(scans, seed):
     cells = Grid(resolution_m=0.4, height=64, width=64)
-    found = embed(flatten, scans, cells, config={}, image="density", rotation_seed=seed)
+    found = embed_images(flatten, scans, cells, config={}, image="density", rotation_seed=seed)
     for row, (cloud, angle) in enumerate(zip(clouds(), drawn_angles(3), strict=True)):
         cos, sin = np.cos(np.float64(angle)), np.sin(np.float64(angle))
         x, y, z = cloud.astype(np.float64).T
@@ -140,29 +127,30 @@ def test_scans_become_density_images_of_the_turned_points(scans, seed):
 
 
 def test_ready_made_images_are_taken_as_they_are_by_any_model(pictures):
-    as_points, as_density = (embed(flatten, pictures, GRID, config={}, image=image) for image in ("points", "density"))
+    kinds = ("points", "density")
+    as_points, as_density = (embed_images(flatten, pictures, GRID, config={}, image=kind) for kind in kinds)
     np.testing.assert_array_equal(as_points.descriptors, as_density.descriptors)
 
 
 def test_only_cells_of_density_images_make_density_images(scans):
     with pytest.raises(ValueError, match=r"151 x 151 cells of 0.4 m: expected .* found 16 x 16 cells of 1.0 m"):
-        embed(flatten, scans, GRID, config={}, image="density")
+        embed_images(flatten, scans, GRID, config={}, image="density")
 
 
 def test_progress_ends_with_all_scans(scans):
     seen = []
-    embed(flatten, scans, GRID, config={}, batch=3, on_progress=seen.append)
+    embed_images(flatten, scans, GRID, config={}, batch=3, on_progress=seen.append)
     assert seen == [3, 6, 7]
 
 
 def test_a_scan_that_cannot_be_read_raises_its_own_error(scans):
     with pytest.raises(ValueError, match=r"000004\.bin: not a whole scan"):
-        embed(flatten, with_bad_scan(scans, 2), GRID, config={})
+        embed_images(flatten, with_bad_scan(scans, 2), GRID, config={})
 
 
 def test_bad_scans_are_reported_and_left_out_if_asked(scans):
     reported = []
-    found = embed(
+    found = embed_images(
         flatten,
         with_bad_scan(scans, 2, 6),
         GRID,
@@ -176,23 +164,23 @@ def test_bad_scans_are_reported_and_left_out_if_asked(scans):
     assert found.ids == tuple(scans.ids[i] for i in kept)
     np.testing.assert_array_equal(found.positions, scans.positions[kept])
     np.testing.assert_array_equal(found.times, scans.times[kept])
-    everything = embed(flatten, scans, GRID, config={}, rotation_seed=3)
+    everything = embed_images(flatten, scans, GRID, config={}, rotation_seed=3)
     np.testing.assert_array_equal(found.descriptors, everything.descriptors[kept])  # the others keep their angles
 
 
 def test_nothing_but_bad_scans_is_an_error(scans):
     with pytest.raises(ValueError, match="sequence 08: expected at least one readable scan, found none"):
-        embed(flatten, with_bad_scan(scans, *range(SCANS)), GRID, config={}, on_bad_scan=lambda *_: None)
+        embed_images(flatten, with_bad_scan(scans, *range(SCANS)), GRID, config={}, on_bad_scan=lambda *_: None)
 
 
 def test_scans_without_a_grid_are_refused(scans):
     with pytest.raises(ValueError, match="scans need a grid"):
-        embed(flatten, scans, None, config={})
+        embed_images(flatten, scans, None, config={})
 
 
 def test_a_source_without_poses_can_be_embedded(scans):
     bare = dataclasses.replace(scans, positions=None, times=None, pose_source=None)
-    found = embed(flatten, bare, GRID, config={})
+    found = embed_images(flatten, bare, GRID, config={})
     assert found.positions is None and found.times is None and len(found) == SCANS
 
 
@@ -207,7 +195,7 @@ def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(sc
         assert images.shape == labels.shape == (3, GRID.height, GRID.width)
         return flatten(labels)
 
-    found = embed(maps, labelled, GRID, config={}, categories=25, rotation_seed=3, batch=3)
+    found = embed_images(maps, labelled, GRID, config={}, categories=25, rotation_seed=3, batch=3)
     for cloud, ids, angle, descriptor in zip(clouds(), raw, drawn_angles(3), found.descriptors, strict=True):
         turned = rotate_points(jnp.asarray(cloud), jnp.float32(angle))
         classes = jnp.asarray(to_classes(ids.astype(np.int32), categories=25))
@@ -215,22 +203,22 @@ def test_with_categories_every_scan_comes_with_its_map_turned_as_the_image_is(sc
         assert expected.max() == 25  # the moving car
         np.testing.assert_array_equal(descriptor, np.asarray(expected).reshape(-1))
     with pytest.raises(ValueError, match="scan 000000 of sequence 08: expected labels, found none"):
-        embed(maps, scans, GRID, config={}, categories=25)
+        embed_images(maps, scans, GRID, config={}, categories=25)
     with pytest.raises(ValueError, match="scan 000000 of sequence 06: expected labels, found none"):
-        embed(maps, pictures, GRID, config={}, categories=25)
+        embed_images(maps, pictures, GRID, config={}, categories=25)
 
 
 def test_images_come_with_their_maps_turned_by_the_same_angle(pictures, tmp_path):
     paths = tuple(tmp_path / f"{i}.png" for i in range(SCANS))
     for path, picture in zip(paths, map(pictures.image, range(SCANS)), strict=True):
-        Image.fromarray(label_map_pixels(np.where(picture > 5, 259, 40))).save(path)
+        Image.fromarray(label_image_pixels(np.where(picture > 5, 259, 40))).save(path)
     labelled = dataclasses.replace(pictures, label_paths=paths)
     angle, grid = jnp.float32(0.7), Grid(0.4, 16, 16)
-    image, classes = read_views(labelled, 1, grid, categories=25, angle=angle)
-    np.testing.assert_array_equal(image, read_views(pictures, 1, grid, angle=angle)[0])
+    image, classes = view(labelled.record(1), grid, categories=25, angle=angle)
+    np.testing.assert_array_equal(image, view(pictures.record(1), grid, angle=angle).image)
     whole = jnp.asarray(np.where(pictures.image(1) > 5, 25, 11).astype(np.int32))
     np.testing.assert_array_equal(classes, rotate_labels(whole, angle)[2:18, 4:20])
-    assert read_views(labelled, 1, None, categories=25)[1].shape == (20, 24)
+    assert view(labelled.record(1), None, categories=25).classes.shape == (20, 24)
 
 
 def test_points_are_described_scan_by_scan(scans):
@@ -256,12 +244,12 @@ def test_points_that_are_not_finite_are_left_out_with_their_labels(scans, tmp_pa
     for path, ids in zip(paths, raw, strict=True):
         ids.tofile(path)
 
-    def read(path):
-        points = scans.read_scan(path).copy()
+    def points_of(path):
+        points = scans.read(path, None, False).points.copy()
         points[0] = np.nan
         return points
 
-    labelled = dataclasses.replace(scans, label_paths=paths, read_scan=read)
+    labelled = dataclasses.replace(with_points(scans, points_of), label_paths=paths)
     found = embed_scans(mean_point, labelled, config={}, distance="l2", labels=True)
     classes = np.select([raw[0] == 10, raw[0] == 50], [1, 13], 16)
     np.testing.assert_allclose(found.descriptors[0], [*clouds()[0][1:].mean(axis=0), classes[1:].mean()], rtol=1e-5)

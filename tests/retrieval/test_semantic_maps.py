@@ -6,14 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import of_images
 
 from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_bev, density_label_bev
-from sglpr_jax.data.label_maps import label_map_pixels
-from sglpr_jax.data.sequence import ImageSequence
+from sglpr_jax.data.formats.label_images import label_image_pixels
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.labels import to_raw
+from sglpr_jax.models.input_image import field_of_view
+from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import Params, field_of_view, init, segment
-from sglpr_jax.retrieval.semantic_maps import read_semantic_map, semantic_map
+from sglpr_jax.models.sglpr import init, segment
+from sglpr_jax.retrieval.semantic_maps import semantic_map
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +30,7 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 9, (700, 3)).astype(np.float32)
     classes = rng.integers(0, 20, 700).astype(np.int32)
-    found = semantic_map(params, points, classes)
+    found = semantic_map(params, Record(points=points, labels=to_raw(classes)))
     grid = params.config.grid
     counts = np.asarray(rasterize(points, grid=grid))
     seen = (counts > 0) & field_of_view(params.config)[0]
@@ -34,40 +39,38 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     np.testing.assert_array_equal(found.seen, seen)
     np.testing.assert_array_equal(found.predicted, np.where(seen, logits[..., 1:].argmax(-1) + 1, 0))
     np.testing.assert_array_equal(found.truth, np.where(seen, rasterize_labels(points, classes, grid=grid), 0))
-    unlabelled = semantic_map(params, points)
+    unlabelled = semantic_map(params, Record(points=points))
     np.testing.assert_array_equal(unlabelled.predicted, found.predicted)
     assert not unlabelled.truth.any()
 
 
-def image_sequence(image: np.ndarray, label_path: Path | None) -> ImageSequence:
-    return ImageSequence(
-        "06", ("0",), None, None, None, (Path("0.png"),), 0.4, lambda path: image, label_paths=(label_path,)
-    )
+def image_sequence(image: np.ndarray, label_path: Path | None) -> Recording:
+    return of_images({Path("0.png"): image}, name="06", label_paths=(label_path,))
 
 
 def test_the_map_of_an_image_is_that_of_its_middle_where_it_is_not_empty(params, tmp_path):
     grid = params.config.grid
     rng = np.random.default_rng(0)
     image = rng.poisson(0.3, (grid.height + 3, grid.width + 6)).astype(np.float32)
-    Image.fromarray(label_map_pixels(np.full(image.shape, 50))).save(tmp_path / "0.png")
-    found = read_semantic_map(params, image_sequence(image, tmp_path / "0.png"), 0)
+    Image.fromarray(label_image_pixels(np.full(image.shape, 50))).save(tmp_path / "0.png")
+    found = semantic_map(params, image_sequence(image, tmp_path / "0.png").record(0))
     middle = np.asarray(even_cells(jnp.asarray(image)))[2 : 2 + grid.height, 3 : 3 + grid.width]
     seen = (middle > 0) & field_of_view(params.config)[0]
     logits = np.asarray(segment(params, jnp.asarray(middle)))[..., 1:]
     np.testing.assert_array_equal(found.counts, middle)
     np.testing.assert_array_equal(found.predicted, np.where(seen, logits.argmax(-1) + 1, 0))
     np.testing.assert_array_equal(found.truth, np.where(seen, 13, 0))  # building
-    assert not read_semantic_map(params, image_sequence(image, None), 0).truth.any()
+    assert not semantic_map(params, image_sequence(image, None).record(0)).truth.any()
 
 
 def test_cells_the_network_is_not_sure_of_are_left_unlabelled(params):
     points = np.random.default_rng(0).normal(0, 9, (700, 3)).astype(np.float32)
-    every = semantic_map(params, points)
+    every = semantic_map(params, Record(points=points))
     logits = np.asarray(segment(params, jnp.asarray(every.counts)), np.float64)[..., 1:]
     exponentials = np.exp(logits - logits.max(-1, keepdims=True))
     confidence = 1 / exponentials.sum(-1)
     least = np.quantile(confidence[every.seen], 0.5) + 1e-6
-    found = semantic_map(params, points, min_confidence=least)
+    found = semantic_map(params, Record(points=points), min_confidence=least)
     clear = np.abs(confidence - least) > 1e-5
     expected = np.where(confidence >= least, every.predicted, 0)
     np.testing.assert_array_equal(found.predicted[clear], expected[clear])
@@ -80,7 +83,7 @@ def test_the_map_of_a_model_for_density_images_lies_on_such_an_image(random_para
     rng = np.random.default_rng(0)
     points = rng.normal(0, [5, 5, 1], (700, 3)).astype(np.float32)
     classes = rng.integers(1, 20, 700).astype(np.int32)
-    found = semantic_map(params, points, classes)
+    found = semantic_map(params, Record(points=points, labels=to_raw(classes)))
     whole = (density_bev(points), density_label_bev(points, classes))
     counts, truth = (np.asarray(even_cells(jnp.asarray(view)))[60:92, 60:92] for view in whole)
     np.testing.assert_array_equal(found.counts, counts)

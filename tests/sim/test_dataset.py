@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import ImageSequence, ScanSequence, open_sequence
-from sglpr_jax.data.batch import read_batch
-from sglpr_jax.data.density_image import density_image, density_label_map
-from sglpr_jax.data.tuples import TupleConfig, TuplePool
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.density_image import density_image, density_label_image
+from sglpr_jax.data.sampling.batch import read_batch
+from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
 from sglpr_jax.poses import positions_from_camera
-from sglpr_jax.sim import SENSORS, Sensor, scan, sequence, simulate_sequence, write_dataset
+from sglpr_jax.sim import SENSORS, Sensor, recording, scan, simulate_recording, write_dataset
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 SCANS = 4
@@ -35,7 +35,7 @@ def dataset(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def drive():
-    return simulate_sequence("08", scans=SCANS, sensor=TINY, seed=1)
+    return simulate_recording("08", scans=SCANS, sensor=TINY, seed=1)
 
 
 @pytest.fixture
@@ -69,13 +69,13 @@ def test_poses_times_and_calibration_are_kittis(dataset, drive):
     camera_from_lidar = np.array(rows["Tr"].split(), float).reshape(3, 4)
     np.testing.assert_array_equal(camera_from_lidar, [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
     # KITTI's camera looks along z: where x of the LiDAR points.
-    expected = camera_from_lidar[:, :3] @ drive.drive.world_from_lidar[:, :3, 0, None]
+    expected = camera_from_lidar[:, :3] @ drive.poses.world_from_lidar[:, :3, 0, None]
     np.testing.assert_allclose(poses[:, :, 2:3], expected, atol=1e-6)
 
 
 def test_a_drive_on_the_fly_is_the_one_on_disk(dataset, drive):
-    on_disk = open_sequence(dataset, "08")
-    assert isinstance(drive, ScanSequence) and drive.has_labels
+    on_disk = open_recording(dataset, "08")
+    assert not drive.has_images and drive.has_labels
     assert drive.ids == on_disk.ids and len(drive) == SCANS and drive.name == "08"
     for i in range(SCANS):
         np.testing.assert_array_equal(drive.points(i), on_disk.points(i))
@@ -84,8 +84,8 @@ def test_a_drive_on_the_fly_is_the_one_on_disk(dataset, drive):
 
 def test_points_and_labels_of_a_scan_cost_one_rendering(monkeypatch):
     rendered = []
-    monkeypatch.setattr(sequence, "scan", lambda *a, **k: rendered.append(k["time"]) or scan(*a, **k))
-    fresh = simulate_sequence("08", scans=SCANS, sensor=TINY, seed=2)
+    monkeypatch.setattr(recording, "scan", lambda *a, **k: rendered.append(k["time"]) or scan(*a, **k))
+    fresh = simulate_recording("08", scans=SCANS, sensor=TINY, seed=2)
     assert len(fresh.points(1)) == len(fresh.labels(1)) and len(fresh.points(2)) == len(fresh.labels(2))
     assert rendered == [fresh.times[1], fresh.times[2]]
 
@@ -138,19 +138,19 @@ def test_deleted_scans_come_back_and_finished_ones_are_left_alone(dataset, tmp_p
 
 
 def test_a_finished_dataset_builds_no_town(dataset, monkeypatch):
-    monkeypatch.setattr(sequence, "build_world", None)
+    monkeypatch.setattr(recording, "build_world", None)
     before = content(dataset)
     assert content(write(dataset)) == before
 
 
 def test_along_a_pose_file_distances_are_the_files(tmp_path, pose_file):
     root = write(tmp_path / "along", names=(), along=(pose_file,), scans=8)
-    drive = open_sequence(root, "campus")
+    drive = open_recording(root, "campus")
     assert len(drive) == 8  # every 19th of 150
     np.testing.assert_allclose(drive.positions[:, 0], 9.5 * np.arange(8), atol=1e-6)
     np.testing.assert_allclose(drive.positions[:, 1], 0, atol=1e-6)
     np.testing.assert_allclose(drive.times, 1.9 * np.arange(8), atol=1e-6)
-    on_the_fly = simulate_sequence(along=pose_file, scans=8, sensor=TINY, seed=1)
+    on_the_fly = simulate_recording(along=pose_file, scans=8, sensor=TINY, seed=1)
     np.testing.assert_array_equal(on_the_fly.points(3), drive.points(3))
 
 
@@ -174,14 +174,14 @@ def test_images_are_those_of_the_scans(tmp_path, drive):
     root = write(tmp_path / "images", names=("08",), layout="images")
     pictures = [f"08/{what}/{i:06d}.png" for what in ("imgs", "labels") for i in range(SCANS)]
     assert sorted(content(root)) == [*pictures, "08/pose.txt", "simulation.json"]
-    images = open_sequence(root, "08")
-    assert isinstance(images, ImageSequence)
+    images = open_recording(root, "08")
+    assert images.has_images
     np.testing.assert_allclose(images.positions, drive.positions, atol=1e-5)
     expected = np.rot90(density_image(drive.points(2)), -1) * np.float32(10 / 255)
     np.testing.assert_array_equal(images.image(2), expected)
     assert expected.max() > 0
     labels = images.labels(2)
-    shown = np.rot90(density_label_map(drive.points(2), drive.labels(2)), -1)
+    shown = np.rot90(density_label_image(drive.points(2), drive.labels(2)), -1)
     np.testing.assert_array_equal(labels, np.where(expected > 0, shown, 0))
     assert 0.8 < (labels[expected > 0] > 0).mean() <= 1
 
@@ -242,7 +242,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
     try:
-        with pytest.raises(OSError, match=r"velodyne/00000\d.bin: could not write this file of the simulated dataset"):
+        with pytest.raises(OSError, match=r"velodyne/00000\d.bin: expected to write it"):
             write(root)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -253,5 +253,5 @@ def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp
 
 def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"simulation.json: could not write this file"):
+    with pytest.raises(OSError, match=r"simulation.json: expected to write it"):
         write(tmp_path / "file" / "town")

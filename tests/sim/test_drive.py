@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.poses import distances
-from sglpr_jax.sim import plan_trajectory, poses_on, read_path
+from sglpr_jax.sim import plan_scan_path, poses_on, read_path
 from sglpr_jax.sim.drive import TILT_DEG, body_tilt, name_of_path, plan_path, speeds, thinned
 from sglpr_jax.sim.ground import Relief, draw_relief, relief_height
 from sglpr_jax.sim.routes import ROLES, plan_walk
@@ -27,7 +27,7 @@ def revisits(trajectory) -> tuple[float, float, np.ndarray]:
 
 @pytest.mark.parametrize(("name", "scans", "seed"), CASES)
 def test_a_route_has_the_revisits_of_its_namesake(name, scans, seed):
-    trajectory = plan_trajectory(np.random.default_rng(seed), name, scans=scans)
+    trajectory = plan_scan_path(np.random.default_rng(seed), name, scans=scans)
     same, opposite, when = revisits(trajectory)
     if name in SAME:
         assert LEAST[name] <= same <= 0.3 and opposite < 0.02
@@ -59,18 +59,18 @@ def test_a_car_could_drive_it(name, scans, seed):
 @pytest.mark.parametrize("name", ROLES)
 def test_the_scans_are_spread_over_the_whole_path(name):
     path = plan_path(np.random.default_rng(3), name, scans=250)
-    trajectory = plan_trajectory(np.random.default_rng(3), name, scans=250)
+    trajectory = plan_scan_path(np.random.default_rng(3), name, scans=250)
     every = len(path.times) // 250
     assert len(trajectory.times) == 250
     for values, kept in zip(path, trajectory, strict=True):
         np.testing.assert_array_equal(values[::every], kept)
     assert 0.15 < trajectory.times[1] < 0.4  # around 4 Hz
-    at_kittis_rate = plan_trajectory(np.random.default_rng(3), name, scans=1000, rate_hz=10.0)
+    at_kittis_rate = plan_scan_path(np.random.default_rng(3), name, scans=1000, rate_hz=10.0)
     assert 0.07 < at_kittis_rate.times[1] < 0.13
 
 
 def test_few_scans_are_spread_over_a_drive_that_comes_back():
-    trajectory = plan_trajectory(np.random.default_rng(0), "08", scans=3)
+    trajectory = plan_scan_path(np.random.default_rng(0), "08", scans=3)
     assert len(trajectory.times) == 3 and trajectory.times[-1] > 30
 
 
@@ -107,7 +107,7 @@ def test_too_few_streets_for_a_loop_and_unknown_routes_are_refused():
     with pytest.raises(ValueError, match="no walk of 3 blocks"):
         plan_walk(np.random.default_rng(0), ROLES["08"], blocks=3)
     with pytest.raises(ValueError, match=r"expected a route among 00, 01, .*found '11'"):
-        plan_trajectory(np.random.default_rng(0), "11", scans=100)
+        plan_scan_path(np.random.default_rng(0), "11", scans=100)
 
 
 def test_poses_stand_on_the_hills():

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.spatial import KDTree
 
-from sglpr_jax.data import open_sequence
-from sglpr_jax.data.scan_files import read_scan
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim import SENSORS, Sensor, plan_sessions, write_sessions
 from sglpr_jax.sim.drive import plan_path
@@ -64,7 +64,7 @@ def test_houses_stay_and_parked_cars_do_not(days):
 
     def squares(day, i: int, category: str) -> set[tuple[int, int]]:
         points = day.points(i)[to_classes(day.labels(i)) == CATEGORIES.index(category)]
-        world = points @ day.drive.world_from_lidar[i, :3, :3].T + day.positions[i]
+        world = points @ day.poses.world_from_lidar[i, :3, :3].T + day.positions[i]
         return set(map(tuple, np.floor(world[:, :2] / 2).astype(int).tolist()))
 
     def stays(category: str) -> float:
@@ -96,9 +96,9 @@ def test_the_vehicle_turns_round_at_roundabouts_never_on_the_spot():
 def test_the_reader_gives_back_the_days(dataset, days):
     assert not list(dataset.rglob("*.label"))
     for day in days:
-        on_disk = open_sequence(dataset, day.name)
+        on_disk = open_recording(dataset, day.name)
         assert on_disk.ids == day.ids and on_disk.pose_source == f"groundtruth_{day.name}.csv"
-        up = day.drive.world_from_lidar[:, :3, 2]
+        up = day.poses.world_from_lidar[:, :3, 2]
         np.testing.assert_allclose(on_disk.positions, day.positions - NCLT_HEIGHT_M * up, atol=1e-5)
         for i in (0, SCANS - 1):
             lifted = day.points(i) + np.float32([0, 0, NCLT_HEIGHT_M])
@@ -109,7 +109,7 @@ def test_the_ground_truth_turns_forward_right_down_to_north_east_down(dataset, d
     rows = np.loadtxt(dataset / DAYS[1] / f"groundtruth_{DAYS[1]}.csv", delimiter=",")
     roll, pitch, yaw = rows[:, 4:].T
     east_of_north = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)], axis=1)
-    forward = days[1].drive.world_from_lidar[:, :3, 0]
+    forward = days[1].poses.world_from_lidar[:, :3, 0]
     np.testing.assert_allclose(east_of_north * [1, -1, -1], forward, atol=1e-6)
     assert np.abs(roll).max() < 0.2  # upright, not upside down
 

@@ -9,13 +9,13 @@ Frames are numbered from 0, as the rows of the poses.
 
 from pathlib import Path
 
-from sglpr_jax.data.trajectory import Trajectory
-from sglpr_jax.evaluation.distances import distance_function
+from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.matrix import read_matrix
 from sglpr_jax.evaluation.inputs.own_file import read_own_file
 from sglpr_jax.evaluation.inputs.pair_list import read_pair_list
 from sglpr_jax.evaluation.inputs.top_k_list import is_top_k_list, read_top_k_list
 from sglpr_jax.evaluation.protocols import ScoredPairs, Source
+from sglpr_jax.retrieval.distances import distance_function
 
 Input = Source | ScoredPairs
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Num
 
-from sglpr_jax.data.trajectory import Trajectory
+from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.evaluation.inputs.arrays import as_descriptors
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
@@ -18,17 +19,7 @@ def read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, dis
     rows = _load(path)
     trajectory = needed(path, trajectory, rows=len(rows))
     try:
-        return DescriptorFile(
-            sequence=sequence,
-            ids=tuple(f"{row:06d}" for row in range(len(rows))),
-            positions=trajectory.positions,
-            times=trajectory.times,
-            descriptors=_as_float32(rows),
-            pose_source=trajectory.source,
-            config={"method": path.stem},
-            weights_hash="",
-            distance=distance,
-        )
+        return as_descriptors(rows, trajectory, sequence=sequence, method=path.stem, distance=distance)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -44,9 +35,3 @@ def _load(path: Path) -> Num[np.ndarray, "n d"]:
     if rows.ndim != 2 or rows.dtype.kind not in "fiub" or rows.size == 0:
         raise ValueError(f"{expected}, found {rows.dtype} {rows.shape}")
     return rows
-
-
-def _as_float32(rows: Num[np.ndarray, "n d"]) -> Num[np.ndarray, "n d"]:
-    # A number too large for float32 becomes infinite, which the descriptor file refuses; no need to warn as well.
-    with np.errstate(over="ignore"):
-        return np.array(rows, dtype=np.float32)

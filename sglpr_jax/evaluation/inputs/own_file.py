@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from sglpr_jax.data.trajectory import Trajectory
+from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 

@@ -1,18 +1,19 @@
 """An evaluation as one HTML page that stands alone."""
 
+from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import sections
 from sglpr_jax.evaluation.page.document import document
-from sglpr_jax.evaluation.page.evaluation import Evaluation
 from sglpr_jax.evaluation.page.pictures import HeatPicture, Pictures, SemanticPicture
-from sglpr_jax.evaluation.page.plots import Plots, can_draw, draw_curves, draw_trajectory
+from sglpr_jax.evaluation.page.plots import Plots, draw_curves, draw_trajectory
+from sglpr_jax.evaluation.scoring import Evaluation
 
 
 def page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictures) -> str:
     """Return the page as HTML.
 
-    Where a section has not what it needs, one line says which option of the command line would add it.
+    Where something is missing for a section, one line says which option of the command line would add it.
     """
-    drawn = can_draw()
+    drawn = figures.can_draw()
     parts = [sections.results_section(found.results)]
     if len(found.methods) > 1:
         parts.append(sections.comparison_section(found.methods))
@@ -29,12 +30,10 @@ def page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictu
 
 
 __all__ = [
-    "Evaluation",
     "HeatPicture",
     "Pictures",
     "Plots",
     "SemanticPicture",
-    "can_draw",
     "draw_curves",
     "draw_trajectory",
     "page",

@@ -4,38 +4,39 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 
 @dataclass(frozen=True, eq=False)
 class SemanticPicture:
     """One scan's semantic map."""
 
-    counts: np.ndarray
-    """(h, w) integers: points in each cell."""
-    truth: np.ndarray | None
-    """(h, w) class ids, or None where the scan has no labels."""
-    predicted: np.ndarray
-    """(h, w) class ids."""
+    counts: Num[np.ndarray, "h w"]
+    """Points in each cell."""
+    truth: Int[np.ndarray, "h w"] | None
+    """Class ids, or None where the scan has no labels."""
+    predicted: Int[np.ndarray, "h w"]
+    """Class ids."""
     resolution_m: float
     categories: int = 20
-    """Which classes the ids are (`labels.label_map`)."""
+    """Which classes the ids are (`labels.taxonomy`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatPicture:
     """How strongly the features of a network answer to one image."""
 
-    image: np.ndarray
-    """(h, w) point counts."""
-    maps: Mapping[str, np.ndarray]
-    """(h, w) from 0 to 1, NaN where the network does not look, by the name of the layer."""
+    image: Num[np.ndarray, "h w"]
+    """Point counts."""
+    maps: Mapping[str, Float[np.ndarray, "h w"]]
+    """From 0 to 1, NaN where the network does not look, by the name of the layer."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """All of them, by frame; where there are none, a line says what they would need."""
+    """All pictures of a page, by frame; where there are none, a line says what they would need."""
 
-    images: Mapping[int, np.ndarray] = field(default_factory=dict)
-    """(h, w) point counts, of the frames of false positives."""
+    images: Mapping[int, Num[np.ndarray, "_ _"]] = field(default_factory=dict)
+    """Point counts of the frames of false positives."""
     semantic: Mapping[str, SemanticPicture] | str = "Semantic maps: add --weights and --data."
     heat: Mapping[str, HeatPicture] | str = "Feature heat maps: add --weights and --data."

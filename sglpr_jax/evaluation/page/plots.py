@@ -1,20 +1,14 @@
 """The plots of an evaluation, by the name of the file that each is written to."""
 
-import importlib.util
 from typing import TYPE_CHECKING
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.page.evaluation import Evaluation
+from sglpr_jax.evaluation.scoring import Evaluation
 
 if TYPE_CHECKING:
     import matplotlib.figure
 
 Plots = dict[str, "matplotlib.figure.Figure"]
-
-
-def can_draw() -> bool:
-    """Whether matplotlib is there."""
-    return importlib.util.find_spec("matplotlib") is not None
 
 
 def draw_curves(found: Evaluation) -> Plots:

@@ -49,7 +49,7 @@ def curves_section(plots: Plots, *, drawn: bool) -> Section:
 
 def trajectory_section(plots: Plots, *, drawn: bool) -> Section:
     """Figure 6: red found, black missed, blue nothing to find."""
-    needs = "Decisions along the drive: add --poses, and a protocol that answers queries (--protocols top1-f1max)."
+    needs = "Decisions along the recording: add --poses, and a protocol that answers queries (--protocol top1-f1max)."
     nothing = missing(needs if drawn else NO_MATPLOTLIB)
     body = "\n".join(figure_html(plot, "every frame by what became of it") for plot in plots.values())
     return Section("Trajectory", body or nothing)
@@ -62,7 +62,7 @@ def false_positives_section(
     title = "Worst false positives"
     if judged is None:
         return Section(
-            title, missing("Wrong answers: add a protocol that puts a threshold on them (--protocols top1-f1max).")
+            title, missing("Wrong answers: add a protocol that puts a threshold on them (--protocol top1-f1max).")
         )
     if not worst:
         return Section(title, f"<p>{escape(judged.name)}: none at the threshold of the highest F1.</p>")

@@ -1,7 +1,7 @@
 """Bootstrap confidence intervals: how far a score moves when the queries are drawn anew.
 
-Queries are drawn with replacement, as many as there are. Neighbouring frames of a drive resemble each other, so that
-they are worth less than as many independent queries: read an interval as the least uncertainty there is.
+Queries are drawn with replacement, as many as there are. Neighbouring frames of a recording resemble each other, so
+that they are worth less than as many independent queries: read an interval as the least uncertainty there is.
 """
 
 import numpy as np

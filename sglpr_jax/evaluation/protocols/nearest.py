@@ -1,21 +1,16 @@
-"""Retrieval: which frames a query is answered with, and whether its database has a right answer."""
+"""Retrieval: which frames a query is answered with, and which of the answers is the first right one."""
 
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.evaluation.distances import distance_function
 from sglpr_jax.evaluation.protocols.source import Source, TopK
-from sglpr_jax.poses import distances
+from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.revisits import Near
 
 BLOCK = 512
 """Queries whose descriptors are compared with the whole database at a time."""
-POSITION_BLOCK = 32
-"""Queries whose positions are: so few that the distances stay in the cache."""
-
-Near = Callable[[np.ndarray], np.ndarray]
-"""From distances in metres to whether they are those of one place, such as `lambda apart: apart < 5`."""
 
 
 def nearest_frames(
@@ -61,19 +56,6 @@ def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.
     # |q - d|^2 without |q|^2, which is the same for a whole row.
     norms = np.sum(database**2, axis=1)
     return lambda queries: norms[None, :] - 2 * queries @ database.T
-
-
-def has_near(
-    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], ends: Int[np.ndarray, " q"], near: Near
-) -> Bool[np.ndarray, " q"]:
-    """Return whether each query has a near position among the first `ends` of the database."""
-    found = np.zeros(len(queries), dtype=bool)
-    for start in range(0, len(queries), POSITION_BLOCK):
-        rows = slice(start, start + POSITION_BLOCK)
-        last = ends[rows].max()
-        close = near(distances(queries[rows], database[:last]))
-        found[rows] = np.any(close & (np.arange(last) < ends[rows, None]), axis=1)
-    return found
 
 
 def first_hits(

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+from jaxtyping import Float64, Int8, Int64
 
 from sglpr_jax.metrics import PrecisionRecallCurve
 
@@ -42,9 +43,9 @@ class Result:
     """Its thresholds are negated descriptor distances. None for a recall, and where there is no revisit."""
     recalls: dict[int, float] = field(default_factory=dict)
     """Recall@N by N, where the protocol has it."""
-    decisions: np.ndarray | None = None
-    """(n,) int8: a `Decision` for every frame. None for pairs and across sessions."""
-    answers: np.ndarray | None = None
-    """(n,) int64: the frame that each query was answered with, -1 elsewhere. None where answers meet no threshold."""
-    answer_distances: np.ndarray | None = None
-    """(n,) float64: the descriptor distances of `answers`, infinite where there is none."""
+    decisions: Int8[np.ndarray, " n"] | None = None
+    """A `Decision` for every frame. None for pairs and across sessions."""
+    answers: Int64[np.ndarray, " n"] | None = None
+    """The frame that each query was answered with, -1 elsewhere. None where answers meet no threshold."""
+    answer_distances: Float64[np.ndarray, " n"] | None = None
+    """The descriptor distances of `answers`, infinite where there is none."""

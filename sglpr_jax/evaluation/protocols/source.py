@@ -1,9 +1,9 @@
-"""What a protocol is asked about: descriptors, or frames that a method has retrieved already."""
+"""What a method hands in: descriptors, frames that it retrieved, or pairs that it scored."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
@@ -17,17 +17,17 @@ class TopK:
     """
 
     sequence: str
-    positions: np.ndarray
-    """(n, 3) float64, metres, z up, of every frame."""
-    times: np.ndarray | None
-    """(n,) float64 seconds, or None."""
+    positions: Float[np.ndarray, "_n 3"]
+    """Metres, z up, of every frame."""
+    times: Float[np.ndarray, "_n"] | None
+    """Seconds, or None."""
     pose_source: str | None
-    queries: np.ndarray
-    """(q,) integers: the frames listed."""
-    nearest: np.ndarray
-    """(q, k) integers: the frames retrieved; -1 fills a row that has fewer."""
-    scores: np.ndarray | None = None
-    """(q, k) float64, higher is closer. F1max cannot be had without."""
+    queries: Int[np.ndarray, "_q"]
+    """The frames listed."""
+    nearest: Int[np.ndarray, "_q _k"]
+    """The frames retrieved; -1 fills a row that has fewer."""
+    scores: Float[np.ndarray, "_q _k"] | None = None
+    """Higher is closer. F1max cannot be had without."""
 
     def __post_init__(self):
         if len(self.queries) == 0:
@@ -65,6 +65,35 @@ class TopK:
             best = np.take_along_axis(self.scores[row], order[:, :1], axis=1)[:, 0]
             distance = np.where(nearest[:, 0] >= 0, -best, np.inf)
         return np.pad(nearest, ((0, 0), (0, k - nearest.shape[1])), constant_values=-1), distance
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredPairs:
+    """Pairs of frames of a sequence, each with a score and perhaps a label.
+
+    Raises ValueError where the list is empty, a frame is out of range, or the numbers of rows differ.
+    """
+
+    pairs: Int[np.ndarray, "_p 2"]
+    """Two frames, the query first."""
+    scores: Float[np.ndarray, "_p"]
+    """Higher is closer."""
+    labels: Bool[np.ndarray, "_p"] | None = None
+    """One place or not. None: the positions tell."""
+    positions: Float[np.ndarray, "_n 3"] | None = None
+    """Metres, z up, of every frame. Needed where there are no labels."""
+    pose_source: str | None = None
+
+    def __post_init__(self):
+        p = len(self.pairs)
+        if p == 0:
+            raise ValueError("expected a list with at least one pair, found none")
+        if self.pairs.shape != (p, 2) or len(self.scores) != p or (self.labels is not None and len(self.labels) != p):
+            raise ValueError(f"expected {p} pairs of frames, with a score each and a label each or none, found others")
+        if self.labels is None and self.positions is None:
+            raise ValueError("expected labels, or positions to tell them from, found neither")
+        n = np.iinfo(np.int64).max if self.positions is None else len(self.positions)
+        check_frames("pairs of", self.pairs, 0, n)
 
 
 Source = DescriptorFile | TopK

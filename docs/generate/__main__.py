@@ -1,0 +1,25 @@
+"""Write the reference pages that follow from the code: the API, the commands, the configuration.
+
+`python docs/generate` writes them into docs/reference; bin/docs does so before it builds the manual.
+"""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from api import api_page  # noqa: E402
+from commands import commands_page  # noqa: E402
+from configuration import configuration_page  # noqa: E402
+
+
+def main() -> None:
+    """Write the three pages."""
+    pages = {"api": api_page(), "commands": commands_page(ROOT), "configuration": configuration_page(ROOT)}
+    for name, text in pages.items():
+        (ROOT / "docs" / "reference" / f"{name}.md").write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The page of the API: everything that `sglpr_jax` exports, under a few headings; the texts are the docstrings."""
+
+import sglpr_jax
+
+GROUPS = {
+    "From a scan to a descriptor": ["load", "read_scan", "scan_image", "describe", "segment", "forward", "Outputs"],
+    "Recordings": ["open_recording", "recording_names", "Recording", "Record"],
+    "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "evaluate", "Evaluation"],
+    "Training": ["preset", "train", "TrainResult", "init", "save", "for_places"],
+    "Simulation": ["simulate"],
+    "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],
+    "What a model is": ["ModelConfig", "SwinConfig", "RingConfig", "SglprConfig", "HeadConfig"],
+    "Images of a scan": ["Grid", "rasterize", "rasterize_labels", "density_bev", "rotate_image", "rotate_points"],
+    "Labels": ["CATEGORIES", "taxonomy", "to_classes"],
+}
+HEAD = """# API
+
+What `import sglpr_jax` gives. Functions without side effects are pure: they may stand under `jit`, `vmap` and `grad`.
+Shapes stand in the signatures, as jaxtyping writes them: `Float[Array, "*b h w"]` is an array of floating point numbers
+with any leading axes, h rows and w columns. Points are metres in the LiDAR frame: x forward, y left, z up.
+"""
+
+
+def api_page() -> str:
+    """All public names, each once."""
+    exported = list(sglpr_jax.__all__)
+    grouped = {title: [name for name in names if name in exported] for title, names in GROUPS.items()}
+    rest = sorted(set(exported) - {name for names in grouped.values() for name in names})
+    sections = [_section(title, names) for title, names in {**grouped, "Everything else": rest}.items() if names]
+    return "\n".join([HEAD, *sections])
+
+
+def _section(title: str, names: list[str]) -> str:
+    return "\n".join([f"## {title}\n", *(f"::: sglpr_jax.{name}\n" for name in names)])

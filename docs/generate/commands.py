@@ -1,0 +1,65 @@
+"""The page of the commands: what each does, its examples and its flags, from the dataclass that its parser reads."""
+
+import dataclasses
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+from fields import Field, fields_of, paragraph, table
+
+HEAD = """# Commands
+
+Each command stands in `bin/`, and after `pip install` as `sglpr-NAME`. `--help` prints the same. This page is made from
+the parsers.
+"""
+
+
+def commands_page(root: Path) -> str:
+    """All commands of `bin/` that are a module of `sglpr_jax.cli`, by name."""
+    return "\n".join([HEAD, *(_section(script.name, _command_of(script)) for script in _scripts(root))])
+
+
+def _scripts(root: Path) -> list[Path]:
+    return sorted(script for script in (root / "bin").iterdir() if _module(script))
+
+
+def _module(script: Path) -> str | None:
+    found = re.search(r"-m (sglpr_jax\.cli\.\w+)", script.read_text())
+    return found and found.group(1)
+
+
+def _command_of(script: Path) -> type:
+    """The dataclass that the command's parser reads."""
+    module = importlib.import_module(_module(script))
+    members = vars(module).values()
+    return next(
+        m for m in members if inspect.isclass(m) and m.__module__ == module.__name__ and "Command" in m.__name__
+    )
+
+
+def _section(name: str, command: type) -> str:
+    about, _, examples = (inspect.getdoc(command) or "").partition("Example")
+    lines = [f"## bin/{name}", "", about.strip(), ""]
+    commands = [
+        re.sub(r"\s{2,}(?=[^#\s])", "    # ", shown) for shown in re.findall(r"bin/.*$", examples, re.MULTILINE)
+    ]
+    if commands:
+        lines += ["```bash", *commands, "```", ""]
+    return "\n".join([*lines, table(("flag", "default", "meaning"), [_row(field) for field in fields_of(command)]), ""])
+
+
+def _row(field: Field) -> tuple[str, str, str]:
+    if dataclasses.is_dataclass(field.default):
+        return "any field of the configuration", "the preset's", "See [Configuration](configuration.md)."
+    positional = "Positional" in field.annotation
+    flag = field.name.upper() if positional else "--" + field.name.replace("_", "-")
+    return f"`{flag}`", _shown(field.default), paragraph(field.text)
+
+
+def _shown(default: object) -> str:
+    if default is dataclasses.MISSING:
+        return "required"
+    if default is None or default is False or default == ():
+        return ""
+    return f"`{' '.join(map(str, default)) if isinstance(default, tuple) else default}`"

@@ -1,0 +1,1 @@
+"""Scans made worse on purpose, for the stress test."""

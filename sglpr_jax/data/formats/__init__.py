@@ -1,0 +1,1 @@
+"""Single files: scans, poses, label images."""

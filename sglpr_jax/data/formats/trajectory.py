@@ -1,0 +1,101 @@
+"""Trajectories from files: where every frame was taken, in the formats that tools write.
+
+kitti   12 numbers a line, camera frame (x right, y down, z forward): KITTI's own poses and SemanticKITTI's
+lidar   12 numbers a line, z up: poses of the sensor or the car
+tum     t x y z qx qy qz qw, z up
+csv     a header that names columns, x, y and z among them and perhaps t
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sglpr_jax.data.formats.pose_files import check_times, read_poses, read_rows, read_times
+from sglpr_jax.poses import positions_from_camera
+
+PoseFormat = Literal["auto", "kitti", "lidar", "tum", "csv"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Where and when the frames of a sequence were taken."""
+
+    positions: np.ndarray
+    """(n, 3) float64, metres, z up."""
+    times: np.ndarray | None
+    """(n,) float64 seconds, or None."""
+    source: str
+    """Which poses these are, in words."""
+
+
+def read_trajectory(path: Path, *, format: PoseFormat = "auto", times: Path | None = None) -> Trajectory:
+    """Read a pose file, one row per frame; a file of `times`, one number a line, replaces those of the pose file.
+
+    "auto" knows csv by its ending and tum by its 8 numbers a line. It does not guess which frame 12 numbers are in:
+    horizontal distances depend on it. Raises FileNotFoundError, and ValueError naming the file, what was expected and
+    what was found.
+    """
+    trajectory = READERS[_format_of(path) if format == "auto" else format](path)
+    if len(trajectory.positions) == 0:
+        raise ValueError(f"{path}: expected at least one pose, found none")
+    if times is None:
+        return trajectory
+    clock = read_times(times)
+    if len(clock) != len(trajectory.positions):
+        raise ValueError(f"{times}: expected {len(trajectory.positions)} times, as many as poses, found {len(clock)}")
+    return replace(trajectory, times=clock)
+
+
+def _format_of(path: Path) -> str:
+    """Return the format that the ending or the first line tells."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a pose file, found none")
+    if path.suffix == ".csv":
+        return "csv"
+    lines = (line.split() for line in path.read_text(errors="replace").splitlines() if not line.startswith("#"))
+    columns = len(next(lines, []))
+    if columns == 12:
+        raise ValueError(
+            f"{path}: expected --pose-format kitti (camera frame: KITTI, SemanticKITTI) or lidar (z up) for poses of"
+            " 12 numbers a line, found neither"
+        )
+    if columns != 8:
+        raise ValueError(f"{path}: expected 12 numbers a line (kitti, lidar), 8 (tum) or a .csv, found {columns}")
+    return "tum"
+
+
+def _read_kitti(path: Path) -> Trajectory:
+    return Trajectory(positions_from_camera(read_poses(path)), None, _said(path, "camera"))
+
+
+def _read_lidar(path: Path) -> Trajectory:
+    return Trajectory(read_poses(path)[:, :, 3], None, _said(path, "z up"))
+
+
+def _read_tum(path: Path) -> Trajectory:
+    rows = read_rows(path, columns=8)
+    check_times(path, rows[:, 0])
+    return Trajectory(rows[:, 1:4], rows[:, 0], _said(path, "TUM"))
+
+
+def _read_csv(path: Path) -> Trajectory:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a pose file, found none")
+    header = path.read_text(errors="replace").partition("\n")[0]
+    names = [name.strip().lower() for name in header.split(",")]
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
+    columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
+    if "t" in columns:
+        check_times(path, columns["t"])
+    return Trajectory(np.stack([columns[axis] for axis in "xyz"], axis=1), columns.get("t"), _said(path, "csv"))
+
+
+def _said(path: Path, format: str) -> str:
+    """Name the file shortly: a table has no room for a whole path."""
+    return f"{Path(*path.parts[-2:])} ({format})"
+
+
+READERS = {"kitti": _read_kitti, "lidar": _read_lidar, "tum": _read_tum, "csv": _read_csv}

@@ -1,0 +1,35 @@
+"""What a reader of a dataset's layout is: each file of `data/readers` defines one, under the name READER."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.recording import Recording
+
+PoseChoice = Literal["auto", "semantickitti", "kitti"]
+"""Which of the two pose files of KITTI's layout."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a user may say about a dataset; a reader uses what concerns it."""
+
+    pose_source: PoseChoice = "auto"
+    format: ScanFormat = "auto"
+    """What the scans of a plain folder are."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One layout of a dataset on disk."""
+
+    layout: str
+    """How to recognise it, for a message: "sequences/NN/velodyne/*.bin (KITTI)"."""
+    recording_names: Callable[[Path], tuple[str, ...]]
+    """The names of the recordings in a folder, in order; none where the folder has another layout."""
+    open: Callable[[Path, str, ReadOptions], Recording]
+    """Open one of them."""
+    rank: int = 5
+    """Where two layouts fit one folder, that of the lower rank is taken; then the first by name of its file."""

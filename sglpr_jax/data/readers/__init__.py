@@ -1,0 +1,63 @@
+"""Readers, one file for each layout of a dataset on disk: all modules here that define READER are found by themselves.
+
+A new layout is a new file here and its test.
+"""
+
+import functools
+import importlib
+import pkgutil
+from pathlib import Path
+
+from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions
+from sglpr_jax.data.recording import Recording
+
+
+@functools.cache
+def readers() -> tuple[Reader, ...]:
+    """Return all readers, in the order in which they look at a folder."""
+    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
+    found = [module.READER for module in modules if isinstance(getattr(module, "READER", None), Reader)]
+    return tuple(sorted(found, key=lambda reader: reader.rank))
+
+
+def recording_names(root: Path | str) -> tuple[str, ...]:
+    """Return the names of the sequences in `root`, in order.
+
+    Raises FileNotFoundError, with the layouts there are, where `root` has none of them.
+    """
+    return _reader_of(Path(root))[1]
+
+
+def open_recording(
+    root: Path | str, name: str | None = None, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
+) -> Recording:
+    """Open one sequence of `root`, whatever its layout.
+
+    Without `name`, `root` must have one sequence. `pose_source` chooses between the two pose files of KITTI's layout
+    and is not used for the others; `format` tells what the scans of a plain folder are. Raises FileNotFoundError where
+    something is missing, ValueError where a file is malformed.
+
+    Example:
+      recording = open_recording("KITTI", "08")
+    """
+    root = Path(root)
+    reader, names = _reader_of(root)
+    if name is None and len(names) == 1:
+        name = names[0]
+    if name is None or name not in names:
+        asked = "the name of one sequence" if name is None else f"sequence {name!r}"
+        raise FileNotFoundError(f"{root}: expected {asked}, found {', '.join(names)}")
+    return reader.open(root, name, ReadOptions(pose_source, format))
+
+
+def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
+    """The first reader that finds recordings in `root`, and their names."""
+    for reader in readers():
+        names = reader.recording_names(root)
+        if names:
+            return reader, names
+    found = "nothing of the kind" if root.is_dir() else "no such folder"
+    *layouts, last = (reader.layout for reader in readers())
+    raise FileNotFoundError(f"{root}: expected {', '.join(layouts)} or {last}, found {found}")

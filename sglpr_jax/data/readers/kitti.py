@@ -1,0 +1,73 @@
+"""Sequences of scans in the layout of KITTI odometry and SemanticKITTI.
+
+    sequences/08/velodyne/000000.bin   scans; the number is the frame, and frames may be left out
+    sequences/08/labels/000000.label   SemanticKITTI's labels (optional, each)
+    sequences/08/times.txt             seconds, one line per frame (optional)
+    sequences/08/poses.txt             SemanticKITTI's poses: loops closed in height too
+    poses/08.txt                       KITTI's own ground truth: its height drifts
+
+Both pose files move the left camera, so `calib.txt` is not needed for positions.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.reader import PoseChoice, Reader
+from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.poses import positions_from_camera
+
+
+def recording_names(root: Path) -> tuple[str, ...]:
+    """Return the names of the sequences in `root` that have a folder of scans, in order."""
+    return tuple(sorted(folder.parent.name for folder in root.glob("sequences/*/velodyne")))
+
+
+def open_recording(root: Path, name: str, *, pose_source: PoseChoice = "auto") -> Recording:
+    """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses."""
+    folder = root / "sequences" / name
+    scan_paths = tuple(sorted((folder / "velodyne").glob("*.bin")))
+    if not scan_paths:
+        raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
+    ids = tuple(path.stem for path in scan_paths)
+    positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
+    labels = {path.stem: path for path in (folder / "labels").glob("*.label")}
+    return Recording(
+        name=name,
+        ids=ids,
+        positions=positions[rows_of(ids, rows=len(positions), path=root / pose_file)],
+        times=None if times is None else times[rows_of(ids, rows=len(times), path=folder / "times.txt")],
+        pose_source=pose_file,
+        paths=scan_paths,
+        label_paths=tuple(labels.get(scan) for scan in ids),
+        read=scan_record,
+    )
+
+
+def read_trajectory(
+    root: Path, name: str, *, pose_source: PoseChoice = "auto"
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"] | None, str]:
+    """Return the positions of all frames (metres, z up), their times or None, and the pose file's name.
+
+    The scans themselves need not be there. `pose_source` chooses the file; "auto" takes SemanticKITTI's where it
+    exists. Raises FileNotFoundError where there is no such file, ValueError where it is malformed.
+    """
+    pose_files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
+    candidates = list(pose_files.values()) if pose_source == "auto" else [pose_files[pose_source]]
+    pose_file = next((file for file in candidates if (root / file).is_file()), None)
+    if pose_file is None:
+        raise FileNotFoundError(f"{root}: expected poses in {' or '.join(candidates)}, found none")
+    times_path = root / "sequences" / name / "times.txt"
+    times = read_times(times_path) if times_path.is_file() else None
+    return positions_from_camera(read_poses(root / pose_file)), times, pose_file
+
+
+READER = Reader(
+    layout="sequences/NN/velodyne/*.bin (KITTI)",
+    recording_names=recording_names,
+    open=lambda root, name, options: open_recording(root, name, pose_source=options.pose_source),
+    rank=0,
+)

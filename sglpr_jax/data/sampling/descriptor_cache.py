@@ -1,0 +1,52 @@
+"""Descriptors of places as they were some steps ago: what hard negatives are chosen by."""
+
+import dataclasses
+import functools
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from sglpr_jax.files import replacing
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DescriptorCache:
+    """The descriptor of each of some places; `places` are frame numbers of a `TuplePool`, rising."""
+
+    places: Int[np.ndarray, "n"]
+    descriptors: Float32[np.ndarray, "n d"]
+
+    def nearest(self, anchor: int, candidates: Int[np.ndarray, "_"], size: int) -> Int[np.ndarray, "_"]:
+        """The up to `size` candidates whose descriptors are nearest to the anchor's, nearest first.
+
+        Candidates that are not in the cache are left out; of an anchor that is not there nothing is near.
+        """
+        candidates = candidates[np.isin(candidates, self.places, assume_unique=True)]
+        if anchor not in self.places:
+            return candidates[:0]
+        rows, row = np.searchsorted(self.places, candidates), np.searchsorted(self.places, anchor)
+        # |a - b|^2 less |a|^2: one product of a matrix and a vector, where differences would copy the whole cache.
+        square = self._squares - 2 * (self.descriptors @ self.descriptors[row])
+        return candidates[np.argsort(square[rows], kind="stable")[:size]]
+
+    @functools.cached_property
+    def _squares(self) -> Float32[np.ndarray, "n"]:
+        return np.square(self.descriptors).sum(1)
+
+    def save(self, path: Path) -> None:
+        """Write the file whole or not at all."""
+        with replacing(path) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, places=self.places, descriptors=self.descriptors)
+
+    @classmethod
+    def load(cls, path: Path) -> "DescriptorCache":
+        """Read what `save` wrote. Raises FileNotFoundError, or ValueError where it is damaged."""
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: expected descriptors of places, found no such file")
+        try:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                return cls(file["places"], file["descriptors"])
+        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path}: expected descriptors of places, found no such archive ({error})") from error

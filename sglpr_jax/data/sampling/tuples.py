@@ -1,0 +1,174 @@
+"""Which frames make a training tuple: 1 anchor, k_p positives of the same place, k_n negatives of other places."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
+from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
+from sglpr_jax.revisits import close_pairs
+
+
+@dataclasses.dataclass(frozen=True)
+class TupleConfig:
+    """How tuples are drawn. Distances are horizontal: ground-truth heights drift by metres within a recording."""
+
+    positives: int = 1
+    negatives: int = 10
+    positive_m: float = POSITIVE_M
+    negative_m: float = NEGATIVE_M
+    revisit_fraction: float = 0.5
+    """The share of tuples whose positives come from another visit; the others' come from neighbouring frames."""
+    revisit_gap: int = 50
+    """Frames at most this far apart belong to one visit."""
+    cluster: int = 1
+    """Tuples in a row whose anchors lie near each other. Where tuples share their places as negatives, neighbouring
+    places of one street are harder to tell apart than any two of a whole recording."""
+    cluster_m: float = 100.0
+    """How near: the distance to the first anchor of the row."""
+    mining: Literal["none", "hardest"] = "none"
+    """`none`: negatives at random, as in the paper. `hardest`: those that look most like the anchor (BEVPlace++); the
+    anchors of a cluster are then alike rather than near each other."""
+    hardest: int = 10
+    """Negatives are drawn from this many places: those that look most like the anchor, beyond the negative distance."""
+    refresh_steps: int = 1000
+    """Steps after which the descriptors that mining compares are computed anew."""
+    mined_places: int = 0
+    """Places that are described then, other ones each time, and anchors of the tuples drawn; 0: all."""
+
+    def __post_init__(self):
+        if self.mining == "none":
+            return
+        if self.negatives == 0 and self.cluster == 1:
+            raise ValueError(
+                "sampling.mining chooses negatives or the other anchors of a cluster: expected sampling.negatives or "
+                "sampling.cluster above 0 and 1, found 0 and 1"
+            )
+        if min(self.hardest, self.refresh_steps) < 1:
+            raise ValueError(
+                "expected sampling.hardest and sampling.refresh_steps of 1 or more, found "
+                f"{self.hardest} and {self.refresh_steps}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Positives:
+    """For every frame of the pool its positives, as slices of one flat array."""
+
+    frames: Int[np.ndarray, "pairs"]
+    starts: Int[np.ndarray, "bounds"]
+
+    @property
+    def anchors(self) -> Int[np.ndarray, "anchors"]:
+        """The frames that have a positive at all."""
+        return np.flatnonzero(np.diff(self.starts))
+
+    def draw(self, rng: np.random.Generator, anchor: int, size: int) -> Int[np.ndarray, "size"]:
+        """Some positives of `anchor`; all different where there are enough."""
+        choices = self.frames[self.starts[anchor] : self.starts[anchor + 1]]
+        return rng.choice(choices, size, replace=len(choices) < size)
+
+
+class TuplePool:
+    """All frames of several recordings, counted through, and the tuples that can be drawn from them."""
+
+    def __init__(
+        self,
+        positions: Sequence[Float[np.ndarray, "_ 3"]],
+        config: TupleConfig,
+        *,
+        frames: Sequence[Int[np.ndarray, "_"]] | None = None,
+    ):
+        """`frames` are those of each recording that may be used (None: all). ValueError when none has a positive."""
+        self.config = config
+        frames = [np.arange(len(p)) for p in positions] if frames is None else frames
+        self.positions = np.concatenate([p[kept] for p, kept in zip(positions, frames, strict=True)])
+        self.recording = np.repeat(np.arange(len(positions)), [len(kept) for kept in frames])
+        self.frame = np.concatenate(frames)
+        pairs = np.concatenate([self._pairs_within(d) for d in range(len(positions))])
+        same_visit = np.abs(self.frame[pairs[:, 0]] - self.frame[pairs[:, 1]]) <= config.revisit_gap
+        self.neighbours = self._group(pairs[same_visit])
+        self.revisits = self._group(pairs[~same_visit])
+        if not len(pairs):
+            raise ValueError(f"no two frames lie within {config.positive_m} m of each other: nothing can be a positive")
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def draw(
+        self, *, seed: int, step: int, tuples: int, cache: DescriptorCache | None = None
+    ) -> Int[np.ndarray, "{tuples} k"]:
+        """The pool's frame numbers of one batch, (anchor, positives, negatives) a row. A pure function.
+
+        With a `cache` the anchors are among its places, and negatives and clusters are mined. Raises ValueError for an
+        anchor that has no negatives.
+        """
+        rng = np.random.default_rng([seed, step])
+        anchored: list[list[int]] = []
+        for i in range(tuples):
+            row = anchored[i - i % self.config.cluster :]
+            anchored.append(self._draw_anchored(rng, [anchor for anchor, *_ in row], cache))
+        return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in anchored])
+
+    def draw_places(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
+        """As many frame numbers as `draw` returns, but any places, where what counts is that they differ."""
+        rng = np.random.default_rng([seed, step])
+        shape = tuples, 1 + self.config.positives + self.config.negatives
+        return rng.choice(len(self), shape, replace=bool(np.prod(shape) > len(self)))
+
+    def _draw_anchored(self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None) -> list[int]:
+        """An anchor and its positives; `cluster` are the anchors of the same cluster that were drawn before."""
+        other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
+        source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
+        anchors = source.anchors
+        if cache is not None:
+            anchors = _unless_empty(np.intersect1d(anchors, cache.places), anchors)
+        if cluster:
+            anchors = _unless_empty(self._alike_or_near(cluster, anchors, cache), anchors)
+        anchor = int(rng.choice(anchors))
+        return [anchor, *source.draw(rng, anchor, self.config.positives).tolist()]
+
+    def _alike_or_near(
+        self, cluster: list[int], anchors: Int[np.ndarray, "_"], cache: DescriptorCache | None
+    ) -> Int[np.ndarray, "_"]:
+        """Which anchors fit a cluster: those near its first one or, mined, the likest ones far from all of it."""
+        if cache is None:
+            return anchors[self._within(cluster[0], anchors, self.config.cluster_m)]
+        far = self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)
+        return cache.nearest(cluster[0], anchors[far], self.config.hardest)
+
+    def _draw_negatives(
+        self, rng: np.random.Generator, anchor: int, cache: DescriptorCache | None
+    ) -> Int[np.ndarray, "{self.config.negatives}"]:
+        choices = np.flatnonzero(self.far_apart(np.array(anchor), np.arange(len(self))))
+        size = self.config.negatives
+        if size and not len(choices):
+            raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
+        if cache is not None:
+            choices = _unless_empty(cache.nearest(anchor, choices, self.config.hardest), choices)
+        return rng.choice(choices, size, replace=len(choices) < size)
+
+    def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
+        """Whether two frames are certainly other places: of other recordings, or beyond the negative distance."""
+        return ~self._within(a, b, self.config.negative_m)
+
+    def _within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], metres: float) -> np.ndarray:
+        """Whether two frames are of one recording and at most so far apart."""
+        offset = self.positions[a, :2] - self.positions[b, :2]
+        return (self.recording[a] == self.recording[b]) & (np.hypot(offset[..., 0], offset[..., 1]) <= metres)
+
+    def _pairs_within(self, recording: int) -> Int[np.ndarray, "pairs 2"]:
+        members = np.flatnonzero(self.recording == recording)
+        pairs = close_pairs(self.positions[members, :2], closer_than_m=self.config.positive_m)
+        return members[np.concatenate([pairs, pairs[:, ::-1]])].reshape(-1, 2)
+
+    def _group(self, pairs: Int[np.ndarray, "pairs 2"]) -> Positives:
+        pairs = pairs[np.lexsort(pairs.T[::-1])]
+        return Positives(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(len(self.recording) + 1)))
+
+
+def _unless_empty(wanted: Int[np.ndarray, "_"], otherwise: Int[np.ndarray, "_"]) -> Int[np.ndarray, "_"]:
+    return wanted if len(wanted) else otherwise

@@ -1,0 +1,127 @@
+"""The test after a training: on a recording never seen, raw and with every scan rotated, beside other methods."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+from rich.console import Console, ConsoleOptions, RenderableType
+
+from sglpr_jax.data import Recording
+from sglpr_jax.evaluation import figures, report
+from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.scoring import score
+from sglpr_jax.evaluation.semantic_score import SemanticScore, score_semantics
+from sglpr_jax.files import write_json
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.method import Method
+from sglpr_jax.methods.registry import NETWORK, handcrafted, network
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import init
+from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.retrieval.embed import embed
+
+ROTATION_SEED = 0
+UNTRAINED = "untrained"
+BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
+"""The methods that stand beside the trained network, where none are named."""
+if TYPE_CHECKING:
+    BesideName = str
+else:
+    BesideName = Literal[(UNTRAINED, *HANDCRAFTED)]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class FinalTest(report.PrintsItself):
+    """The scores of a trained network and of methods beside it. Prints itself as tables."""
+
+    sequence: str
+    results: Mapping[str, Mapping[str, Sequence[Result]]]
+    """By `raw` and `rotated`, then by the method's name."""
+    semantics: SemanticScore | None
+    """None where the network has no segmentation head, or the recording no labels."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for `json.dump`."""
+        scores = {
+            title: {name: report.to_json(found) for name, found in methods.items()}
+            for title, methods in self.results.items()
+        }
+        segmentation = {} if self.semantics is None else {"segmentation": self.semantics.to_json()}
+        return {"sequence": self.sequence, **scores, **segmentation}
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+        for name, methods in self.results.items():
+            title = f"sequence {self.sequence}, {name}"
+            yield report.table(methods[NETWORK], title=f"{title}: {NETWORK}")
+            yield report.comparison(methods, title=title)
+        if self.semantics is not None:
+            yield self.semantics
+
+
+def final_test(
+    params: Params,
+    recording: Recording,
+    folder: Path,
+    *,
+    methods: Sequence[str] = BESIDE,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> FinalTest:
+    """Score a trained network on a recording, raw and with every scan rotated at random.
+
+    Beside it stand `methods`: handcrafted ones by name, or `untrained`, the same network with fresh weights made from
+    `seed`. Descriptors, pictures and results.json go to `folder`. Raises ValueError where a method does not fit the
+    recording, OSError where something cannot be read or written.
+
+    Example:
+      print(final_test(result.params, recording, result.folder / "test"))
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    beside = {name: _method(name, params, recording, seed) for name in methods}
+    results = {}
+    for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
+        results[title] = _score({NETWORK: network(params), **beside}, recording, folder, title, rotation_seed, progress)
+        if figures.can_draw():
+            _draw(results[title], recording, folder, title)
+    semantics = None
+    if params.config.segments and recording.has_labels:
+        semantics = score_semantics(params, recording, folder=folder, progress=progress)
+    found = FinalTest(recording.name, results, semantics)
+    write_json(folder / "results.json", found.to_json())
+    return found
+
+
+def _method(name: str, params: Params, recording: Recording, seed: int) -> Method:
+    if name == UNTRAINED:
+        return network(init(jax.random.key(seed + 1), config=params.config))
+    return handcrafted(name, recording, params.config.grid)
+
+
+def _score(
+    methods: Mapping[str, Method],
+    recording: Recording,
+    folder: Path,
+    title: str,
+    rotation_seed: int | None,
+    progress: Progress,
+) -> dict[str, list[Result]]:
+    results = {}
+    for name, method in methods.items():
+        with progress(f"embed {title} {name}", len(recording)) as show:
+            file = embed(method, recording, rotation_seed=rotation_seed, on_progress=show)
+        file.save(folder / f"{name}-{title}.npz")
+        results[name] = score(file)
+    return results
+
+
+def _draw(results: Mapping[str, Sequence[Result]], recording: Recording, folder: Path, title: str) -> None:
+    top1 = {name: scored[0] for name, scored in results.items()}
+    curves = {name: result.curve for name, result in top1.items() if result.curve is not None}
+    if curves:  # none where the recording has no revisit
+        picture = figures.precision_recall(curves, title=f"{recording.name}, {title}: top-1")
+        figures.save(picture, folder / f"precision-recall-{title}.png")
+    decisions = top1[NETWORK].decisions
+    if decisions is not None and recording.positions is not None:
+        figures.save(figures.trajectory(recording.positions, decisions), folder / f"trajectory-{title}.png")

@@ -1,0 +1,34 @@
+"""The files of several methods on the same frames, to be compared."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.evaluation.inputs import Input, read_input
+
+
+def read_methods(
+    paths: Sequence[Path],
+    *,
+    poses: Trajectory | None = None,
+    dataset: Trajectory | None = None,
+    sequence: str | None = None,
+    distance: str | None = None,
+) -> dict[str, Input]:
+    """Read the file of every method, by the name of the method: that of its file.
+
+    `poses` replace those of every file; those of the `dataset` serve files that have none of their own. `distance`
+    names how the descriptors of the first file, and of every .npy, are compared. Errors as of `read_input`.
+    """
+    methods = {}
+    for path in paths:
+        trajectory = poses or (None if path.suffix == ".npz" else dataset)
+        compared_by = distance if path == paths[0] or path.suffix == ".npy" else None
+        name = sequence or path.stem
+        methods[_name(path, paths)] = read_input(path, trajectory, sequence=name, distance=compared_by)
+    return methods
+
+
+def _name(path: Path, others: Sequence[Path]) -> str:
+    """Return the file's name without its ending, or its whole path where another has the same name."""
+    return path.stem if sum(other.stem == path.stem for other in others) == 1 else str(path)

@@ -1,0 +1,77 @@
+"""The split of a recording by BEVPlace and BEVPlace++: a first part is the database, a later one the queries."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sglpr_jax.evaluation.protocols.nearest import first_hits, nearest_frames
+from sglpr_jax.evaluation.protocols.recall import recall_decisions, score_recall
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.evaluation.protocols.source import Source, positions_of
+from sglpr_jax.revisits import has_near
+
+POSITIVE_M = 5.0
+FRAMES = {"00": 4541, "02": 4661, "05": 2761, "06": 1101, "08": 4071}
+"""How many frames a KITTI sequence has: a sequence of another length is another sequence."""
+SPLITS = {
+    "00": (3000, 3200, 4541),
+    "02": (3400, 3600, 4661),
+    "05": (1000, 1200, 2761),
+    "06": (600, 800, 1101),
+    "08": (1000, 1200, 4071),
+}
+"""BEVPlace++: where the database ends, where the queries start and where they end."""
+V1_SPLITS = {"00": SPLITS["00"], "02": SPLITS["02"], "05": (1000, 1200, 2751), "06": SPLITS["06"]}
+"""BEVPlace: ten queries fewer in 05, and no 08."""
+DATABASE_SHARE = 0.6
+"""The part of any other recording that is the database."""
+
+
+def recall_on_split(
+    source: Source,
+    name: str,
+    paper: str,
+    splits: Mapping[str, tuple[int, int, int]],
+    *,
+    dimensions: int,
+    numbers: Sequence[int],
+    seed: int,
+) -> Result:
+    """Score Recall@N where the first frames of a recording are the database and later ones the queries.
+
+    `splits` has by sequence where the database ends, where the queries start and where they end.
+    """
+    positions = positions_of(source, dimensions)
+    end, first, last, split = _split(source, paper, splits)
+    queries, ends = np.arange(first, last), np.full(last - first, end)
+    result = Result(
+        name=name,
+        rule=f"{POSITIVE_M:g} m, {split}",
+        dimensions=dimensions,
+        pose_source=source.pose_source,
+        published_on="the poses of BEVPlace's images",
+    )
+    revisited = has_near(positions[queries], positions, ends, near)
+    ranks = np.full(len(queries), numbers[-1])
+    if revisited.any():
+        nearest, _ = nearest_frames(source, queries, ends, k=numbers[-1])
+        ranks = first_hits(positions[queries], positions, nearest, near)
+    result = score_recall(result, ranks, revisited, numbers=numbers, seed=seed)
+    return replace(result, decisions=recall_decisions(len(source), queries, ranks, revisited))
+
+
+def _split(source: Source, paper: str, splits: Mapping[str, tuple[int, int, int]]) -> tuple[int, int, int, str]:
+    """Return how many frames are the database, the first query, the end of the queries, and the split in words."""
+    n = len(source)
+    if source.sequence in splits and FRAMES[source.sequence] == n:
+        end, first, last = splits[source.sequence]
+        return end, first, last, f"{paper} split: database 0 to {end - 1}, queries {first} to {last - 1}"
+    end = int(DATABASE_SHARE * n)
+    return end, end, n, f"no published split: database is the first {DATABASE_SHARE:.0%} of the frames"
+
+
+def near(apart: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+    """Return whether frames so many metres apart are of one place."""
+    return apart < POSITIVE_M

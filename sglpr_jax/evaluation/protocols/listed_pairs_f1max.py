@@ -1,0 +1,65 @@
+"""The protocol of pairs that come with a score: a published list, or of a method that gives no descriptors."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sglpr_jax.evaluation.protocols.pairs import pair_distances, score_pairs
+from sglpr_jax.evaluation.protocols.pairs_f1max import GAP
+from sglpr_jax.evaluation.protocols.protocol import Protocol
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.evaluation.protocols.source import ScoredPairs, check_frames
+from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+
+def score_listed_pairs(
+    file: DescriptorFile, pairs: Int[np.ndarray, "p 2"], labels: Bool[np.ndarray, " p"] | None = None
+) -> ScoredPairs:
+    """Return listed pairs of rows of a descriptor file with the negated distances of their descriptors."""
+    check_frames("pairs of", pairs, 0, len(file))
+    return ScoredPairs(pairs, -pair_distances(file, pairs.T), labels, file.positions, file.pose_source)
+
+
+def listed_pairs_f1max(listed: ScoredPairs, *, seed: int = 0) -> Result:
+    """Score listed pairs by F1max: with SSC's published lists (`neg_100`), the numbers of SSC's and RINet's tables.
+
+    Pairs without labels are labelled as `pairs_f1max` would: positive less than 3 m and more than 50 frames apart,
+    negative more than 20 m apart, in x and y; what is neither is left out. The interval resamples the first frames
+    of the pairs.
+    """
+    result = Result(
+        name="listed pairs F1max",
+        rule="labels as listed",
+        dimensions=None,
+        pose_source=None,
+        published_on="KITTI's own poses",
+    )
+    if listed.labels is not None:
+        return score_pairs(result, listed.pairs.T, listed.scores, listed.labels, seed=seed)
+    assert listed.positions is not None  # `ScoredPairs` has seen to it
+    positive, negative = _label(listed.pairs, listed.positions[:, :2])
+    rule = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m, pairs as listed"
+    result = replace(result, rule=rule, dimensions=2, pose_source=listed.pose_source)
+    counted = positive | negative
+    return score_pairs(result, listed.pairs[counted].T, listed.scores[counted], positive[counted], seed=seed)
+
+
+def _label(
+    pairs: Int[np.ndarray, "p 2"], positions: Float[np.ndarray, "n 2"]
+) -> tuple[Bool[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
+    """Return which pairs are positive and which are negative; a pair may be neither."""
+    i, j = pairs.T
+    apart = np.linalg.norm(positions[i] - positions[j], axis=1)
+    return (apart < POSITIVE_M) & (np.abs(i - j) > GAP), apart > NEGATIVE_M
+
+
+LISTED_PAIRS_F1MAX = Protocol(
+    "listed-pairs-f1max",
+    listed_pairs_f1max,
+    rule="pairs of frames as listed; without labels: same place below 3 m, different beyond 20 m, in x and y",
+    source="SSC, RINet: the lists that they publish",
+    takes=("scored pairs",),
+    returns="F1max",
+)

@@ -1,0 +1,43 @@
+"""The protocol of Scan Context's evaluator."""
+
+from sglpr_jax.evaluation.protocols.answers import older_by, score_top1_by_distance
+from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.evaluation.protocols.source import Source
+
+POSITIVE_M = 5.0
+GAP = 50
+"""The last so many frames, the query among them, are left out but for the oldest, as the published code counts."""
+
+
+def scan_context_f1max(source: Source, *, seed: int = 0) -> Result:
+    """Score top-1 retrieval as Scan Context's evaluator does: 5 m in x and y, a gap of 50 frames.
+
+    The database of frame i is frames 0 to i - 49; the last frame is no query. Accepted, an answer less than 5 m away is
+    a true positive, any other a false positive. Rejected, it is a false negative if the database has a frame less than
+    5 m away, else a true negative. The published code (gisbi-kim/scancontext, fast_evaluator/main.m) looks at 50
+    candidates by ring key alone and at 100 thresholds; here all frames are compared and every distinct distance is a
+    threshold. Published on the pose files it ships, a sequence each. The interval resamples queries.
+    """
+    result = Result(
+        name="Scan Context F1max",
+        rule=f"{POSITIVE_M:g} m, gap {GAP} frames",
+        dimensions=2,
+        pose_source=source.pose_source,
+        published_on="Scan Context's own pose files",
+    )
+    ends = older_by(len(source), GAP - 1)
+    ends[-1] = 0
+    return score_top1_by_distance(
+        source, result, ends, right=lambda apart: apart < POSITIVE_M, wrong=lambda apart: apart >= POSITIVE_M, seed=seed
+    )
+
+
+SCAN_CONTEXT_F1MAX = Protocol(
+    "scan-context-f1max",
+    scan_context_f1max,
+    rule="the nearest frame at least 49 older: right below 5 m in x and y, else wrong",
+    source="Scan Context, fast_evaluator/main.m",
+    takes=SCORED_RETRIEVAL,
+    returns="F1max",
+)

@@ -1,0 +1,47 @@
+"""The protocol of LoGG3D-Net and Locus."""
+
+from sglpr_jax.evaluation.protocols.answers import score_top1_by_distance
+from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.evaluation.protocols.source import Source
+from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
+from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, Near, database_end
+
+METRES = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m"
+
+
+def top1_f1max(source: Source, *, seed: int = 0) -> Result:
+    """Score top-1 retrieval as LoGG3D-Net and Locus do: 3 m / 20 m in 3-D, the last 30 s excluded.
+
+    Each query is answered with the nearest descriptor among the frames at least 30 s older (`poses.database_end` has
+    the rule). Accepted, the answer is a true positive up to 3 m away, a false positive beyond 20 m, and counts for
+    nothing in between. Rejected, it is a false negative if the query has any frame within 3 m in its database, else a
+    true negative. Every distinct distance is a threshold; the published code takes 1000 of them (Locus: 200).
+    Published on SemanticKITTI's poses (LoGG3D-Net, evaluation/eval_sequence.py). The interval resamples queries.
+    """
+    return score_top1(source, "top-1 F1max", f"{METRES}, {excluded(source)}", lambda apart: apart > NEGATIVE_M, seed)
+
+
+def score_top1(source: Source, name: str, rule: str, wrong: Near, seed: int) -> Result:
+    """Score the nearest of the frames at least 30 s older: right up to 3 m away, and what is wrong is given."""
+    result = Result(
+        name=name, rule=rule, dimensions=3, pose_source=source.pose_source, published_on="SemanticKITTI's poses"
+    )
+    ends = database_end(len(source), times=source.times)
+    return score_top1_by_distance(source, result, ends, right=lambda apart: apart <= POSITIVE_M, wrong=wrong, seed=seed)
+
+
+def excluded(source: Source) -> str:
+    """Return in words which frames are left out of the database."""
+    return f"last {EXCLUDED_FRAMES} frames excluded" if source.times is None else f"last {EXCLUDED_S:g} s excluded"
+
+
+TOP1_F1MAX = Protocol(
+    "top1-f1max",
+    top1_f1max,
+    rule="the nearest frame at least 30 s older: right up to 3 m, wrong beyond 20 m, in 3-D",
+    source="LoGG3D-Net, evaluation/eval_sequence.py; Locus",
+    takes=SCORED_RETRIEVAL,
+    returns="F1max",
+    headline=True,
+)

@@ -1,0 +1,27 @@
+"""The protocol of LoGG3D-Net and Locus without the answers that count for nothing."""
+
+from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
+from sglpr_jax.evaluation.protocols.result import Result
+from sglpr_jax.evaluation.protocols.source import Source
+from sglpr_jax.evaluation.protocols.top1_f1max import METRES, excluded, score_top1
+from sglpr_jax.poses import POSITIVE_M
+
+
+def top1_strict_f1max(source: Source, *, seed: int = 0) -> Result:
+    """Score top-1 retrieval like `top1_f1max`, but an accepted answer 3 to 20 m away is a false positive too.
+
+    It leaves no answer uncounted, so a method cannot win by near misses. Nobody publishes it; its number beside
+    that of `top1_f1max` says how much of the latter rests on them. The interval resamples queries.
+    """
+    rule = f"{METRES}, in between false, {excluded(source)}"
+    return score_top1(source, "top-1 strict F1max", rule, lambda apart: apart > POSITIVE_M, seed)
+
+
+TOP1_STRICT_F1MAX = Protocol(
+    "top1-strict-f1max",
+    top1_strict_f1max,
+    rule="as top1-f1max, but an answer 3 to 20 m away is wrong too",
+    source="this project",
+    takes=SCORED_RETRIEVAL,
+    returns="F1max",
+)

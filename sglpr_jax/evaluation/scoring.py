@@ -1,0 +1,167 @@
+"""Scoring what methods say of a recording: one call, and a result that prints itself."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Num
+from rich.console import Console, ConsoleOptions
+from rich.table import Table
+
+from sglpr_jax.evaluation import report
+from sglpr_jax.evaluation.false_positives import FalsePositive, worst_false_positives
+from sglpr_jax.evaluation.inputs import Input, read_input
+from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
+from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
+from sglpr_jax.evaluation.protocols.choice import chosen_protocols
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(report.PrintsItself):
+    """The results of one method, and of those it is compared with, by the same protocols. Prints itself as tables."""
+
+    title: str
+    about: str
+    """What was scored and how it is compared, in a line."""
+    methods: Mapping[str, Sequence[Result]]
+    """By the name of the method; the first is the one in question."""
+    positions: Float[np.ndarray, "n 3"] | None
+    """Metres, z up; None where pairs came with labels alone."""
+    published: Sequence[tuple[str, ...]] = ()
+    """`report.published_rows` of the sequence, where they were asked for."""
+    made_with: Mapping[str, Any] = field(default_factory=dict)
+    """The file, and the configuration, weights and distance of its descriptors, as JSON can hold them."""
+
+    @property
+    def results(self) -> Sequence[Result]:
+        """Those of the method in question, one for each protocol."""
+        return next(iter(self.methods.values()))
+
+    @cached_property
+    def judged(self) -> Result | None:
+        """The first result that accepts answers by a threshold; None where there is none."""
+        return next((result for result in self.results if result.answers is not None), None)
+
+    @cached_property
+    def worst(self) -> Sequence[FalsePositive]:
+        """The worst false positives of `judged`."""
+        if self.judged is None or self.positions is None:
+            return []
+        return worst_false_positives(self.judged, self.positions)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for `json.dump`."""
+        others = list(self.methods.items())[1:]
+        return {
+            **self.made_with,
+            "results": report.to_json(self.results),
+            "false_positives": [dataclasses.asdict(mistake) for mistake in self.worst],
+            "compared": {name: report.to_json(results) for name, results in others},
+            "published": self.published,
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | str]:
+        yield report.table(self.results, title=self.title)
+        if len(self.methods) > 1:
+            yield report.comparison(self.methods)
+        if self.published:
+            yield report.published_table(self.published)
+            yield report.PUBLISHED_NOTE
+
+
+def evaluate(
+    source: Input | Path | str | Num[np.ndarray, "n d"],
+    protocols: Sequence[str] = (),
+    *,
+    positions: Float[np.ndarray, "n 3"] | None = None,
+    times: Float[np.ndarray, " n"] | None = None,
+    distance: str | None = None,
+    published: bool = False,
+) -> Evaluation:
+    """Score descriptors, a top-k list or scored pairs.
+
+    `source` is a file of any kind that `evaluation.inputs` reads, what it was read to, or an array of descriptors.
+    `protocols` are names in `PROTOCOLS`; none stands for the headlines that fit, `all` for all that do. `positions`
+    (metres, z up) and `times` (seconds) are those of the frames, where `source` has none of its own; `distance` names
+    how the descriptors of an array are compared (by L2 unless given). With `published` the paper's numbers for the
+    sequence stand beside. Raises ValueError where positions are missing or a protocol does not fit.
+
+    Example:
+      print(sglpr_jax.evaluate("08.npz"))
+    """
+    given = as_trajectory(positions, times)
+    if isinstance(source, str | Path):
+        path = Path(source)
+        read = read_input(path, given, sequence=path.stem, distance=distance)
+        return evaluate_methods({path.stem: read}, protocols, published=published, file=path)
+    if isinstance(source, np.ndarray):
+        if given is None:
+            raise ValueError(f"expected positions of {len(source)} frames beside their descriptors, found none")
+        source = as_descriptors(source, given, sequence="", method="", distance=distance or "l2")
+    return evaluate_methods({"descriptors": source}, protocols, published=published)
+
+
+def evaluate_methods(
+    methods: Mapping[str, Input], protocols: Sequence[str] = (), *, published: bool = False, file: Path | None = None
+) -> Evaluation:
+    """Score several methods by the same protocols: those that fit the first one, where none is named or `all` are.
+
+    `file` is what the first was read from. Raises ValueError, naming the method, where one cannot be scored.
+    """
+    source = next(iter(methods.values()))
+    chosen = chosen_protocols(source, protocols)
+    results = {}
+    for name, of_one in methods.items():
+        try:
+            results[name] = score(of_one, chosen_protocols(of_one, chosen))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+    return Evaluation(
+        title=_title(source, file),
+        about=_about(source, file),
+        methods=results,
+        positions=source.positions,
+        published=report.published_rows(_sequence_of(source)) if published else (),
+        made_with=_made_with(source, file),
+    )
+
+
+def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
+    """Return the result of each named protocol; none named: of the headlines that fit.
+
+    Raises ValueError where there are no positions, or a name is no protocol that `source` can be scored by.
+    """
+    known = protocols_taking(kind_of(source))
+    return [protocol_named(name, known)(source) for name in protocols or chosen_protocols(source, ())]
+
+
+def _title(source: Input, file: Path | None) -> str:
+    if isinstance(source, ScoredPairs):
+        return f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
+    return f"sequence {source.sequence}, {len(source)} scans"
+
+
+def _sequence_of(source: Input) -> str:
+    return "scored pairs" if isinstance(source, ScoredPairs) else source.sequence
+
+
+def _about(source: Input, file: Path | None) -> str:
+    """Say what the source holds and how it is compared."""
+    where = "" if file is None else f"{file}: "
+    if isinstance(source, ScoredPairs):
+        return f"{where}scored pairs" + (" with labels" if source.labels is not None else "")
+    if isinstance(source, TopK):
+        return f"{where}up to {source.nearest.shape[1]} retrieved frames for each of {len(source.queries)} queries"
+    return f"{where}descriptors of {source.descriptors.shape[1]} numbers, compared by {source.distance}"
+
+
+def _made_with(source: Input, file: Path | None) -> dict[str, Any]:
+    about: dict[str, Any] = {} if file is None else {"file": str(file)}
+    if isinstance(source, DescriptorFile):
+        about |= {"config": source.config, "weights_hash": source.weights_hash, "distance": source.distance}
+    return about

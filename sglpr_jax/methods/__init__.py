@@ -1,0 +1,1 @@
+"""What a descriptor can come from: the network, and methods without training."""

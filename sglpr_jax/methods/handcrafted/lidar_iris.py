@@ -1,0 +1,137 @@
+"""LiDAR Iris (Wang et al., 2020): the scan as an iris, its texture as bits, compared by a shifted Hamming distance."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex64, Complex128, Float, Float32, Float64, Int, UInt64
+
+from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.pairwise import correlate_spectra, in_blocks
+
+RINGS = 80
+COLUMNS = 360
+RING_M = 1.0
+HEIGHT_BITS = 8
+LOWEST_DEG = -24.0
+"""Elevation at which the first of the height bits begins: the HDL-64E's; a 16-beam sensor's would be -15."""
+BIT_DEG = 4.0
+NUMBERS = RINGS * COLUMNS
+
+WAVELENGTHS = tuple(18 * 1.6**scale for scale in range(4))
+"""In columns, of the four log-Gabor filters."""
+SIGMA = 0.75
+"""Width of a filter: its standard deviation over its frequency."""
+FAINT = 1e-4
+"""Responses below it have no certain sign."""
+NEAR = 2
+"""Columns that are tried to either side of the alignment, and of the opposite one."""
+
+BLOCK = 128
+
+
+def lidar_iris(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "28800"]:
+    """Return the LiDAR-Iris image, 80 rings of 1 m x 360 degrees, flat: whole numbers 0 to 255.
+
+    Bit k of a pixel is set where it has a point (metres, z up) with floor((elevation + 24 degrees) / 4 degrees) = k;
+    lower and higher elevations count for the first and the last bit. Points from 80 m on are left out.
+    """
+    x, y, z = points.astype(np.float64).T
+    radius, azimuth = np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360
+    inside = radius < RINGS * RING_M
+    ring = np.floor(radius / RING_M).astype(np.int64)
+    column = np.floor(azimuth).astype(np.int64) % COLUMNS
+    elevation = np.degrees(np.arctan2(z, radius))
+    bit = np.clip(np.floor((elevation - LOWEST_DEG) / BIT_DEG), 0, HEIGHT_BITS - 1).astype(np.int64)
+    image = np.zeros(NUMBERS, np.int64)
+    np.bitwise_or.at(image, (ring * COLUMNS + column)[inside], 1 << bit[inside])
+    return image.astype(np.float32)
+
+
+class _Iris(NamedTuple):
+    """What is compared of n images. The words of a column hold its bits of all rings, filters and parts."""
+
+    phases: Complex64[np.ndarray, "n 80 frequencies"]
+    bits: UInt64[np.ndarray, "n 360 words"]
+    faint: UInt64[np.ndarray, "n 360 words"]
+
+
+def lidar_iris_distance(
+    queries: Float32[np.ndarray, "q 28800"], database: Float32[np.ndarray, "n 28800"]
+) -> Float32[np.ndarray, "q n"]:
+    """Return the smallest Hamming distance, 0 to 1, over ten shifts: 2 columns about the alignment and its opposite.
+
+    D = min over shifts of |(q xor d) and not m| / |not m|, over the bits of 80 x 360 pixels x 4 filters x 2 parts: the
+    signs of the real and of the imaginary part of the log-Gabor response. m marks bits that are faint in either image.
+    It is 1 where all are. The alignment is the peak of the phase correlation along the columns.
+    """
+
+    def compare(queries, database):
+        shift = np.argmax(correlate_spectra(queries.phases, database.phases, sectors=COLUMNS), axis=-1)
+        return np.stack(
+            [_hamming(bits, faint, database, row) for bits, faint, row in zip(*queries[1:], shift, strict=True)]
+        )
+
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare)
+
+
+def responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "filters 80 360"]:
+    """Return the complex log-Gabor responses of every ring.
+
+    A filter of wavelength w has the gain exp(-ln(f w)^2 / (2 ln(sigma)^2)) at the frequency f > 0, and 0 elsewhere.
+    """
+    frequency = np.fft.fftfreq(COLUMNS)
+    positive = frequency > 0
+    gains = np.zeros((len(WAVELENGTHS), COLUMNS))
+    ratio = np.log(np.outer(WAVELENGTHS, frequency[positive]))
+    gains[:, positive] = np.exp(-(ratio**2) / (2 * np.log(SIGMA) ** 2))
+    return np.fft.ifft(np.fft.fft(image)[None] * gains[:, None])
+
+
+def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> _Iris:
+    images = rows.reshape(-1, RINGS, COLUMNS)
+    spectra = np.fft.rfft(images)
+    size = np.abs(spectra)
+    phases = np.divide(spectra, size, out=np.zeros_like(spectra), where=size > 0)
+    bits, faint = zip(*map(_encode, images), strict=True)
+    return _Iris(phases, np.stack(bits), np.stack(faint))
+
+
+def _encode(image: Float32[np.ndarray, "80 360"]) -> tuple[UInt64[np.ndarray, "360 words"], ...]:
+    """Return the signs of an image's responses, and which of them are faint."""
+    found = responses(image.astype(np.float64))
+    faint = np.abs(found) < FAINT
+    return _pack(np.stack([np.real(found) > 0, np.imag(found) > 0])), _pack(np.stack([faint, faint]))
+
+
+def _pack(bits: Bool[np.ndarray, "parts filters 80 360"]) -> UInt64[np.ndarray, "360 words"]:
+    """Return the bits of every column as words of 64."""
+    by_column = bits.reshape(-1, COLUMNS).T
+    return np.ascontiguousarray(np.packbits(by_column, axis=-1)).view(np.uint64)
+
+
+def _hamming(
+    bits: UInt64[np.ndarray, "360 words"],
+    faint: UInt64[np.ndarray, "360 words"],
+    database: _Iris,
+    shift: Int[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Return the distance of one image to each of the database, whose column j + shift[i] lies on its column j."""
+    best = np.ones(len(shift))
+    rows = np.arange(len(shift))[:, None]
+    for step in range(-NEAR, NEAR + 1):
+        for half in (0, COLUMNS // 2):
+            columns = (np.arange(COLUMNS) + (shift + step + half)[:, None]) % COLUMNS
+            clear = ~(faint | database.faint[rows, columns])
+            unlike = np.bitwise_count((bits ^ database.bits[rows, columns]) & clear).sum(axis=(1, 2), dtype=np.int64)
+            counted = np.bitwise_count(clear).sum(axis=(1, 2), dtype=np.int64)
+            best = np.minimum(best, np.divide(unlike, counted, out=np.ones(len(shift)), where=counted > 0))
+    return best
+
+
+LIDAR_IRIS = HandcraftedMethod(
+    "lidar-iris",
+    'Wang et al., "LiDAR Iris for Loop-Closure Detection", IROS 2020',
+    "points",
+    lidar_iris,
+    distance=lidar_iris_distance,
+)

@@ -1,0 +1,69 @@
+"""Scan Context (Kim and Kim, 2018): the greatest height in every cell of a polar grid, compared over all rotations."""
+
+import numpy as np
+from jaxtyping import Float32
+
+from sglpr_jax.methods.method import HandcraftedMethod
+from sglpr_jax.methods.pairwise import correlate, in_blocks
+
+RINGS = 20
+SECTORS = 60
+RADIUS_M = 80.0
+LIDAR_HEIGHT_M = 2.0
+"""Added to z, so that the ground is near 0 and heights are positive."""
+NUMBERS = RINGS * SECTORS
+
+BLOCK = 256
+
+
+def scan_context(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "1200"]:
+    """Return the matrix I of 20 rings x 60 sectors, flat: I[i, j] = max of z + 2 m over the points of a cell, else 0.
+
+    Points (metres, x forward, y left, z up) farther than 80 m are left out. A cell holds the far and the
+    counter-clockwise border, not the near one: ring = ceil(20 r / 80 m), sector = ceil(60 theta / 360 degrees), from 1.
+    """
+    x, y, z = points.astype(np.float64).T
+    radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
+    inside = radius <= RADIUS_M
+    ring = np.clip(np.ceil(radius / RADIUS_M * RINGS), 1, RINGS).astype(np.int64) - 1
+    sector = np.clip(np.ceil(angle / (2 * np.pi) * SECTORS), 1, SECTORS).astype(np.int64) - 1
+    highest = np.full(NUMBERS, -np.inf)
+    np.maximum.at(highest, (ring * SECTORS + sector)[inside], z[inside] + LIDAR_HEIGHT_M)
+    return np.where(np.isfinite(highest), highest, 0).astype(np.float32)
+
+
+def scan_context_distance(
+    queries: Float32[np.ndarray, "q 1200"], database: Float32[np.ndarray, "n 1200"]
+) -> Float32[np.ndarray, "q n"]:
+    """Return the column-wise cosine distance at the best of all 60 rotations (the paper's equations 6 and 7).
+
+    D = min over shifts s of 1 - (1 / N_s) sum over j of cos(q_j, d_{j + s}), where q_j are the columns (sectors) and
+    the sum is over the N_s that are empty in neither. It is 1 where there are none. The published search tries only the
+    shifts near the best one of a coarse key, and only ten candidates; here every shift of every scan is tried.
+    """
+
+    def compare(queries, database):
+        cosines, shared = correlate(queries[0], database[0]), np.rint(correlate(queries[1], database[1]))
+        mean = np.divide(cosines, shared, out=np.zeros_like(cosines), where=shared > 0)
+        return 1 - mean.max(axis=-1)
+
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=_unit_columns)
+
+
+def _unit_columns(
+    rows: Float32[np.ndarray, "n 1200"],
+) -> tuple[Float32[np.ndarray, "n 20 60"], Float32[np.ndarray, "n 1 60"]]:
+    """Return the columns divided by their lengths, and 1 for each that is not empty."""
+    columns = rows.reshape(-1, RINGS, SECTORS)
+    lengths = np.linalg.norm(columns, axis=1, keepdims=True)
+    unit = np.divide(columns, lengths, out=np.zeros_like(columns), where=lengths > 0)
+    return unit, (lengths > 0).astype(np.float32)
+
+
+SCAN_CONTEXT = HandcraftedMethod(
+    "scan-context",
+    'Kim and Kim, "Scan Context", IROS 2018',
+    "points",
+    scan_context,
+    distance=scan_context_distance,
+)

@@ -1,0 +1,82 @@
+"""Every method that a descriptor can come from: the network, and the handcrafted methods."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.data import Recording
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.models.weights_file import load
+
+NETWORK = "sglpr"
+METHODS = (NETWORK, *HANDCRAFTED)
+"""The names of all methods."""
+
+if TYPE_CHECKING:
+    MethodName = str
+else:
+    MethodName = Literal[METHODS]
+"""One of `METHODS`: a command line lists them in its help and refuses others."""
+
+
+def method_named(name: str, weights: str | None, recording: Recording) -> Method:
+    """Return the network with these weights, or a handcrafted method; ValueError for the network without weights."""
+    if name != NETWORK:
+        return handcrafted(name, recording, model_preset("small").grid)
+    if weights is None:
+        raise ValueError("expected --weights (a name, or a training run's folder), found none")
+    return network(load(weights))
+
+
+def methods_named(names: Sequence[str], weights: str | None, recording: Recording) -> dict[str, Method]:
+    """Return the network, where there are weights, and these methods by name; ValueError where there are none."""
+    asked: list[str] = [*([NETWORK] if weights is not None else []), *names]
+    chosen = list(dict.fromkeys(asked))
+    if not chosen:
+        raise ValueError("expected --weights (a name, or a training run's folder) or --method, found neither")
+    return {name: method_named(name, weights, recording) for name in chosen}
+
+
+def network(params: Params) -> ImageMethod:
+    """Return the method that describes by `params`."""
+    config = params.config
+    about = {"method": NETWORK, "model": dataclasses.asdict(config)}
+    describe_views = functools.partial(describe, params)
+    return ImageMethod(describe_views, config.grid, about, weights_hash(params), config.categories_read, config.image)
+
+
+def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
+    """Return a handcrafted method for the scans of `recording`: on points, on whole images, or on images of `grid`.
+
+    Raises ValueError for a name that is not in `HANDCRAFTED`.
+    """
+    if name not in HANDCRAFTED:
+        raise ValueError(f"no handcrafted method {name!r}; there are {', '.join(HANDCRAFTED)}")
+    method = HANDCRAFTED[name]
+    return _on_images(method, recording, grid) if method.takes == "images" else _on_points(method)
+
+
+def _on_images(method: HandcraftedMethod, recording: Recording, grid: Grid) -> ImageMethod:
+    if recording.has_images:
+        describe, window, about = method.describe_ready_made or method.describe, None, {}
+    else:
+        describe, window, about = method.describe, grid, {"grid": dataclasses.asdict(grid)}
+    return ImageMethod(lambda images: describe(np.asarray(images)), window, {"method": method.name, **about})
+
+
+def _on_points(method: HandcraftedMethod) -> ScanMethod:
+    labels = method.takes == "labelled points"
+
+    def describe_scan(points, classes):
+        return method.describe(points, classes) if labels else method.describe(points)
+
+    return ScanMethod(describe_scan, labels, method.distance_name, {"method": method.name})

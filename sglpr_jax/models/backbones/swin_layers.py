@@ -1,0 +1,179 @@
+"""The layers of a Swin transformer: patch embedding, blocks of window attention, merging and expanding of patches."""
+
+import math
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sglpr_jax.models.backbones.attention import WindowAttention, join_windows, shift_mask, split_windows
+from sglpr_jax.models.layers import LayerNorm, Linear, gelu, torch_uniform
+
+MLP_RATIO = 4
+"""Of the hidden layer of a block's MLP to its channels, in the paper."""
+
+
+class PatchEmbed(nn.Module):
+    """One token for each patch of the image: a convolution whose stride is its kernel, then layer norm."""
+
+    channels: int
+    patch: tuple[int, int] = (4, 4)
+    """Its rows and columns."""
+
+    @nn.compact
+    def __call__(
+        self, image: Float[Array, "b h w c"]
+    ) -> Float[Array, "b h//{self.patch[0]} w//{self.patch[1]} {self.channels}"]:
+        """`c` input channels to `channels`; height and width shrink by the patch's."""
+        bound = (math.prod(self.patch) * image.shape[-1]) ** -0.5
+
+        def bias_init(key, shape, dtype):
+            return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+        size = self.patch
+        tokens = nn.Conv(
+            self.channels,
+            size,
+            size,
+            "VALID",
+            dtype=image.dtype,
+            kernel_init=torch_uniform,
+            bias_init=bias_init,
+            name="projection",
+        )(image)
+        return LayerNorm(name="norm")(tokens)
+
+
+class DropPath(nn.Module):
+    """Stochastic depth: in training drops a whole branch per sample and scales kept ones by 1 / (1 - rate).
+
+    Draws from the random stream `drop_path`.
+    """
+
+    rate: float
+
+    @nn.compact
+    def __call__(self, branch: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w c"]:
+        """Off when `train` is False or the rate is 0."""
+        if not train or self.rate == 0:
+            return branch
+        keep = 1 - self.rate
+        kept = jax.random.bernoulli(self.make_rng("drop_path"), keep, (len(branch), 1, 1, 1))
+        return jnp.where(kept, branch / keep, 0.0)
+
+
+class SwinBlock(nn.Module):
+    """x + attention(norm(x)), then x + mlp(norm(x)); attention inside windows, shifted by half a window if asked.
+
+    An image no larger than the window is one window of its own size, and is not shifted. In a `circular` image the last
+    column is the first one's neighbour. `shift_each_way`: an image that a window spans in one direction only is still
+    shifted in the other; Swin leaves it where it is.
+    """
+
+    heads: int
+    window: int
+    shifted: bool
+    mlp_ratio: int = MLP_RATIO
+    drop_path: float = 0.0
+    circular: bool = False
+    shift_each_way: bool = False
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> Float[Array, "b h w c"]:
+        """Keeps the shape; `train` switches stochastic depth on. Raises ValueError where windows do not fit."""
+        attended = self._attend(LayerNorm(name="attention_norm")(x))
+        x = x + DropPath(self.drop_path)(attended, train=train)
+        hidden = gelu(Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x)))
+        return x + DropPath(self.drop_path)(Linear(x.shape[-1], name="mlp_out")(hidden), train=train)
+
+    def _attend(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
+        _, h, w, _ = x.shape
+        window = min(self.window, h, w)
+        if h % window or w % window:
+            raise ValueError(f"windows of {window} x {window} tokens must tile the map, found {h} x {w} tokens")
+        down, right = self._shift(h, w, window)
+        attention = WindowAttention(self.heads, name="attention")
+        if not (down or right):
+            return join_windows(attention(split_windows(x, window)), h, w)
+        windows = split_windows(jnp.roll(x, (-down, -right), (1, 2)), window)
+        mixed = attention(windows, shift_mask(h, w, window, (down, right), circular=self.circular))
+        return jnp.roll(join_windows(mixed, h, w), (down, right), (1, 2))
+
+    def _shift(self, h: int, w: int, window: int) -> tuple[int, int]:
+        """By how many rows and columns the image is rolled."""
+        if not self.shifted or (min(h, w) <= self.window and not self.shift_each_way):
+            return 0, 0
+        return (window // 2 if h > window else 0), (window // 2 if w > window else 0)
+
+
+class SwinStage(nn.Module):
+    """Blocks at one resolution, every second one shifted; `drop_paths` has a rate for each block."""
+
+    heads: int
+    window: int
+    mlp_ratio: int
+    drop_paths: tuple[float, ...]
+    circular: bool = False
+    shift_each_way: bool = False
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> list[Float[Array, "b h w c"]]:
+        """The output of every block, the stage's own output last."""
+        outputs = []
+        for i, rate in enumerate(self.drop_paths):
+            block = SwinBlock(
+                self.heads,
+                self.window,
+                i % 2 == 1,
+                self.mlp_ratio,
+                rate,
+                self.circular,
+                self.shift_each_way,
+                name=f"block_{i}",
+            )
+            x = block(x, train=train)
+            outputs.append(x)
+        return outputs
+
+
+class PatchMerging(nn.Module):
+    """Halves height and width and doubles the channels."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h//2 w//2 2*c"]:
+        """Joins 2 x 2 tokens in the order (y, x) = (0, 0), (1, 0), (0, 1), (1, 1), then norm, then a linear layer."""
+        b, h, w, c = x.shape
+        quads = x.reshape(b * h // 2, 2, w // 2, 2, c).transpose(0, 2, 3, 1, 4)
+        quads = quads.reshape(b, h // 2, w // 2, 4 * c)
+        return Linear(2 * c, use_bias=False, name="reduction")(LayerNorm(name="norm")(quads))
+
+
+class PatchExpand(nn.Module):
+    """Doubles height and width and halves the channels."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c//2"]:
+        """Each token becomes 2 x 2 tokens."""
+        return _expand(x, factor=2, channels=x.shape[-1] // 2)
+
+
+class FinalPatchExpand(nn.Module):
+    """From patches back to pixels."""
+
+    patch: int = 4
+    channels: int | None = None
+    """None: as many as before."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b {self.patch}*h {self.patch}*w _"]:
+        """Each token becomes patch x patch pixels."""
+        return _expand(x, factor=self.patch, channels=self.channels or x.shape[-1])
+
+
+def _expand(x: Float[Array, "b h w c"], *, factor: int, channels: int) -> Float[Array, "b _ _ _"]:
+    """Linear layer, its outputs read as (row offset, column offset, channel), then norm: layers of the caller."""
+    b, h, w, _ = x.shape
+    tokens = Linear(factor**2 * channels, use_bias=False, name="expand")(x)
+    strips = tokens.reshape(b * h, w, factor, factor * channels).transpose(0, 2, 1, 3)
+    return LayerNorm(name="norm")(strips.reshape(b, h * factor, w * factor, channels))

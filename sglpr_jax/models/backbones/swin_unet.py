@@ -1,0 +1,87 @@
+"""Swin-Unet: an encoder and a decoder of Swin blocks with skip connections."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sglpr_jax.models.backbones.swin_layers import MLP_RATIO, PatchEmbed, PatchExpand, PatchMerging, SwinStage
+from sglpr_jax.models.layers import LayerNorm, Linear
+
+
+def drop_path_rates(depths: tuple[int, ...], rate: float) -> list[tuple[float, ...]]:
+    """Rates of stochastic depth for each encoder stage: from 0 in the first block to `rate` in the last."""
+    rates = np.linspace(0, rate, sum(depths))
+    ends = np.cumsum(depths)
+    return [tuple(rates[end - depth : end].tolist()) for depth, end in zip(depths, ends, strict=True)]
+
+
+class SwinUnet(nn.Module):
+    """Image to one token per patch, before the last expansion to pixels.
+
+    Stage i has embed_dim * 2**i channels. The decoder mirrors the encoder, its depths, heads and drop path included. A
+    `circular` image's left and right borders are neighbours, as those of a polar image are.
+    """
+
+    embed_dim: int
+    depths: tuple[int, ...]
+    heads: tuple[int, ...]
+    window: int
+    mlp_ratio: int = MLP_RATIO
+    patch: int = 4
+    drop_path: float = 0.0
+    circular: bool = False
+    shift_each_way: bool = False
+    """Whether windows that span the map in one direction are still shifted in the other."""
+
+    @nn.compact
+    def __call__(
+        self, image: Float[Array, "b h w c"], *, train: bool = False
+    ) -> tuple[Float[Array, "b h//{self.patch} w//{self.patch} {self.embed_dim}"], dict[str, Float[Array, "b _ _ _"]]]:
+        """Tokens, and the intermediates by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
+        stages = [
+            {
+                "heads": heads,
+                "window": self.window,
+                "mlp_ratio": self.mlp_ratio,
+                "drop_paths": rates,
+                "circular": self.circular,
+                "shift_each_way": self.shift_each_way,
+            }
+            for heads, rates in zip(self.heads, drop_path_rates(self.depths, self.drop_path), strict=True)
+        ]
+        x = PatchEmbed(self.embed_dim, (self.patch, self.patch), name="patch_embed")(image)
+        seen = {"patch_embed": x}
+        x = self._encode(x, stages, seen, train)
+        x = seen["bottleneck_norm"] = LayerNorm(name="norm")(x)
+        x = self._decode(x, stages, seen, train)
+        x = seen["norm_up"] = LayerNorm(name="norm_up")(x)
+        return x, seen
+
+    def _encode(self, x, stages: list[dict], seen: dict, train: bool):
+        for i, stage in enumerate(stages):
+            seen[f"skip{i}"] = x
+            x = _run_stage(x, f"encoder_{i}", stage, seen, f"enc{i}", train)
+            if i < len(stages) - 1:
+                x = PatchMerging(name=f"encoder_{i}_merge")(x)
+            seen[f"enc{i}_out"] = x
+        return x
+
+    def _decode(self, x, stages: list[dict], seen: dict, train: bool):
+        """Decoder stage i works at the resolution of encoder stage `level`; stage 0 only expands the bottleneck."""
+        for i, level in enumerate(reversed(range(len(stages)))):
+            if i > 0:
+                x = jnp.concatenate([x, seen[f"skip{level}"]], axis=-1)
+                x = Linear(self.embed_dim * 2**level, name=f"decoder_{i}_fuse")(x)
+                seen[f"dec{i}_concat_linear"] = x
+                x = _run_stage(x, f"decoder_{i}", stages[level], seen, f"dec{i}", train)
+            if level > 0:
+                x = PatchExpand(name=f"decoder_{i}_expand")(x)
+            seen[f"dec{i}_out"] = x
+        return x
+
+
+def _run_stage(x, name: str, stage: dict, seen: dict, label: str, train: bool):
+    outputs = SwinStage(**stage, name=name)(x, train=train)
+    seen.update({f"{label}_block{i}": output for i, output in enumerate(outputs)})
+    return outputs[-1]

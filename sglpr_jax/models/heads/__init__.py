@@ -1,0 +1,1 @@
+"""From feature maps to a descriptor, or to classes."""

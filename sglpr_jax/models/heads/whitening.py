@@ -1,0 +1,20 @@
+"""The last layer of a place head whose descriptors spread along few directions; models/whitening.py fits it."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sglpr_jax.models.layers import l2_normalize
+
+
+class Whitening(nn.Module):
+    """A linear layer and L2 normalisation; the identity until it is fitted."""
+
+    @nn.compact
+    def __call__(self, descriptor: Float[Array, "b d"]) -> Float[Array, "b d"]:
+        """Descriptors of length 1."""
+        d = descriptor.shape[-1]
+        kernel = self.param("kernel", lambda key, shape: jnp.eye(*shape), (d, d))
+        bias = self.param("bias", nn.initializers.zeros, (d,))
+        return l2_normalize(jnp.matmul(descriptor, kernel, precision=jax.lax.Precision.HIGHEST) + bias[None])

@@ -1,0 +1,60 @@
+"""Weights by name: which ones a model has, parts of them, and one number for all of them."""
+
+import dataclasses
+import hashlib
+from typing import Any
+
+import flax.traverse_util
+import jax
+import numpy as np
+
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import init
+
+
+def by_name(weights: Any) -> dict[str, Any]:
+    """A flat dictionary of weights, named like `backbone/encoder_0/block_1/mlp_in/kernel`."""
+    return flax.traverse_util.flatten_dict(weights, sep="/")
+
+
+def as_tree(named: dict[str, Any]) -> Any:
+    """The inverse of `by_name`."""
+    return flax.traverse_util.unflatten_dict(named, sep="/")
+
+
+def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """The shape of every weight that the configuration asks for; nothing is computed."""
+    fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
+    return {name: leaf.shape for name, leaf in by_name(fresh.weights).items()}
+
+
+def graft(given: Params, fresh: Params) -> Params:
+    """`fresh` with the values of `given` wherever that has them: to train on from weights handed out.
+
+    Raises ValueError where `given` has a weight that `fresh` has not, or one of another shape.
+    """
+    all_of_them, values = by_name(fresh.weights), by_name(given.weights)
+    for name, value in values.items():
+        if name not in all_of_them or all_of_them[name].shape != value.shape:
+            wanted = all_of_them[name].shape if name in all_of_them else "no such weight"
+            raise ValueError(f"cannot begin with these weights: {name} has shape {value.shape}, expected {wanted}")
+    return dataclasses.replace(fresh, weights=as_tree(all_of_them | values))
+
+
+def for_places(params: Params) -> Params:
+    """The part that `describe` computes with, to hand out: no segmentation head and nothing that feeds it alone."""
+    if not params.config.segments:
+        return params
+    config = dataclasses.replace(params.config, categories=0)
+    values = by_name(params.weights)
+    return Params(as_tree({name: values[name] for name in weight_shapes(config)}), config)
+
+
+def weights_hash(params: Params) -> str:
+    """SHA-256 over names, shapes and values of all weights, so that a result can say which weights made it."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(by_name(params.weights).items()):
+        digest.update(f"{name} {leaf.shape} {leaf.dtype}".encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,59 @@
+"""What can be known to be wrong with a reproduction before anything is trained for it."""
+
+from collections.abc import Sequence
+
+from sglpr_jax.data import recording_names
+from sglpr_jax.evaluation import figures
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.reproduce.experiments import EXPERIMENTS
+from sglpr_jax.reproduce.runs import Runs
+
+
+def check(runs: Runs, names: Sequence[str], seqs: Sequence[str], methods: Sequence[str]) -> None:
+    """Raise ValueError for an unknown method, recordings without poses, points or labels where they are needed, or no
+    second recording to train on; ImportError for figures without matplotlib."""
+    if not names:
+        raise ValueError(f"expected tables or figures, found none; there are all, {', '.join(EXPERIMENTS)}")
+    if not seqs:
+        found = ", ".join(recording_names(runs.data))
+        raise ValueError(f"{runs.data}: expected recordings named as the paper's, found {found}; name yours with --seq")
+    if any(EXPERIMENTS[name].kind == "figure" for name in names) and not figures.can_draw():
+        raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
+    _check_recordings(runs, seqs)
+    for name in names:
+        _check_labels(runs, name)
+        if EXPERIMENTS[name].beside_handcrafted:
+            _check_methods(runs, seqs, methods)
+
+
+def _check_recordings(runs: Runs, seqs: Sequence[str]) -> None:
+    recordings = recording_names(runs.data)
+    if len(recordings) < 2:
+        raise ValueError(
+            f"{runs.data}: expected two recordings or more, to train and test on, found {', '.join(recordings)}"
+        )
+    for seq in (*seqs, *recordings):
+        if runs.recording(seq).positions is None:
+            raise ValueError(f"{runs.data}: sequence {seq} has no poses; training and scoring need them")
+
+
+def _check_labels(runs: Runs, name: str) -> None:
+    """Without labels a segmentation branch has nothing to learn: tables that compare it would compare nothing."""
+    if not EXPERIMENTS[name].needs_labels:
+        return
+    for seq in recording_names(runs.data):
+        if not runs.recording(seq).has_labels:
+            raise ValueError(f"{name} is about semantics: expected labels in sequence {seq} of {runs.data}, found none")
+
+
+def _check_methods(runs: Runs, seqs: Sequence[str], methods: Sequence[str]) -> None:
+    for name in methods:
+        if name not in HANDCRAFTED:
+            raise ValueError(f"no handcrafted method {name!r}; there are {', '.join(HANDCRAFTED)}")
+        needs = HANDCRAFTED[name].takes
+        for seq in seqs:
+            recording = runs.recording(seq)
+            if needs != "images" and recording.has_images:
+                raise ValueError(f"{name} needs points, found images in sequence {seq}; leave it out of --method")
+            if needs == "labelled points" and not recording.has_labels:
+                raise ValueError(f"{name} needs labels, found none in sequence {seq}; leave it out of --method")

@@ -1,0 +1,136 @@
+"""The paper's experiments as data: which variants of the model each table and figure compares."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from sglpr_jax.training.config import TrainConfig, without_untrained_head
+
+FULL = "full"
+NO_SEGMENTATION = "no-segmentation"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to train: what a table calls it, and how its configuration differs from the preset's."""
+
+    label: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of TrainConfig by their dotted names, as on the command line of bin/train."""
+
+
+VARIANTS: dict[str, Variant] = {
+    FULL: Variant("SG-LPR"),
+    "no-rotation": Variant("SG-LPR, not rotated in training", {"rotate": False}),
+    "convolutions": Variant("convolutions", {"model.head.cbam": False, "model.head.pooling": "mean"}),
+    "no-cbam": Variant("convolutions, NetVLAD", {"model.head.cbam": False}),
+    NO_SEGMENTATION: Variant("no segmentation branch", {"model.categories": 0}),
+    "counts": Variant("RB: counts", {"model.head.input": "counts"}),
+    "labels": Variant("RS: labels", {"model.head.input": "labels"}),
+    "counts-and-labels": Variant("RB+RS: counts and labels", {"model.head.input": "counts+labels"}),
+    "no-dice": Variant("triplet, cross-entropy", {"loss.dice_weight": 0.0}),
+    "no-cross-entropy": Variant("triplet, Dice", {"loss.ce_weight": 0.0}),
+    "raw-counts": Variant("counts as they are", {"model.counts": "raw"}),
+    "clipped-counts": Variant("min(n, 10) / 10", {"model.counts": "clipped"}),
+    **{f"categories-{n}": Variant(f"{n} categories", {"model.categories": n}) for n in (6, 15, 25, 34)},
+}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A table or figure: what it shows, and the variants that must be trained for it."""
+
+    kind: Literal["table", "figure"]
+    title: str
+    variants: tuple[str, ...] = (FULL,)
+    labels: tuple[str, ...] = ()
+    """What this experiment calls its variants, where it is not `Variant.label`."""
+    rotated: bool = False
+    """Every scan of the test recordings is rotated by its own random angle."""
+    beside_handcrafted: bool = False
+    """Whether handcrafted methods stand beside the variants."""
+    across_sessions: bool = False
+    """Tested on sessions of another dataset, so that one model serves: the one trained without the first recording."""
+    needs_labels: bool = False
+    """It compares what is learned from labels, or draws them."""
+
+    def names(self) -> dict[str, str]:
+        """The label of each variant, by the variant's name."""
+        labels = self.labels or tuple(VARIANTS[name].label for name in self.variants)
+        return dict(zip(self.variants, labels, strict=True))
+
+
+_WITH_FIGURE_9 = ("categories-6", "categories-15", FULL, "categories-25", "categories-34")
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "table1": Experiment("table", "F1max beside other methods", beside_handcrafted=True),
+    "table2": Experiment(
+        "table", "F1max, every scan rotated", (FULL, "no-rotation"), rotated=True, beside_handcrafted=True
+    ),
+    "table3": Experiment(
+        "table",
+        "Recall@1 across NCLT sessions, trained on other recordings",
+        beside_handcrafted=True,
+        across_sessions=True,
+    ),
+    "table4": Experiment(
+        "table",
+        "CBAM and NetVLAD",
+        ("convolutions", "no-cbam", FULL),
+        ("convolutions", "convolutions, NetVLAD", "convolutions, CBAM, NetVLAD"),
+    ),
+    "table5": Experiment(
+        "table", "The segmentation branch", (NO_SEGMENTATION, FULL), ("without", "with"), needs_labels=True
+    ),
+    "table6": Experiment(
+        "table",
+        "Input of the place head",
+        ("counts", "labels", "counts-and-labels", FULL),
+        ("RB: counts", "RS: labels", "RB+RS: counts and labels", "HS: features"),
+        needs_labels=True,
+    ),
+    "table7": Experiment(
+        "table",
+        "Terms of the loss",
+        (NO_SEGMENTATION, "no-dice", "no-cross-entropy", FULL),
+        ("triplet", "triplet, cross-entropy", "triplet, Dice", "triplet, cross-entropy, Dice"),
+        needs_labels=True,
+    ),
+    "figure5": Experiment("figure", "Precision and recall", beside_handcrafted=True),
+    "figure6": Experiment("figure", "Top-1 retrieval along the trajectory"),
+    "figure7": Experiment("figure", "Counts, true and predicted semantic maps", needs_labels=True),
+    "figure8": Experiment(
+        "figure",
+        "Feature heat maps with and without the segmentation branch",
+        (FULL, NO_SEGMENTATION),
+        across_sessions=True,
+        needs_labels=True,
+    ),
+    "figure9": Experiment(
+        "figure",
+        "Number of semantic categories",
+        (NO_SEGMENTATION, *_WITH_FIGURE_9),
+        ("0", "6", "15", "20", "25", "34"),
+        needs_labels=True,
+    ),
+    "normalisation": Experiment(
+        "table",
+        "Point counts as input (not in the paper)",
+        ("raw-counts", "clipped-counts", FULL),
+        ("n", "min(n, 10) / 10", "log(1 + n)"),
+    ),
+}
+
+
+def variant_config(preset: TrainConfig, variant: str) -> TrainConfig:
+    """The preset with the changes of a variant."""
+    config = preset
+    for name, value in VARIANTS[variant].changes.items():
+        config = _with_field(config, name.split("."), value)
+    return without_untrained_head(config)
+
+
+def _with_field(config: Any, path: list[str], value: Any) -> Any:
+    name, *rest = path
+    return dataclasses.replace(config, **{name: _with_field(getattr(config, name), rest, value) if rest else value})

@@ -1,0 +1,117 @@
+"""The trained models and descriptors behind the tables: made where they are missing, kept in one folder per run."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from sglpr_jax.data import Recording, open_recording, recording_names
+from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION
+from sglpr_jax.data.readers.kitti import PoseChoice
+from sglpr_jax.evaluation.learning_curves import LearningCurves
+from sglpr_jax.files import write_json
+from sglpr_jax.methods.method import Method
+from sglpr_jax.methods.registry import handcrafted, network
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights_file import load
+from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.reuse import embed_or_reuse
+from sglpr_jax.training.callbacks import Callbacks
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.progress_bar import ProgressBar
+from sglpr_jax.training.recipe import TrainResult, train
+from sglpr_jax.training.run_folder import require_same_settings
+
+ROTATION_SEED = 0
+BATCH = 16
+DONE_FILE = "trained.json"
+WITHOUT_TRAINING = "without-training"
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Leave-one-out runs: `folder`/VARIANT/SEQ has one model, trained on all recordings of `data` but SEQ."""
+
+    folder: Path
+    data: Path
+    preset: str
+    config: TrainConfig
+    pose_source: PoseChoice = "auto"
+    progress: Progress = no_progress
+    """Shows how far an embedding is."""
+
+    def config_of(self, variant: str) -> TrainConfig:
+        """How a variant is trained."""
+        return variant_config(self.config, variant)
+
+    def is_trained(self, variant: str, seq: str) -> bool:
+        """Whether nothing is left to train of a run. Raises ValueError where it was made with other settings."""
+        folder = self._folder(variant, seq)
+        if not folder.exists():
+            return False
+        require_same_settings(folder, self.config_of(variant), self._settings(seq))
+        done = folder / DONE_FILE
+        steps = json.loads(done.read_text())["steps"] if done.is_file() else 0
+        if steps > self.config.steps:
+            raise ValueError(f"{folder}: expected a run of up to {self.config.steps} steps, found {steps}")
+        return steps == self.config.steps
+
+    def train(self, variant: str, seq: str, *, stopped: Callable[[], bool] = lambda: False) -> TrainResult:
+        """Train what is missing of a run. Raises ValueError where it was begun with other settings."""
+        folder = self._folder(variant, seq)
+        result = train(
+            self.config_of(variant),
+            self.recordings_but(seq),
+            out=folder,
+            test=self.recording(seq),
+            resume=folder.exists(),
+            callback=Callbacks(ProgressBar(), LearningCurves(folder)),
+            stopped=stopped,
+            settings=self._settings(seq),
+        )
+        if result.finished:
+            write_json(folder / DONE_FILE, {"steps": self.config.steps})
+        return result
+
+    def params(self, variant: str, seq: str) -> Params:
+        """The weights of a finished run."""
+        return load(self._folder(variant, seq))
+
+    def recording(self, seq: str) -> Recording:
+        """A recording of the dataset."""
+        return open_recording(self.data, seq, pose_source=self.pose_source)
+
+    def recordings_but(self, seq: str) -> list[Recording]:
+        """The recordings that the runs for `seq` train on."""
+        return [self.recording(name) for name in recording_names(self.data) if name != seq]
+
+    def descriptors(
+        self, method: str, seq: str, *, of: Recording | None = None, rotated: bool = False
+    ) -> DescriptorFile:
+        """What a method says of the recording `seq`, or `of` another; a variant's model was trained without `seq`."""
+        recording = of or self.recording(seq)
+        folder = self._folder(method, seq) if method in VARIANTS else self.folder / WITHOUT_TRAINING / method
+        (folder / "descriptors").mkdir(parents=True, exist_ok=True)
+        corruption = ROTATION if rotated else CLEAN
+        described_by = network(self.params(method, seq)) if method in VARIANTS else self._handcrafted(method, recording)
+        return embed_or_reuse(
+            folder / "descriptors" / f"{recording.name}-{corruption.name}.npz",
+            described_by,
+            recording,
+            corruption,
+            seed=ROTATION_SEED,
+            batch=BATCH,
+            title=f"embed {method} {recording.name}",
+            progress=self.progress,
+        )
+
+    def _handcrafted(self, method: str, recording: Recording) -> Method:
+        return handcrafted(method, recording, self.config.model.grid)
+
+    def _settings(self, seq: str) -> dict[str, str]:
+        return {"seq": seq, "data": str(self.data), "preset": self.preset, "pose_source": self.pose_source}
+
+    def _folder(self, variant: str, seq: str) -> Path:
+        return self.folder / variant / seq

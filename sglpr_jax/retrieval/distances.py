@@ -1,0 +1,54 @@
+"""How two descriptors are compared, by the name that a descriptor file records (`DescriptorFile.distance`).
+
+Every function takes queries (q, d) and a database (n, d), float32, and returns the distances (q, n), float32, smaller
+for places more alike. It is a pure function, works in blocks so that it needs little memory beside the result, and
+knows from its method what the numbers of a row are.
+"""
+
+import difflib
+
+import numpy as np
+from jaxtyping import Float32
+
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.method import DistanceFn
+from sglpr_jax.methods.pairwise import in_blocks
+
+BLOCK = 1024
+
+
+def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
+    """Return the Euclidean distances |q - d|. Sums are taken in float64: near zero the squares cancel."""
+
+    def compare(queries, database):
+        squares = np.sum(queries**2, axis=1)[:, None] + np.sum(database**2, axis=1)[None, :]
+        return np.sqrt(np.maximum(squares - 2 * queries @ database.T, 0))
+
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=lambda rows: rows.astype(np.float64))
+
+
+def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
+    """Return 1 - q . d / (|q| |d|), from 0 to 2; 1 where either is zero."""
+
+    def unit(rows):
+        lengths = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
+        return np.divide(rows, lengths, out=np.zeros(rows.shape), where=lengths > 0)
+
+    return in_blocks(lambda q, d: 1 - q @ d.T, queries, database, block=BLOCK, prepare=unit)
+
+
+DISTANCES: dict[str, DistanceFn] = {
+    "l2": l2,
+    "cosine": cosine,
+    **{name: method.distance for name, method in HANDCRAFTED.items() if method.distance is not None},
+}
+"""Every distance by its name."""
+
+
+def distance_function(name: str) -> DistanceFn:
+    """Return the distance called `name`. Raises ValueError with the names there are and the nearest of them."""
+    if name not in DISTANCES:
+        near = difflib.get_close_matches(name, DISTANCES, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise ValueError(f"expected a distance among {', '.join(DISTANCES)}, found {name!r}{hint}")
+    return DISTANCES[name]

@@ -1,0 +1,100 @@
+"""Which places look most like a query: exact nearest neighbours among descriptors, as their method compares them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import distance_function
+
+BLOCK = 512
+"""Queries compared with the whole database at a time."""
+SHOWN = 10
+"""Queries of which a printed result tells the answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """The nearest k places of every query, nearest first."""
+
+    queries: DescriptorFile
+    database: DescriptorFile
+    rows: Int[np.ndarray, "q k"]
+    """Which of the database; -1 where fewer than k may be answers."""
+    distances: Float32[np.ndarray, "q k"]
+    """Of the descriptors; infinite there."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def ids(self, query: int | np.integer) -> tuple[str, ...]:
+        """The names of the places found for a query, nearest first."""
+        return tuple(self.database.ids[row] for row in self.rows[query] if row >= 0)
+
+    def __str__(self) -> str:
+        """The nearest place of the queries that are least far from it."""
+        found = int((self.rows[:, 0] >= 0).sum())
+        best = np.argsort(self.distances[:, 0], kind="stable")[: min(SHOWN, found)]
+        lines = (f"{self.queries.ids[q]} -> {self.ids(q)[0]}  {self.distances[q, 0]:.4f}" for q in best)
+        where = f"{self.queries.sequence} in {self.database.sequence}"
+        return "\n".join([f"{found} of {len(self)} queries of {where} have an answer; the surest:", *lines])
+
+
+def nearest(
+    queries: DescriptorFile,
+    database: DescriptorFile | None = None,
+    *,
+    k: int = 1,
+    exclude_frames: int = 50,
+    exclude_s: float = 0.0,
+) -> Nearest:
+    """Find the nearest `k` places of every query by the distance that their descriptor files name.
+
+    Without a `database` a query looks among the frames before it in its own recording, of which the last
+    `exclude_frames` and those less than `exclude_s` seconds old are left out: they show where it still is. Equally near
+    places come in the order of the database. Raises ValueError where the two files' descriptors cannot be compared, and
+    for seconds where there are no times.
+
+    Example:
+      print(nearest(file))              # places that one recording comes back to
+      print(nearest(today, yesterday))  # the places of one session in another
+    """
+    own, database = database is None, queries if database is None else database
+    _check(queries, database, k, exclude_s if own else 0.0)
+    compare = distance_function(queries.distance)
+    k_there = min(k, len(database))
+    rows = np.full((len(queries), k), -1)
+    distances = np.full((len(queries), k), np.inf, np.float32)
+    for start in range(0, len(queries), BLOCK):
+        block = np.arange(start, min(start + BLOCK, len(queries)))
+        found = compare(queries.descriptors[block], database.descriptors)
+        if own:
+            found = np.where(_old_enough(queries, block, exclude_frames, exclude_s), found, np.float32(np.inf))
+        order = np.argsort(found, axis=1, kind="stable")[:, :k_there]
+        distances[block, :k_there] = np.take_along_axis(found, order, axis=1)
+        rows[block, :k_there] = np.where(np.isfinite(distances[block, :k_there]), order, -1)
+    return Nearest(queries, database, rows, distances)
+
+
+def _old_enough(
+    file: DescriptorFile, block: Int[np.ndarray, " q"], frames: int, seconds: float
+) -> Bool[np.ndarray, "q n"]:
+    """Which frames may be answers to the queries `block` of the same recording."""
+    allowed = np.arange(len(file))[None, :] < block[:, None] - max(frames, 0)
+    if seconds > 0 and file.times is not None:
+        allowed &= file.times[block, None] - file.times[None, :] >= seconds
+    return allowed
+
+
+def _check(queries: DescriptorFile, database: DescriptorFile, k: int, seconds: float) -> None:
+    ours, theirs = ((file.distance, file.descriptors.shape[1]) for file in (queries, database))
+    if ours != theirs:
+        raise ValueError(
+            f"expected descriptors of {ours[1]} numbers compared by {ours[0]}, as those of {queries.sequence}, found "
+            f"{theirs[1]} numbers compared by {theirs[0]} in {database.sequence}"
+        )
+    if k < 1:
+        raise ValueError(f"expected k of 1 or more, found {k}")
+    if seconds > 0 and queries.times is None:
+        raise ValueError(f"sequence {queries.sequence}: expected times to leave out seconds by, found none")

@@ -1,0 +1,83 @@
+"""Descriptor files of a method and a corruption, used again only if they were made with the same settings."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from sglpr_jax.data import Recording
+from sglpr_jax.data.corruption.corrupted import corrupted
+from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION, Corruption
+from sglpr_jax.methods.method import Method
+from sglpr_jax.progress import Progress, no_progress
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.embed import embed
+
+SETTINGS = "made_with"
+"""The key of a descriptor file's `config` under which they stand."""
+
+
+def embed_or_reuse(
+    path: Path,
+    method: Method,
+    recording: Recording,
+    corruption: Corruption,
+    *,
+    seed: int,
+    batch: int,
+    title: str = "",
+    progress: Progress = no_progress,
+) -> DescriptorFile:
+    """Describe the corrupted recording and write the file; read it where it is there already.
+
+    `progress` shows under the `title` how many scans are done. Raises ValueError where the file was made with other
+    settings, on other scans or with other weights.
+    """
+    wanted = _settings(method, recording, corruption, seed)
+    if path.exists():
+        return _checked(path, wanted)
+    rotated = corruption == ROTATION
+    source = recording if rotated or corruption == CLEAN else corrupted(recording, corruption, seed=seed)
+    with progress(title, len(recording)) as show:
+        file = embed(method, source, rotation_seed=seed if rotated else None, batch=batch, on_progress=show)
+    file = dataclasses.replace(file, config={**file.config, SETTINGS: wanted})
+    file.save(path)
+    return file
+
+
+def fingerprint(recording: Recording) -> str:
+    """Name what a recording holds without reading its scans: their ids, the sizes of their files, the positions."""
+    digest = hashlib.sha256(json.dumps([recording.ids, [path.stat().st_size for path in recording.paths]]).encode())
+    if recording.positions is not None:
+        digest.update(recording.positions.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _settings(method: Method, recording: Recording, corruption: Corruption, seed: int) -> dict[str, Any]:
+    settings = {
+        "seed": None if corruption == CLEAN else seed,
+        "scans": fingerprint(recording),
+        "poses": recording.pose_source,
+        "corruption": dataclasses.asdict(corruption),
+        "weights": method.weights_hash,
+        "method": method.about,
+    }
+    return json.loads(json.dumps(settings))  # as it will be read again: lists in place of tuples
+
+
+def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
+    file = DescriptorFile.load(path)
+    found = file.config.get(SETTINGS, {})
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise ValueError(
+                f"{path}: expected descriptors made with {name} {_short(value)}, found {_short(found.get(name))}; "
+                "name another --out, or delete the file"
+            )
+    return file
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."

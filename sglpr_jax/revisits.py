@@ -1,0 +1,81 @@
+"""Revisits: which frames have a place of their own past, or of a database, near them."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from sglpr_jax.poses import POSITIVE_M, distances
+
+EXCLUDED_S = 30.0
+"""A query is never matched with frames younger than this: they are neighbours, not a revisit."""
+EXCLUDED_FRAMES = 290
+"""What stands for EXCLUDED_S where a sequence has no times: 30 s at KITTI's 9.6 scans a second."""
+
+BLOCK = 32
+"""Queries whose positions are compared at a time: so few that the distances stay in the cache."""
+
+Near = Callable[[Float[np.ndarray, "..."]], Bool[np.ndarray, "..."]]
+"""From distances in metres to whether they are those of one place, such as `lambda apart: apart < 5`."""
+
+
+def close_pairs(positions: Float[np.ndarray, "n d"], *, closer_than_m: float) -> Int[np.ndarray, "pairs 2"]:
+    """Return every pair of frames less than so many metres apart, each once and in no order."""
+    return KDTree(positions).query_pairs(np.nextafter(closer_than_m, 0), output_type="ndarray")
+
+
+def database_end(
+    n: int,
+    *,
+    times: Float[np.ndarray, " n"] | None = None,
+    excluded_s: float = EXCLUDED_S,
+    excluded_frames: int = EXCLUDED_FRAMES,
+) -> Int[np.ndarray, " n"]:
+    """Return for each of `n` frames as a query how many of the first frames are its database; 0: it is no query.
+
+    The rule is LoGG3D-Net's. A frame in the first `excluded_s` seconds is no query. The database of any other query at
+    time t is frames `[:k + 1]`, k being the first frame with a time > t - `excluded_s`; so one frame in it is a little
+    younger than `excluded_s`. Without `times` (seconds) the frame number is the clock and `excluded_frames` the limit.
+
+    Raises ValueError where times are not finite or run backwards.
+    """
+    clock, excluded = (np.arange(n, dtype=np.float64), excluded_frames) if times is None else (times, excluded_s)
+    if not np.all(np.isfinite(clock)) or np.any(np.diff(clock) < 0):
+        raise ValueError("expected finite times that never decrease, found others")
+    if n == 0:
+        return np.zeros(0, dtype=np.int64)
+    first_younger = np.searchsorted(clock, clock - excluded, side="right")
+    return np.where(clock - clock[0] < excluded, 0, np.minimum(first_younger + 1, np.arange(n)))
+
+
+def has_near(
+    queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], ends: Int[np.ndarray, " q"], near: Near
+) -> Bool[np.ndarray, " q"]:
+    """Return whether each query is a revisit: it has a near position among the first `ends` of the database."""
+    found = np.zeros(len(queries), dtype=bool)
+    for start in range(0, len(queries), BLOCK):
+        rows = slice(start, start + BLOCK)
+        last = ends[rows].max()
+        close = near(distances(queries[rows], database[:last]))
+        found[rows] = np.any(close & (np.arange(last) < ends[rows, None]), axis=1)
+    return found
+
+
+def revisits(
+    positions: Float[np.ndarray, "n d"],
+    *,
+    times: Float[np.ndarray, " n"] | None = None,
+    radius_m: float = POSITIVE_M,
+    excluded_s: float = EXCLUDED_S,
+    excluded_frames: int = EXCLUDED_FRAMES,
+) -> Bool[np.ndarray, " n"]:
+    """Return for each frame whether its database (see `database_end`) holds a frame within `radius_m` metres.
+
+    `positions` with three columns give the revisits in 3-D, their first two columns alone those in 2-D.
+    """
+    ends = database_end(len(positions), times=times, excluded_s=excluded_s, excluded_frames=excluded_frames)
+    queries = np.flatnonzero(ends)
+    revisited = np.zeros(len(positions), dtype=bool)
+    revisited[queries] = has_near(positions[queries], positions, ends[queries], lambda apart: apart <= radius_m)
+    return revisited

@@ -1,0 +1,127 @@
+"""A simulated drive as a recording whose scans are rendered when they are asked for: nothing lies on disk."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.sim.drive import (
+    RATE_HZ,
+    PlanarPath,
+    TimedPoses,
+    body_tilt,
+    drive_seed,
+    every_kth,
+    name_of_path,
+    plan_path,
+    poses_on,
+    read_path,
+    speeds,
+)
+from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
+from sglpr_jax.sim.world import World, build_world
+
+KEPT_SCANS = 8
+"""The last ones rendered, so that asking for a scan's points and then for its labels costs one rendering."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRecording(Recording):
+    """A recording whose scans, all with labels, are rendered on demand; `paths` and `label_paths` name no files."""
+
+    poses: TimedPoses = field(kw_only=True)
+    """Where the LiDAR was at every scan, and when."""
+    render: Callable[[int], tuple[np.ndarray, np.ndarray]] = field(kw_only=True)
+    """Points (n, 4) with intensities and labels (n,) of scan i, the same on every call; do not change them in place."""
+
+
+def simulate_recording(
+    name: str = "00",
+    *,
+    along: Path | None = None,
+    scans: int = 300,
+    sensor: Sensor = HDL64E,
+    seed: int = 0,
+    rate_hz: float = RATE_HZ,
+) -> SimulatedRecording:
+    """Build the town around a drive and return its recording: along route `name`, or along the pose file `along`.
+
+    Takes some seconds; every scan then takes some hundredths of one. Of a pose file with more than `scans` lines every
+    k-th is taken, and `rate_hz` is not used. The scans are those that `write_dataset` writes for the same arguments.
+
+    Raises ValueError for an unknown route; for the errors of a pose file see `read_path`.
+    """
+    if along is not None:
+        name = name_of_path(along)
+        path = read_path(along)
+    else:
+        rng = np.random.default_rng((*drive_seed(seed, name), 1))
+        path = plan_path(rng, name, scans=scans, rate_hz=rate_hz)
+    seeds = drive_seed(seed, name)
+    world = build_world(seeds, path.xy, path.times)
+    rows = np.arange(len(path.times))[every_kth(path, scans)]
+    return drive_through(
+        world,
+        path,
+        rows,
+        name=name,
+        ids=tuple(f"{i:06d}" for i in range(len(rows))),
+        times=path.times[rows],
+        sensor=sensor,
+        key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
+        rng=np.random.default_rng((*seeds, 2)),
+    )
+
+
+def drive_through(
+    world: World,
+    path: PlanarPath,
+    rows: Int[np.ndarray, " n"],
+    *,
+    name: str,
+    ids: tuple[str, ...],
+    times: Float[np.ndarray, " n"],
+    sensor: Sensor,
+    key: PRNGKeyArray,
+    rng: np.random.Generator,
+) -> SimulatedRecording:
+    """Return the recording `name` of a drive through a town, with a scan at each of these `rows` of `path`.
+
+    `ids` and `times` (seconds) are what the scans are called and when they are said to be taken; the town's own clock
+    is that of `path`. `key` draws what the sensor measures, `rng` how the vehicle's body tilts.
+    """
+    xy, yaw, clock = (values[rows] for values in path)
+    tilt = body_tilt(rng, clock)
+    poses = TimedPoses(poses_on(world.ground.relief, xy, yaw, height_m=sensor.height_m, tilt=tilt), times)
+    speed = speeds(path)[rows]
+    row_of = {scan_id: i for i, scan_id in enumerate(ids)}
+
+    @functools.lru_cache(maxsize=KEPT_SCANS)
+    def render(i: int) -> tuple[np.ndarray, np.ndarray]:
+        pose, velocity = poses.world_from_lidar[i], np.array([speed[i], 0, 0])
+        return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(clock[i]), velocity=velocity)
+
+    def read(path: Path, label_path: Path | None, lasers: bool) -> Record:
+        points, labels = render(row_of[path.name])
+        return Record(points=points[:, :3], labels=None if label_path is None else labels)
+
+    names = tuple(Path(scan_id) for scan_id in ids)
+    return SimulatedRecording(
+        name=name,
+        ids=ids,
+        positions=poses.world_from_lidar[:, :3, 3],
+        times=times,
+        pose_source="simulation",
+        paths=names,
+        label_paths=names,
+        read=read,
+        on_disk=False,
+        poses=poses,
+        render=render,
+    )

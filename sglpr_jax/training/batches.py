@@ -1,0 +1,90 @@
+"""The batches of a training: tuples of places of recordings, of one dataset or of two."""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sglpr_jax.data import Recording
+from sglpr_jax.data.sampling.batch import Batch, read_batch
+from sglpr_jax.data.sampling.mixing import mix
+from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.models.params import Params
+from sglpr_jax.training.batch_queue import BatchSource
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.hosts import own_part
+from sglpr_jax.training.mining import Mining
+
+
+def tuple_pool(
+    recordings: Sequence[Recording], config: TrainConfig, *, frames: Sequence[Int[np.ndarray, "_"]] | None = None
+) -> TuplePool:
+    """The tuples of the places of recordings, or of their `frames`. Raises ValueError where there are none."""
+    return TuplePool([positions_of(recording) for recording in recordings], config.sampling, frames=frames)
+
+
+def positions_of(recording: Recording) -> Float[np.ndarray, "n 3"]:
+    """The positions of a recording, metres. Raises ValueError where it has none."""
+    if recording.positions is None:
+        raise ValueError(f"sequence {recording.name} has no poses; training and testing need them")
+    return recording.positions
+
+
+class TupleBatches(BatchSource):
+    """Batches of tuples of `pool`, read from `recordings`; the recordings of `also` have `also_tuples` of a step's.
+
+    With `mining` the negatives are those that look alike to the network as it was at the last refresh.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        pool: TuplePool,
+        config: TrainConfig,
+        *,
+        also: Sequence[Recording] = (),
+        mining: Mining | None = None,
+    ):
+        self._recordings, self._pool, self._config, self._mining = recordings, pool, config, mining
+        self._also, self._also_pool = also, tuple_pool(also, config) if also else None
+        self._tuples = config.tuples - config.also_tuples
+        self.refresh_steps = config.sampling.refresh_steps if mining else 0
+
+    def batch(self, step: int) -> Batch:
+        """Return this host's part of the batch of a step."""
+        config, read = self._config, self._read_batch()
+        main = read(self._recordings, self._pool, self._frames(step), part=own_part(self._tuples))
+        if self._also_pool is None:
+            return main
+        draw = self._also_pool.draw if config.also_triplets else self._also_pool.draw_places
+        second = read(self._also, self._also_pool, draw(seed=config.seed, step=step, tuples=config.also_tuples))
+        return mix(main, second, triplets=config.also_triplets, share_negatives=config.share_negatives)
+
+    def refresh(self, step: int, params: Params) -> None:
+        """Find out anew which places look alike."""
+        if self._mining is not None:
+            self._mining.refresh(step, params)
+
+    def places(self, step: int) -> str:
+        """Name the places of a step's batch: their recordings, and the scans there."""
+        frames = np.unique(self._frames(step))
+        named = []
+        for number, recording in enumerate(self._recordings):
+            ids = [recording.ids[self._pool.frame[f]] for f in frames[self._pool.recording[frames] == number]]
+            named += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
+        return "; ".join(named)
+
+    def _frames(self, step: int) -> Int[np.ndarray, "t k"]:
+        cache = self._mining.cache if self._mining else None
+        return self._pool.draw(seed=self._config.seed, step=step, tuples=self._tuples, cache=cache)
+
+    def _read_batch(self):
+        config = self._config
+        return functools.partial(
+            read_batch,
+            max_points=config.max_points,
+            share_negatives=config.share_negatives,
+            categories=config.model.categories,
+            image=config.model.image,
+        )

@@ -1,0 +1,76 @@
+"""The settings of a training run, as plain values. Presets in configs/ fill it in."""
+
+import dataclasses
+from typing import Literal
+
+from sglpr_jax.data.sampling.held_out import ValidationConfig
+from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.training.loss import LossConfig
+from sglpr_jax.training.optimizer import OptimizerConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    model: ModelConfig = ModelConfig()
+    sampling: TupleConfig = TupleConfig()
+    loss: LossConfig = LossConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    validation: ValidationConfig = ValidationConfig()
+    select: Literal["last", "best"] = "last"
+    """Which weights a finished run hands out: its last ones, or those of the best score on what is held out."""
+    steps: int = 40_000
+    tuples: int = 1
+    """Tuples a step."""
+    share_negatives: bool = False
+    """Let every other tuple's places that are far enough away be negatives too."""
+    also_tuples: int = 0
+    """How many of a step's tuples come from the second dataset."""
+    also_triplets: bool = False
+    """Let these count in the triplet loss. Without it they are places at random, for the segmentation alone."""
+    chunk: int = 0
+    """Images that go through the network at a time, on all devices together (0: all). It changes memory and speed; of
+    the results only which branches stochastic depth drops."""
+    rotate: bool = True
+    """Rotate every place about z by its own random angle at every step."""
+    max_points: int = 131072
+    """Clouds are padded to this many points; larger ones are thinned evenly."""
+    seed: int = 0
+    log_every: int = 10
+    score_every: int = 1000
+    """Steps between scores and checkpoints."""
+
+    def __post_init__(self):
+        if not 0 <= self.also_tuples < self.tuples:
+            raise ValueError(
+                f"also_tuples must be fewer than the {self.tuples} tuples of a step, found {self.also_tuples}"
+            )
+        if self.select == "best" and not self.validation.share:
+            raise ValueError("select best needs places held out to choose by: expected a validation.share, found 0")
+        if self.chunk and self.images % self.chunk:
+            raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
+        if self.images_at_once % self.loss.segment_every:
+            raise ValueError(
+                f"loss.segment_every must divide the {self.images_at_once} images of a chunk, "
+                f"found {self.loss.segment_every}"
+            )
+
+    @property
+    def images(self) -> int:
+        """Images a step."""
+        return self.tuples * (1 + self.sampling.positives + self.sampling.negatives)
+
+    @property
+    def images_at_once(self) -> int:
+        """Images of a chunk."""
+        return self.chunk or self.images
+
+
+def without_untrained_head(config: TrainConfig) -> TrainConfig:
+    """The same training without labels, and so without a segmentation head, where neither a loss nor the place head
+    reads them: weights that no loss reaches would be kept and handed out untrained."""
+    if config.model.head.reads_labels or (config.model.segments and config.loss.segments):
+        return config
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, categories=0))

@@ -1,0 +1,67 @@
+"""environment.json: with what, where and by which command a run was made."""
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from sglpr_jax.files import write_json
+
+ENVIRONMENT_FILE = "environment.json"
+PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+_CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def note_environment(folder: Path, *, seed: int) -> None:
+    """Write the environment of a run into its folder; that of a resumed one is added under `resumes`."""
+    path = folder / ENVIRONMENT_FILE
+    now = environment() | {"seed": seed}
+    first = json.loads(path.read_text()) if path.exists() else None
+    write_json(path, now | {"resumes": []} if first is None else first | {"resumes": [*first["resumes"], now]})
+
+
+def environment() -> dict[str, Any]:
+    """The versions, the machine, the commit and the command line of this process."""
+    return {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": shlex.join(sys.argv),
+        "git": git_commit(_CHECKOUT),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "backend": jax.default_backend(),
+        "devices": [device.device_kind for device in jax.devices()],
+        "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith(("JAX_", "XLA_"))},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # run from a checkout that is not installed
+        return None
+
+
+def git_commit(checkout: Path) -> dict[str, Any] | None:
+    """The commit of a checkout and whether files differ from it; None where there is no checkout or no git."""
+    if not (checkout / ".git").exists():
+        return None
+    try:
+        commit, changes = _git(checkout, "rev-parse", "HEAD"), _git(checkout, "status", "--porcelain")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return {"commit": commit, "dirty": bool(changes)}
+
+
+def _git(checkout: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(checkout), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=30).stdout.strip()

@@ -1,0 +1,66 @@
+"""A run's measurements: one JSON object a line, appended, so that an interrupted run loses nothing."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sglpr_jax.files import write_text, writing
+
+
+class MetricsLog:
+    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped.
+
+    Without a path nothing is written: of several hosts one keeps the log. Raises OSError, naming the file, where a line
+    cannot be written.
+    """
+
+    def __init__(self, path: Path | None, *, start_step: int = 0):
+        self._file = None
+        if path is None:
+            return
+        kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
+        write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
+        self._path = path
+        self._file = path.open("ab", buffering=0)  # nothing is left behind that closing would have to write
+
+    def append(self, step: int, values: Mapping[str, Any]) -> None:
+        """Write the measurements of one step; values that are not finite become null."""
+        self._write({"step": step, **{name: _plain(value) for name, value in values.items()}})
+
+    def sync(self) -> None:
+        """Have the lines on the disk itself, before a checkpoint that is ahead of them is."""
+        if self._file:
+            with writing(self._path):
+                os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file:
+            self._file.close()
+
+    def _write(self, line: dict[str, Any]) -> None:
+        if not self._file:
+            return
+        left = json.dumps(line).encode() + b"\n"
+        with writing(self._path):
+            while left:  # a disk that is nearly full takes a part
+                left = left[self._file.write(left) :]
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The lines of a metrics file; a last line cut short by a crash is left out."""
+    lines = []
+    for text in path.read_text().splitlines():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            break
+    return lines
+
+
+def _plain(value: Any) -> float | None:
+    value = float(value)
+    return value if math.isfinite(value) else None

@@ -1,0 +1,57 @@
+"""Hard negatives: which places look alike to the network as it is now, found out anew every so many steps."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
+from sglpr_jax.models.params import Params
+from sglpr_jax.training.config import TrainConfig
+
+FOLDER = "mining"
+
+DescribeFn = Callable[[Params, Int[np.ndarray, "n"]], Float32[np.ndarray, "n d"]]
+"""Describes places, given as frame numbers of the pool."""
+
+
+class Mining:
+    """The newest descriptor cache of a run, and those on disk that a resumed run may need again.
+
+    A refresh at step r, before it is made, writes `folder`/r.npz; steps r to r + refresh_steps - 1 use it. A run that
+    goes on from a checkpoint in between reads the same numbers, so that its batches are those of a run never stopped.
+    """
+
+    def __init__(self, describe: DescribeFn, places: int, config: TrainConfig, folder: Path):
+        """`places`: how many the pool has."""
+        self._describe, self._places, self._config, self._folder = describe, places, config, folder
+        self.cache: DescriptorCache | None = None
+
+    def refresh(self, step: int, params: Params) -> None:
+        """Make the cache that `step` uses the current one; `params` are the weights before that step.
+
+        Raises FileNotFoundError where the descriptors of an earlier step are needed and gone.
+        """
+        every = self._config.sampling.refresh_steps
+        path = self._folder / f"{step - step % every}.npz"
+        if path.is_file() or step % every:
+            self.cache = DescriptorCache.load(path)
+            return
+        self.cache = self._described(step, params)
+        self.cache.save(path)
+        self._drop_before(step - 2 * self._config.score_every - every)
+
+    def _described(self, step: int, params: Params) -> DescriptorCache:
+        wanted = self._config.sampling.mined_places
+        places = np.arange(self._places)
+        if 0 < wanted < self._places:
+            rng = np.random.default_rng([self._config.seed, step])
+            places = np.sort(rng.choice(self._places, wanted, replace=False))
+        return DescriptorCache(places, self._describe(params, places))
+
+    def _drop_before(self, step: int) -> None:
+        """Remove caches that no checkpoint can ask for: the newest whole one is at most two scores old."""
+        for path in self._folder.glob("*.npz"):
+            if path.stem.isdecimal() and int(path.stem) < step:
+                path.unlink()

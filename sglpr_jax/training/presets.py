@@ -1,0 +1,29 @@
+"""Training presets: the Python files in configs/, each of which sets CONFIG."""
+
+import runpy
+from pathlib import Path
+
+from sglpr_jax.training.config import TrainConfig
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")  # in a wheel; in a checkout
+
+
+def preset_names() -> tuple[str, ...]:
+    """The presets there are."""
+    return tuple(sorted(path.stem for folder in _FOLDERS for path in folder.glob("*.py")))
+
+
+def load_preset(name: str) -> TrainConfig:
+    """The configuration of a preset, or of a Python file of your own that sets CONFIG.
+
+    Raises ValueError where there is none.
+    """
+    candidates = [Path(name)] if name.endswith(".py") else [folder / f"{name}.py" for folder in _FOLDERS]
+    path = next((path for path in candidates if path.is_file()), None)
+    if path is None:
+        raise ValueError(f"no preset {name!r}: expected a .py file or one of {', '.join(preset_names())}")
+    config = runpy.run_path(str(path)).get("CONFIG")
+    if not isinstance(config, TrainConfig):
+        raise ValueError(f"{path}: expected CONFIG, a TrainConfig, found {type(config).__name__}")
+    return config

@@ -1,0 +1,52 @@
+"""How far a training is, as a bar on stderr."""
+
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.loss import MEASURES, TERM_NAMES
+
+_SHOWN = ("loss", *TERM_NAMES, *MEASURES, "steps_per_second")
+
+
+class ProgressBar(Callback):
+    """Shows the steps made, the time left and the newest measurements; nothing where stderr is no terminal."""
+
+    def __init__(self):
+        self._progress: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+
+    def on_pack(self, recording: str, done: int, scans: int) -> None:
+        """Show how much of the recording is packed."""
+        self._show(f"pack {recording}", done, scans)
+
+    def on_start(self, step: int, steps: int) -> None:
+        """Show the steps already made."""
+        self._show("train", step, steps)
+
+    def on_step(self, step: int, values: Mapping[str, float]) -> None:
+        """Show the step and what was measured."""
+        terms = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
+        self._show("train", step, None, terms=terms)
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def _show(self, title: str, done: int, total: int | None, *, terms: str = "") -> None:
+        if self._progress is None:
+            self._progress = _progress()
+            self._progress.start()
+        if title not in self._tasks:
+            self._tasks[title] = self._progress.add_task(title, total=total, terms="")
+        self._progress.update(self._tasks[title], completed=done, terms=terms)
+
+
+def _progress() -> Progress:
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, TextColumn("{task.fields[terms]}"), console=console, disable=not console.is_terminal)

@@ -1,0 +1,223 @@
+"""A training from recordings to weights, as one call: what bin/train does before its final test."""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from sglpr_jax.data import Recording
+from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.data.sampling.held_out import hold_out
+from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.weights import graft
+from sglpr_jax.models.weights_file import load, save
+from sglpr_jax.training.batches import TupleBatches, positions_of, tuple_pool
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.config import TrainConfig, without_untrained_head
+from sglpr_jax.training.describe_places import describe_places
+from sglpr_jax.training.devices import own_copy
+from sglpr_jax.training.hosts import is_first_host, on_all_hosts
+from sglpr_jax.training.loop import METRICS_FILE, ScoreFn, best_params, has_checkpoint, run_steps
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.mining import FOLDER as MINING
+from sglpr_jax.training.mining import Mining
+from sglpr_jax.training.run_folder import claim
+from sglpr_jax.training.throughput import Throughput, throughput
+from sglpr_jax.training.training_recall import training_recall
+from sglpr_jax.training.validation import validation_score
+
+WEIGHTS = "weights"
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class TrainResult:
+    """What a training made. Prints itself: how far it came, where its weights are, how fast it was.
+
+    `params` are the weights that are also in `folder`/weights: the last ones, or the best as `config.select` says.
+    `throughput` is None for a run too short to measure.
+    """
+
+    params: Params
+    folder: Path
+    steps: int
+    config: TrainConfig
+    throughput: Throughput | None
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are made; a run that was asked to stop can go on (`resume`)."""
+        return self.steps == self.config.steps
+
+    def __str__(self) -> str:
+        lines = [f"{self.folder}: {self.steps} of {self.config.steps} steps, weights in {self.folder / WEIGHTS}"]
+        if self.throughput is not None:
+            steps, waiting = self.throughput.steps_per_second, self.throughput.data_wait
+            lines.append(
+                f"{steps:.3g} steps/s, {steps * self.config.tuples:.3g} tuples/s, "
+                f"{waiting:.1%} of the time waiting for data"
+            )
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def train(
+    config: TrainConfig,
+    recordings: Sequence[Recording],
+    *,
+    out: Path | str,
+    test: Recording | None = None,
+    also: Sequence[Recording] = (),
+    weights: Params | Path | str | None = None,
+    resume: bool = False,
+    cache: Path | None = None,
+    callback: Callback | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    settings: Mapping[str, Any] | None = None,
+) -> TrainResult:
+    """Train a model on recordings; all about the run is kept in the folder `out`, from where it can be resumed.
+
+    Args:
+        config: the model, the loss, the optimiser, the number of steps and all else; `preset("small")` is one.
+        recordings: what is trained on. They need positions, and labels where the model or the loss reads any.
+        out: the run's folder: settings, metrics, checkpoints, and the weights at the end.
+        test: the recording that will be tested on. It is not read; only that it is not trained on is made sure.
+        also: recordings of a second dataset, of which come `config.also_tuples` of a step's tuples.
+        weights: what a new run begins with: a name, a folder, or weights themselves. None: fresh ones.
+        resume: go on from the newest checkpoint of the run in `out`.
+        cache: a folder in which the recordings are packed, each once, to be read faster.
+        callback: follows the training: a `ProgressBar`, `EventFiles`, or one of your own.
+        stopped: is asked after every step whether to stop there; what is made is saved. While recordings are packed a
+            stop raises KeyboardInterrupt.
+        settings: what config.json says beside `config`, the same in a resumed run. None: names of the recordings.
+
+    Returns the weights, and how the run went.
+
+    Raises ValueError where the recordings cannot be trained on as `config` says, or a resumed run has other settings;
+    FileExistsError where there is a run already, FileNotFoundError where there is none to resume; FloatingPointError
+    where the loss is no longer finite; OSError where something cannot be read or written.
+
+    Example:
+      recordings = [open_recording("KITTI", name) for name in ("00", "05")]
+      result = train(preset("small"), recordings, out="runs/mine")
+      print(result)
+    """
+    folder = Path(out)
+    config = without_untrained_head(config)
+    _require_usable(config, recordings, also, test)
+    settings = _names(recordings, also, test) if settings is None else settings
+    with contextlib.closing(callback if callback is not None and is_first_host() else Callback()) as followed:
+        pack = functools.partial(_packed, cache=cache, callback=followed, stopped=stopped)
+        recordings, also = on_all_hosts(lambda: (pack(recordings), pack(also)))
+        source, score = _source_and_score(recordings, also, config, folder)
+        begun = resume and has_checkpoint(folder)
+        start_from = None if weights is None or begun else _grafted(weights, config)
+        on_all_hosts(lambda: is_first_host() and claim(folder, config, settings, resume=resume))
+        state = run_steps(
+            config,
+            source,
+            folder,
+            score=score,
+            start_from=start_from,
+            resume=resume,
+            callback=followed,
+            stopped=stopped,
+        )
+        result = _finish(state.params, int(state.step), folder, config)
+        followed.on_end(result.steps)
+    return result
+
+
+def _source_and_score(
+    recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
+) -> tuple[TupleBatches, ScoreFn]:
+    """The batches of the places that are trained on, and the score: on those held out, where any are."""
+    splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
+    pool = tuple_pool(recordings, config, frames=[split.training for split in splits])
+    mining = _mining(recordings, pool, config, folder) if config.sampling.mining == "hardest" else None
+    if config.validation.share:
+        score = validation_score(recordings, [split.validation for split in splits], config)
+    else:
+        score = training_recall(recordings, pool, config)
+    return TupleBatches(recordings, pool, config, also=also, mining=mining), score
+
+
+def _finish(last: Params, steps: int, folder: Path, config: TrainConfig) -> TrainResult:
+    """Save the weights that the run hands out."""
+    best = steps == config.steps and config.select == "best"
+    params, measured = best_params(folder, config) if best else own_copy(last), None
+    if is_first_host():
+        save(params, folder / WEIGHTS)
+        measured = throughput(read_metrics(folder / METRICS_FILE))
+    return TrainResult(params, folder, steps, config, measured)
+
+
+def _require_usable(
+    config: TrainConfig, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording | None
+) -> None:
+    if jax.process_count() > 1 and (also or config.sampling.mining != "none"):
+        raise ValueError(
+            f"mined negatives and a second dataset work on one host only, found {jax.process_count()} hosts"
+        )
+    if bool(also) != bool(config.also_tuples):
+        raise ValueError(
+            "also_tuples says how many tuples of a step are of the second dataset: expected both or neither, "
+            f"found {len(also)} of its recordings and {config.also_tuples} tuples"
+        )
+    tested = [] if test is None else [test]
+    if any(recording.name == test.name for test in tested for recording in recordings):
+        raise ValueError(f"expected recordings to train on other than the one tested, found {tested[0].name} in both")
+    if config.model.categories_read:
+        for recording in (*recordings, *also, *tested):
+            _require_labels(recording)
+
+
+def _require_labels(recording: Recording) -> None:
+    labelled = sum(recording.labelled)
+    if labelled < len(recording):
+        raise ValueError(
+            f"model.head.input reads labels: expected labels beside every scan of sequence {recording.name}, "
+            f"found {labelled} of {len(recording)}"
+        )
+
+
+def _names(
+    recordings: Sequence[Recording], also: Sequence[Recording], test: Recording | None
+) -> dict[str, str | list[str] | None]:
+    names = {what: [recording.name for recording in of] for what, of in (("recordings", recordings), ("also", also))}
+    return {**names, "test": None if test is None else test.name}
+
+
+def _packed(
+    recordings: Sequence[Recording], *, cache: Path | None, callback: Callback, stopped: Callable[[], bool]
+) -> Sequence[Recording]:
+    """The same recordings, read from their packs in the folder `cache`, which are made on first use."""
+    if cache is None:
+        return recordings
+
+    def show(recording: Recording, done: int) -> None:
+        callback.on_pack(recording.name, done, len(recording))
+        if stopped():
+            raise KeyboardInterrupt
+
+    return [packed(recording, cache, on_progress=functools.partial(show, recording)) for recording in recordings]
+
+
+def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfig, folder: Path) -> Mining:
+    def describe(params: Params, places: np.ndarray) -> np.ndarray:
+        return describe_places(params, recordings, pool, places, np.zeros(len(places)), config)
+
+    return Mining(describe, len(pool), config, folder / MINING)
+
+
+def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
+    """These weights, with fresh ones where they have none."""
+    given = weights if isinstance(weights, Params) else load(weights)
+    return graft(given, init(jax.random.key(config.seed), config=config.model))

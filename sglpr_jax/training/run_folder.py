@@ -1,0 +1,57 @@
+"""A run's folder: begun once, with its settings and environment, and resumed with the same settings only."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sglpr_jax.files import remove_half_written, write_json
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.environment import note_environment
+
+CONFIG_FILE = "config.json"
+
+
+def claim(folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool) -> None:
+    """Write the configuration and further `settings` of a run into its folder; what a killed process left is removed.
+
+    Raises FileExistsError where there is a run already and this one is not to `resume` it; otherwise as
+    `require_same_settings`.
+    """
+    path = folder / CONFIG_FILE
+    if path.exists() and not resume:
+        raise FileExistsError(
+            f"{folder}: there is a run already; go on with it (--resume), or choose another folder (--out)"
+        )
+    if resume:
+        require_same_settings(folder, config, settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_half_written(folder)
+    write_json(path, _as_json(config, settings))
+    note_environment(folder, seed=config.seed)
+
+
+def require_same_settings(folder: Path, config: TrainConfig, settings: Mapping[str, Any]) -> None:
+    """See that the run in `folder` was begun with this configuration and settings, the number of steps apart.
+
+    Raises FileNotFoundError where there is no run, ValueError, naming them, where settings differ.
+    """
+    path = folder / CONFIG_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a run to resume, found none")
+    different = sorted(_differences(json.loads(path.read_text()), _as_json(config, settings)) - {"config.steps"})
+    if different:
+        raise ValueError(
+            f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
+        )
+
+
+def _as_json(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:
+    return json.loads(json.dumps({**settings, "config": dataclasses.asdict(config)}, default=str))
+
+
+def _differences(a: Any, b: Any, prefix: str = "") -> set[str]:
+    if not (isinstance(a, dict) and isinstance(b, dict)):
+        return set() if a == b else {prefix.removesuffix(".")}
+    return {name for key in a.keys() | b.keys() for name in _differences(a.get(key), b.get(key), f"{prefix}{key}.")}

@@ -1,0 +1,58 @@
+"""What bin/train does is one call of the library."""
+
+import dataclasses
+import json
+
+import pytest
+
+from sglpr_jax.data import open_recording
+from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.models.weights_file import load
+from sglpr_jax.training.callbacks import Callback
+from sglpr_jax.training.presets import load_preset
+from sglpr_jax.training.recipe import train
+
+
+@pytest.mark.slow
+def test_a_training_is_one_call(images, preset, tmp_path):
+    config = dataclasses.replace(load_preset(str(preset)), steps=3)
+    recordings, told = [open_recording(images, "00")], []
+
+    class Noting(Callback):
+        def on_score(self, step, scores):
+            told.append(step)
+
+        def on_end(self, step):
+            told.append(f"end {step}")
+
+        def close(self):
+            told.append("closed")
+
+    out = tmp_path / "run"
+    stops = iter([False, True])
+    stopped = train(config, recordings, out=out, callback=Noting(), stopped=lambda: next(stops))
+    assert (stopped.steps, stopped.finished) == (2, False) and told == [2, "end 2", "closed"]
+    with pytest.raises(FileExistsError, match="there is a run already"):
+        train(config, recordings, out=out)
+    with pytest.raises(ValueError, match="others: recordings"):
+        train(config, [open_recording(images, "06")], out=out, resume=True)
+    result = train(config, recordings, out=out, resume=True)
+    assert result.finished and result.folder == out and f"{out}: 3 of 3 steps" in str(result)
+    assert weights_hash(load(out)) == weights_hash(result.params)
+    settings = json.loads((out / "config.json").read_text())
+    assert settings["recordings"] == ["00"] and settings["test"] is None
+    whole = train(config, recordings, out=tmp_path / "whole", cache=tmp_path / "packs")
+    assert weights_hash(whole.params) == weights_hash(result.params)
+
+
+def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images, preset, tmp_path):
+    config, recording = load_preset(str(preset)), open_recording(images, "00")
+    with pytest.raises(ValueError, match="other than the one tested, found 00 in both"):
+        train(config, [recording], out=tmp_path / "run", test=recording)
+    with pytest.raises(ValueError, match="sequence 00 has no poses"):
+        train(config, [dataclasses.replace(recording, positions=None)], out=tmp_path / "run")
+    head = dataclasses.replace(config.model.head, input="labels")
+    reads = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
+    with pytest.raises(ValueError, match="expected labels beside every scan of sequence 00, found 0 of 30"):
+        train(reads, [recording], out=tmp_path / "run")
+    assert not list(tmp_path.iterdir())

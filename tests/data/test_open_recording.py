@@ -1,0 +1,47 @@
+"""One call opens any layout, and says what it expected where there is none."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data import open_recording, recording_names
+
+
+def test_kitti(kitti_root):
+    assert recording_names(kitti_root) == ("08",)
+    sequence = open_recording(kitti_root, "08", pose_source="kitti")
+    assert not sequence.has_images
+    assert sequence.pose_source == "poses/08.txt"
+
+
+def test_bev_images(bev_root):
+    assert recording_names(bev_root) == ("06",)
+    assert open_recording(bev_root, "06").has_images
+
+
+def test_a_folder_of_scans(tmp_path):
+    np.zeros((2, 5), dtype="<f4").tofile(tmp_path / "a.bin")
+    assert recording_names(tmp_path) == (tmp_path.name,)
+    sequence = open_recording(tmp_path, tmp_path.name, format="nuscenes")
+    assert not sequence.has_images
+    assert sequence.points(0).shape == (2, 3)
+
+
+def test_the_only_sequence_needs_no_name(kitti_root):
+    assert open_recording(kitti_root).name == "08"
+    (kitti_root / "sequences/05/velodyne").mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match="expected the name of one sequence, found 05, 08"):
+        open_recording(kitti_root)
+
+
+def test_an_unknown_sequence_lists_those_that_exist(kitti_root, bev_root):
+    with pytest.raises(FileNotFoundError, match="kitti: expected sequence '8', found 08"):
+        open_recording(kitti_root, "8")
+    with pytest.raises(FileNotFoundError, match="bev: expected sequence '00', found 06"):
+        open_recording(bev_root, "00")
+
+
+def test_an_unknown_layout_says_what_was_expected(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"expected sequences/NN/velodyne.*NN/imgs.*nothing of the kind"):
+        recording_names(tmp_path)
+    with pytest.raises(FileNotFoundError, match="found no such folder"):
+        open_recording(tmp_path / "none", "08")

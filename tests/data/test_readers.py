@@ -1,0 +1,62 @@
+"""A reader is a file of its own: whatever defines READER is found, in the order of its rank."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data import open_recording, readers, recording_names
+
+MULE = """
+from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.recording import Recording
+
+
+def names(root):
+    return tuple(sorted(path.parent.name for path in root.glob("*/scans.here")))
+
+
+def open_recording(root, name, options):
+    paths = tuple(sorted((root / name).glob("*.bin")))
+    return Recording(name, tuple(p.stem for p in paths), None, None, options.pose_source, paths, scan_record)
+
+
+READER = Reader(layout="NN/scans.here (MulRan)", recording_names=names, open=open_recording, rank=3)
+"""
+
+
+@pytest.fixture
+def with_another(tmp_path, monkeypatch):
+    """A file added to the folder of readers."""
+    folder = tmp_path / "more"
+    folder.mkdir()
+    (folder / "mule.py").write_text(MULE)
+    monkeypatch.setattr(readers, "__path__", [*readers.__path__, str(folder)])
+    readers.readers.cache_clear()
+    yield
+    readers.readers.cache_clear()
+
+
+def test_the_readers_look_in_their_order():
+    layouts = [reader.layout.rpartition("(")[2] for reader in readers.readers()]
+    known = ["KITTI)", "BEV images)", "NCLT)", "*.bin, *.pcd)"]
+    assert [layout for layout in layouts if layout in known] == known
+    assert layouts[-1] == known[-1], "single scans lie in other layouts too: that reader looks last"
+
+
+def test_a_new_file_is_all_that_a_new_layout_needs(with_another, tmp_path):
+    root = tmp_path / "data" / "A"
+    root.mkdir(parents=True)
+    (root / "scans.here").write_text("")
+    np.ones((3, 4), "<f4").tofile(root / "0.bin")
+    assert recording_names(root.parent) == ("A",)
+    recording = open_recording(root.parent, "A", pose_source="kitti")
+    assert recording.points(0).shape == (3, 3) and recording.pose_source == "kitti"
+    with pytest.raises(FileNotFoundError, match=r"MulRan.*single scans .*found no such folder"):
+        recording_names(tmp_path / "none")
+
+
+def test_points_of_images_and_images_of_scans_are_refused(kitti_root, bev_root):
+    with pytest.raises(ValueError, match="sequence 06: expected scans, found ready-made images"):
+        open_recording(bev_root, "06").points(0)
+    with pytest.raises(ValueError, match="sequence 08: expected ready-made images, found scans"):
+        open_recording(kitti_root, "08").image(0)

@@ -1,0 +1,47 @@
+"""What the pages' examples find in their folder: scans, a dataset, a descriptor file."""
+
+import shutil
+from pathlib import Path
+
+import jax
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+import sglpr_jax
+from sglpr_jax.methods.registry import method_named
+from sglpr_jax.sim import Sensor, write_dataset
+
+SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
+
+
+@pytest.fixture(scope="session")
+def examples(tmp_path_factory) -> Path:
+    """KITTI/ (three recordings of 200 thin scans, about 2 m apart), my_scans/ (five of them), 08.npz and mine.npz."""
+    folder = tmp_path_factory.mktemp("examples")
+    write_dataset(folder / "KITTI", scans=200, sensor=SENSOR)
+    (folder / "my_scans").mkdir()
+    for scan in sorted((folder / "KITTI/sequences/08/velodyne").glob("*.bin"))[:5]:
+        shutil.copy(scan, folder / "my_scans")
+    for name, root, seq in (("08", folder / "KITTI", "08"), ("mine", folder / "my_scans", None)):
+        recording = sglpr_jax.open_recording(root, seq)
+        sglpr_jax.embed(method_named("polar-fft", None, recording), recording).save(folder / f"{name}.npz")
+    return folder
+
+
+@pytest.fixture
+def in_examples(examples, tmp_path, monkeypatch) -> Path:
+    """A copy of these as the current folder."""
+    folder = tmp_path / "examples"
+    shutil.copytree(examples, folder)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """What a command compiles goes to a folder of this test, not to the user's."""
+    before = jax.config.jax_compilation_cache_dir
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+    compilation_cache.reset_cache()

@@ -1,0 +1,82 @@
+"""Every block of code in the README and the manual: Python is run, command lines are parsed by their own parsers."""
+
+import importlib
+import inspect
+import re
+import shlex
+import sys
+
+import pytest
+import tyro
+
+from .pages import PAGES, ROOT, blocks, command_lines, name_of
+
+COMMANDS = [(page, line) for page in PAGES for b in blocks(page) if b.language == "bash" for line in command_lines(b)]
+WITH_PYTHON = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+QUICK = [
+    "bin/embed --weights simulated --data my_scans --out mine.npz",
+    "bin/embed --method scan-context --data KITTI --seq 08 --out 08-scan-context.npz",
+    "bin/evaluate 08.npz",
+]
+"""Command lines of the pages that take seconds: these are run."""
+
+
+def lines_of(*, start: str) -> list[str]:
+    """Every different command of the pages that begins so, in order."""
+    return list(dict.fromkeys(line for _, line in COMMANDS if line.startswith(start)))
+
+
+def parse(name: str, arguments: list[str]) -> object:
+    """What the parser of `bin/<name>` makes of these arguments."""
+    module = importlib.import_module(f"sglpr_jax.cli.{name}")
+    if hasattr(module, "parse"):
+        return module.parse(arguments)
+    members = [m for m in vars(module).values() if inspect.isclass(m) and m.__module__ == module.__name__]
+    return tyro.cli(next(m for m in members if m.__name__.endswith("Command")), args=arguments)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(script.name for script in (ROOT / "bin").iterdir() if script.name[0] != "_"))
+def test_command_lines_are_parsed(name, capsys):
+    lines = lines_of(start=f"bin/{name}")
+    assert lines, f"no page shows bin/{name}"
+    wrong = []
+    for line in lines if name not in ("docs", "test") else []:
+        try:
+            parse(name, shlex.split(line)[1:])
+        except SystemExit:
+            wrong.append(f"{line}\n{capsys.readouterr().err}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("line", lines_of(start="python benchmarks/"))
+def test_flags_of_benchmarks_exist(line):
+    _, file, *arguments = shlex.split(line)
+    source = (ROOT / file).read_text()
+    flags = [argument.removeprefix("--no-").removeprefix("--") for argument in arguments if argument.startswith("--")]
+    assert not [flag for flag in flags if not re.search(rf"\b{flag.replace('-', '_')}\b", source)], line
+
+
+def test_nothing_else_is_unknown():
+    known = ("bin/", "python ", "pip install", "for ", "done", "sed ")
+    assert not [(name_of(page), line) for page, line in COMMANDS if not line.startswith(known) and "s." not in line]
+    assert {block.language for page in PAGES for block in blocks(page)} <= {"bash", "python", "text"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
+def test_python_runs(page, in_examples):
+    """All blocks of a page, one after another, in a folder with a small dataset."""
+    found = {"__name__": "page"}
+    for block in blocks(page):
+        if block.language == "python":
+            exec(compile("\n" * block.line + block.text, page, "exec", dont_inherit=True), found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", QUICK)
+def test_quick_commands_run(line, in_examples, own_cache, monkeypatch):
+    assert line in {shown for _, shown in COMMANDS}
+    script, *arguments = shlex.split(line)
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    importlib.import_module(f"sglpr_jax.cli.{script.removeprefix('bin/')}").main()

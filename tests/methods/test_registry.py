@@ -1,0 +1,23 @@
+"""Every handcrafted method declares itself in its file, and the registry knows it by that."""
+
+from pathlib import Path
+
+import pytest
+
+from sglpr_jax.methods import handcrafted as package
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.registry import METHODS
+from sglpr_jax.retrieval.distances import DISTANCES
+
+
+def test_every_file_of_the_folder_is_registered():
+    files = [path for path in Path(package.__path__[0]).glob("*.py") if path.stem != "__init__"]
+    assert len(files) == len(HANDCRAFTED) and ("sglpr", *HANDCRAFTED) == METHODS
+
+
+@pytest.mark.parametrize("name", HANDCRAFTED)
+def test_a_method_says_its_source_and_how_its_descriptors_compare(name):
+    method = HANDCRAFTED[name]
+    assert method.name == name and method.source and method.distance_name in DISTANCES
+    if method.distance is not None:
+        assert DISTANCES[name] is method.distance

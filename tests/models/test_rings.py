@@ -1,0 +1,113 @@
+"""The ring net: its convolution is XLA's, and a rotation of the scan shifts its features and no more."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.models.backbones.rings import RingConfig, RingConvolution, RingDecoder, RingNet
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.sglpr import describe, segment
+
+RINGS = RingConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
+HEAD = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
+CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=RINGS, detail=6, head=HEAD)
+SPECTRUM = dataclasses.replace(CONFIG, head=dataclasses.replace(HEAD, pooling="spectrum"))
+BEV = jax.random.poisson(jax.random.key(1), 0.7, (3, 32, 32)).astype(jnp.float32)
+
+
+@pytest.fixture(scope="module", params=[CONFIG, SPECTRUM], ids=["netvlad", "spectrum"])
+def params(request, random_params):
+    return random_params(request.param)
+
+
+@pytest.mark.parametrize("stride, radii", [(1, 5), (2, 6), (2, 5)])
+def test_the_convolution_is_xlas_on_a_wrapped_image(stride, radii, random_variables):
+    x = jax.random.normal(jax.random.key(0), (2, radii, 7, 3))
+    module = RingConvolution(4, stride)
+    variables = random_variables(module, x)
+    wrapped = jnp.pad(jnp.pad(x, ((0, 0), (0, 0), (1, 1), (0, 0)), mode="wrap"), ((0, 0), (1, 1), (0, 0), (0, 0)))
+    kernel, bias = variables["params"]["kernel"], variables["params"]["bias"]
+    expected = bias[None, None, None] + jax.lax.conv_general_dilated(
+        wrapped, kernel, (stride, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest"
+    )
+    np.testing.assert_allclose(module.apply(variables, x), expected, atol=1e-5)
+    one_by_one = jax.jit(jax.vmap(lambda image: module.apply(variables, image[None])[0]))
+    np.testing.assert_allclose(one_by_one(x), expected, atol=1e-5)
+
+
+def test_maps_shrink_as_configured_and_turn_with_the_image(random_variables):
+    image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
+    net = RingNet(RINGS)
+    variables = random_variables(net, image)
+    maps = net.apply(variables, image)
+    assert [m.shape for m in maps] == [(2, 8, 16, 2), (2, 4, 16, 4), (2, 4, 8, 6), (2, 2, 8, 6)]
+    np.testing.assert_allclose(maps[0], image.reshape(2, 8, 2, 16, 2, 2).mean((2, 4)), atol=1e-6)
+    turned = net.apply(variables, jnp.roll(image, 8, axis=2))  # two sectors of the last map
+    np.testing.assert_allclose(turned[-1], jnp.roll(maps[-1], 2, axis=2), atol=1e-5)
+
+
+def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_variables):
+    image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
+    net, decoder = RingNet(RINGS), RingDecoder()
+    variables = random_variables(net, image)
+    maps = net.apply(variables, image)
+    weights = random_variables(decoder, maps)
+    pixels = decoder.apply(weights, maps)
+    assert pixels.shape == (2, 8, 16, 4)
+    turned = decoder.apply(weights, net.apply(variables, jnp.roll(image, 8, axis=2)))
+    np.testing.assert_allclose(turned, jnp.roll(pixels, 4, axis=2), atol=1e-4)
+
+
+def test_quarter_turns_leave_the_descriptor(params):
+    straight = describe(params, BEV)
+    assert jnp.abs(straight[0] - straight[1]).max() > 1e-3
+    for quarters in (1, 2, 3):
+        turned = describe(params, jnp.rot90(BEV, quarters, axes=(1, 2)))
+        np.testing.assert_allclose(turned, straight, atol=1e-5)
+
+
+def test_descriptors_under_jit_vmap_and_grad(params):
+    whole = describe(params, BEV)
+    assert whole.shape == (3, 256)
+    np.testing.assert_allclose(jnp.linalg.norm(whole, axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(jax.vmap(lambda bev: describe(params, bev))(BEV), whole, atol=1e-5)
+    gradient = jax.grad(lambda bev: describe(params, bev)[..., 0].sum())(jnp.zeros_like(BEV))
+    assert jnp.isfinite(gradient).all()
+
+
+def test_the_logits_near_a_cell_depend_most_on_its_counts(params):
+    change = jnp.abs(segment(params, BEV[:1]) - segment(params, BEV[:1].at[0, 10, 20].add(9.0))).max(-1)[0]
+    row, column = np.unravel_index(change.argmax(), change.shape)
+    assert abs(row - 10) <= 2 and abs(column - 20) <= 2
+
+
+def test_amplitudes_are_numpys_and_stay_where_the_columns_are_shifted():
+    columns = jax.random.normal(jax.random.key(0), (2, 12, 3))
+    expected = np.abs(np.fft.rfft(columns, axis=1, norm="ortho"))
+    found = jax.jit(amplitudes, static_argnums=1)(columns, 7)
+    np.testing.assert_allclose(found, expected, atol=2e-3)  # sqrt(FLOOR) where an amplitude is zero
+    np.testing.assert_allclose(amplitudes(jnp.roll(columns, 5, axis=1), 7), found, atol=1e-5)
+    assert jnp.isfinite(jax.grad(lambda c: amplitudes(c, 7).sum())(jnp.zeros((1, 12, 3)))).all()
+
+
+def test_the_spectrum_reads_every_radius(random_variables):
+    features = jax.random.normal(jax.random.key(0), (1, 2, 12, 3))
+    module = Spectrum(channels=4, frequencies=5, output=6)
+    variables = random_variables(module, features)
+    for radius in range(2):
+        changed = module.apply(variables, features.at[0, radius, 3, 1].add(1.0))
+        assert jnp.abs(changed - module.apply(variables, features)).max() > 1e-3
+
+
+def test_what_does_not_fit_is_an_error():
+    with pytest.raises(ValueError, match="as many strides and means as widths"):
+        RingConfig(widths=(4, 8))
+    with pytest.raises(ValueError, match="'rings' sees a polar image"):
+        ModelConfig(backbone=RINGS)
+    with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
+        dataclasses.replace(CONFIG, polar=(20, 32))

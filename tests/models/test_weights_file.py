@@ -1,0 +1,153 @@
+"""Weights on disk come back bit by bit, and everything that is not whole or does not fit is one clear error."""
+
+import dataclasses
+import json
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.weights import graft, weights_hash
+from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
+
+
+@pytest.fixture(scope="module")
+def params(random_params) -> Params:
+    return jax.tree.map(np.asarray, random_params(model_preset("tiny")))
+
+
+def test_weights_and_configuration_come_back_bit_by_bit(params, tmp_path):
+    folder = save(params, tmp_path / "new" / "weights")
+    found = load(folder)
+    chex.assert_trees_all_equal(found, params)
+    assert found.config == params.config
+    assert weights_hash(found) == weights_hash(params)
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["weights"]
+    assert sorted(path.name for path in folder.iterdir()) == [CONFIG_FILE, WEIGHTS_FILE]
+
+
+def test_weights_without_the_training_parts_are_grafted_onto_fresh_ones(params):
+    kept = {name: values for name, values in params.weights.items() if name != "segmentation_head"}
+    given = Params(kept, dataclasses.replace(params.config, categories=0))
+    fresh = jax.tree.map(np.zeros_like, params)
+    found = graft(given, fresh)
+    assert found.config == params.config
+    chex.assert_trees_all_equal({k: v for k, v in found.weights.items() if k != "segmentation_head"}, kept)
+    chex.assert_trees_all_equal(found.weights["segmentation_head"], fresh.weights["segmentation_head"])
+    with pytest.raises(ValueError, match=r"segmentation_head/kernel has shape .*, expected no such weight"):
+        graft(params, given)
+
+
+def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_what_was_there(params, tmp_path, small_files):
+    folder = save(params, tmp_path / "weights")
+    small_files(10_000)
+    with pytest.raises(OSError, match=rf"{folder}: expected to write it, found: File too large"):
+        save(jax.tree.map(np.zeros_like, params), folder)
+    assert weights_hash(load(folder)) == weights_hash(params)
+    assert [path.name for path in tmp_path.iterdir()] == ["weights"]
+
+
+@pytest.mark.parametrize("changes", [{"range_channel": True, "detail": 8}, {"detail": 4}])
+def test_weights_of_any_configuration_come_back(random_params, changes, tmp_path):
+    params = random_params(dataclasses.replace(model_preset("tiny"), **changes))
+    chex.assert_trees_all_equal(load(save(params, tmp_path / "weights")), jax.tree.map(np.asarray, params))
+
+
+def test_arrays_that_are_not_contiguous_come_back_as_they_are(params, tmp_path):
+    """Imported PyTorch weights are transposed views."""
+    kernel = params.weights["segmentation_head"]["kernel"]
+    strided = {**params.weights, "segmentation_head": {"kernel": np.asfortranarray(kernel)}}
+    chex.assert_trees_all_equal(load(save(Params(strided, params.config), tmp_path / "weights")), params)
+
+
+def test_saving_again_replaces_the_folder(params, tmp_path):
+    save(params, tmp_path / "weights")
+    doubled = jax.tree.map(lambda leaf: 2 * leaf, params)
+    save(doubled, tmp_path / "weights")
+    chex.assert_trees_all_equal(load(tmp_path / "weights"), doubled)
+    assert [path.name for path in tmp_path.iterdir()] == ["weights"]
+
+
+def test_a_training_run_s_folder_is_its_weights(params, tmp_path):
+    save(params, tmp_path / "run" / "weights")
+    chex.assert_trees_all_equal(load(tmp_path / "run"), params)
+    chex.assert_trees_all_equal(load(str(tmp_path / "run")), params)
+
+
+@pytest.mark.parametrize("name", [CONFIG_FILE, WEIGHTS_FILE])
+def test_a_missing_file_is_named(params, tmp_path, name):
+    folder = save(params, tmp_path / "weights")
+    (folder / name).unlink()
+    with pytest.raises(FileNotFoundError, match=rf"weights: expected a folder with .*, {name} is missing"):
+        load(folder)
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="none: expected a folder with"):
+        load(tmp_path / "none")
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-100], lambda data: b"", lambda data: b"no tensors" * 9])
+def test_damaged_weights_are_named(params, tmp_path, damage):
+    folder = save(params, tmp_path / "weights")
+    (folder / WEIGHTS_FILE).write_bytes(damage((folder / WEIGHTS_FILE).read_bytes()))
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: not a whole safetensors file"):
+        load(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (b'{"grid": ', "expected JSON"),
+        (b"\xff\xfe\x00", "expected JSON"),
+        (b"[1, 2]", "expected the fields of a ModelConfig"),
+        (b'{"grid": []}', "grid: expected the fields of a Grid"),
+        (b'{"grid": {"colour": 3}, "head": {}}', "grid: expected the fields of a Grid .*, found 'colour'"),
+        (b'{"grid": {"height": 33}, "head": {}}', "height must be a positive even number"),
+    ],
+)
+def test_a_damaged_configuration_is_named(params, tmp_path, text, expected):
+    folder = save(params, tmp_path / "weights")
+    (folder / CONFIG_FILE).write_bytes(text)
+    with pytest.raises(ValueError, match=rf"{CONFIG_FILE}: .*{expected}"):
+        load(folder)
+
+
+def test_the_weights_of_another_preset_are_refused(params, tmp_path):
+    folder = save(params, tmp_path / "weights")
+    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("demo"))))
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: not the weights of its configuration: \S+ should have"):
+        load(folder)
+
+
+def test_a_weight_too_many_or_too_few_is_named(params, tmp_path):
+    folder = save(params, tmp_path / "weights")
+    flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    safetensors.numpy.save_file({**flat, "extra": np.zeros(3, np.float32)}, folder / WEIGHTS_FILE)
+    with pytest.raises(ValueError, match=r"extra should have shape none \(no such weight\), found \(3,\)"):
+        load(folder)
+    kernel = flat.pop("segmentation_head/kernel")
+    safetensors.numpy.save_file(flat, folder / WEIGHTS_FILE)
+    with pytest.raises(
+        ValueError, match=rf"segmentation_head/kernel should have shape \({kernel.shape[0]}, 20\), found none"
+    ):
+        load(folder)
+
+
+def test_the_hash_changes_with_one_value_and_one_name(params):
+    def changed(kernel, name="segmentation_head"):
+        rest = {key: value for key, value in params.weights.items() if key != "segmentation_head"}
+        return weights_hash(Params({**rest, name: {"kernel": kernel}}, params.config))
+
+    kernel = params.weights["segmentation_head"]["kernel"]
+    nudged = kernel.copy()
+    nudged[0, 0] = np.nextafter(nudged[0, 0], np.float32(9))
+    hashes = [weights_hash(params), changed(nudged), changed(kernel, "other"), changed(kernel.reshape(4, -1))]
+    assert len(set(hashes)) == 4
+    assert changed(jnp.asarray(kernel)) == weights_hash(params)
+    assert len(hashes[0]) == 64

@@ -1,0 +1,47 @@
+"""Recordings for the tests: points and images in memory, labels in files."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sglpr_jax.data.formats.scan_files import read_labels
+from sglpr_jax.data.record import Record, image_record
+from sglpr_jax.data.recording import Recording
+
+
+def of_scans(clouds: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
+    """Scans (n, 3) by the paths that they are said to have."""
+    return _recording(tuple(clouds), reading_scans(clouds.__getitem__), **fields)
+
+
+def of_images(images: Mapping[Path, np.ndarray], **fields: Any) -> Recording:
+    """Ready-made images (h, w) by the paths that they are said to have."""
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        return image_record(path, labels, lasers, read=images.__getitem__)
+
+    return _recording(tuple(images), read, **{"resolution_m": 0.4, **fields})
+
+
+def reading_scans(points_of: Callable[[Path], np.ndarray]) -> Callable[..., Record]:
+    """What reads records of scans whose points a function of the path returns."""
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        points = points_of(path)
+        return Record(points=points, labels=None if labels is None else read_labels(labels, points=len(points)))
+
+    return read
+
+
+def with_points(recording: Recording, points_of: Callable[[Path], np.ndarray]) -> Recording:
+    """The recording with other points."""
+    return dataclasses.replace(recording, read=reading_scans(points_of))
+
+
+def _recording(paths: tuple[Path, ...], read: Callable[..., Record], **fields: Any) -> Recording:
+    ids = tuple(path.stem for path in paths)
+    unknown = {"name": "08", "ids": ids, "positions": None, "times": None, "pose_source": None}
+    return Recording(**{**unknown, **fields}, paths=paths, read=read)

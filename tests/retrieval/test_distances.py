@@ -1,0 +1,32 @@
+import numpy as np
+import pytest
+
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.retrieval.distances import DISTANCES, cosine, distance_function, l2
+
+
+@pytest.fixture
+def rows() -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
+
+
+def test_l2_is_the_euclidean_distance_even_where_it_is_tiny(rows):
+    near = rows + np.float32(1e-4)
+    expected = np.linalg.norm(rows[:, None].astype(np.float64) - near[None], axis=-1)
+    np.testing.assert_allclose(l2(rows, near), expected, rtol=1e-4)
+
+
+def test_cosine_is_the_cosine_distance(rows):
+    zero = np.zeros((1, 5), np.float32)
+    expected = [[1 - a @ b / np.linalg.norm(a) / np.linalg.norm(b) for b in rows] for a in 2 * rows]
+    np.testing.assert_allclose(cosine(2 * rows, rows), expected, atol=1e-6)
+    assert (cosine(zero, rows) == 1).all() and (cosine(rows, zero) == 1).all()
+
+
+def test_every_baseline_has_a_distance():
+    assert {baseline.distance_name for baseline in HANDCRAFTED.values()} <= set(DISTANCES)
+
+
+def test_an_unknown_distance_is_named_with_the_nearest_one():
+    with pytest.raises(ValueError, match=r"l2, cosine, .*, found 'scan_context'; did you mean scan-context\?"):
+        distance_function("scan_context")

@@ -1,0 +1,81 @@
+"""Nearest neighbours are those that numpy finds over all pairs, without the frames that are too recent."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.nearest import nearest
+
+
+def file_of(
+    descriptors: np.ndarray, *, sequence: str = "00", times: bool = True, distance: str = "l2"
+) -> DescriptorFile:
+    n = len(descriptors)
+    return DescriptorFile(
+        sequence=sequence,
+        ids=tuple(f"{i:06d}" for i in range(n)),
+        positions=None,
+        times=np.arange(n) / 2 if times else None,
+        descriptors=descriptors.astype(np.float32),
+        pose_source=None,
+        config={},
+        weights_hash="",
+        distance=distance,
+    )
+
+
+@pytest.fixture
+def descriptors() -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(700, 8))
+
+
+@pytest.mark.parametrize("distance", ["l2", "cosine"])
+def test_the_nearest_of_another_session_are_those_of_all_pairs(descriptors, distance):
+    today, yesterday = file_of(descriptors[:600], distance=distance), file_of(descriptors[600:], distance=distance)
+    found = nearest(today, yesterday, k=3)
+    q, d = (file.descriptors.astype(np.float64) for file in (today, yesterday))
+    if distance == "cosine":
+        q, d = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (q, d))
+    every = np.linalg.norm(q[:, None] - d[None], axis=2)
+    np.testing.assert_array_equal(found.rows, np.argsort(every, axis=1)[:, :3])
+    expected = np.sort(every, axis=1)[:, :3]
+    np.testing.assert_allclose(found.distances, expected if distance == "l2" else expected**2 / 2, rtol=1e-4, atol=1e-6)
+    assert len(found) == 600 and found.ids(0) == tuple(yesterday.ids[row] for row in found.rows[0])
+
+
+@pytest.mark.parametrize(("frames", "seconds"), [(0, 0.0), (50, 0.0), (0, 40.0), (10, 2.0)])
+def test_recent_frames_of_the_own_recording_are_no_answers(descriptors, frames, seconds):
+    own = file_of(descriptors)
+    found = nearest(own, exclude_frames=frames, exclude_s=seconds)
+    for query in range(len(own)):
+        last = query - frames
+        while last > 0 and own.times[query] - own.times[last - 1] < seconds:
+            last -= 1
+        if last <= 0:
+            assert found.rows[query, 0] == -1 and np.isinf(found.distances[query, 0]) and found.ids(query) == ()
+        else:
+            apart = np.linalg.norm(own.descriptors[:last] - own.descriptors[query], axis=1)
+            assert found.rows[query, 0] == apart.argmin()
+
+
+def test_fewer_than_k_are_filled_and_ties_come_in_order():
+    found = nearest(file_of(np.zeros((3, 2))), k=4, exclude_frames=0)
+    np.testing.assert_array_equal(found.rows, [[-1] * 4, [0, -1, -1, -1], [0, 1, -1, -1]])
+
+
+def test_a_result_prints_itself():
+    text = str(nearest(file_of(np.eye(4)), file_of(np.eye(4)[::-1], sequence="05")))
+    assert text.splitlines()[0] == "4 of 4 queries of 00 in 05 have an answer; the surest:"
+    assert text.splitlines()[1] == "000000 -> 000003  0.0000"
+
+
+def test_what_cannot_be_compared_is_refused(descriptors):
+    own = file_of(descriptors)
+    with pytest.raises(ValueError, match=r"expected descriptors of 8 numbers .* found 4 numbers compared by l2 in 05"):
+        nearest(own, file_of(descriptors[:, :4], sequence="05"))
+    with pytest.raises(ValueError, match="compared by cosine"):
+        nearest(own, file_of(descriptors, distance="cosine"))
+    with pytest.raises(ValueError, match="expected times"):
+        nearest(file_of(descriptors, times=False), exclude_s=30.0)
+    with pytest.raises(ValueError, match="k of 1 or more, found 0"):
+        nearest(own, k=0)

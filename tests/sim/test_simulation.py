@@ -1,0 +1,43 @@
+"""A simulated dataset in one call says what it writes, and completes what is there."""
+
+from pathlib import Path
+
+import pytest
+
+from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.sim import simulate
+from sglpr_jax.sim.simulation import default_dataset, default_sessions
+
+THIN = {"scans": 3, "azimuth_steps": 40, "sensor": "vlp16"}
+
+
+def test_towns_are_written_with_what_they_are_told_beforehand(tmp_path):
+    told, done = [], []
+    found = simulate(tmp_path / "town", routes=["08"], **THIN, on_start=lambda dataset: told.append(dataset.missing))
+    assert str(found) == f"{tmp_path / 'town'}: recordings 08" and told == [("08",)]
+    assert found.missing == () and found.missing_bytes == 0
+    assert len(open_recording(found.root, "08")) == 3
+    simulate(tmp_path / "town", routes=["08"], **THIN, on_start=lambda dataset: told.append(dataset.missing))
+    assert told[1] == ()
+    both = simulate(tmp_path / "town", routes=["08", "00"], **THIN, on_progress=done.append)
+    assert recording_names(both.root) == ("00", "08") and done[-1] == 6 and done == sorted(done)
+
+
+def test_days_of_one_town(tmp_path):
+    found = simulate(tmp_path, sessions=["2012-01-15", "2012-02-04"], **THIN)
+    assert recording_names(tmp_path) == found.names == ("2012-01-15", "2012-02-04")
+
+
+def test_what_does_not_go_together_is_refused(tmp_path):
+    for more in ({"along": [Path("a.txt")]}, {"images": True}, {"routes": ["00", "08"]}):
+        with pytest.raises(ValueError, match="at most one route"):
+            simulate(tmp_path, sessions=["2012-01-15"], **more)
+    with pytest.raises(ValueError, match=r"expected a sensor among hdl64e, .* found 'vlp17'"):
+        simulate(tmp_path, sensor="vlp17")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_datasets_that_stand_in_for_real_ones_have_their_folders():
+    (towns, options), (days, more) = default_dataset(Path("cache")), default_sessions(Path("cache"))
+    assert towns.parent == days.parent == Path("cache") and towns != days
+    assert options["scans"] == more["scans"] == 300 and len(more["sessions"]) == 3

@@ -1,0 +1,73 @@
+"""A file or folder is written whole or not at all, and errors of writing name it."""
+
+from pathlib import Path
+
+import pytest
+
+from sglpr_jax.files import WriteError, half_written, remove_half_written, replacing, write_json, writing
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_is_replaced_at_the_end_of_the_block(tmp_path):
+    path = tmp_path / "folder" / "that is missing" / "a.txt"
+    for text in ("first", "second"):
+        with replacing(path) as temporary:
+            assert temporary.parent == path.parent
+            temporary.write_text(text)
+            assert not path.exists() or path.read_text() == "first"
+        assert path.read_text() == text
+    assert names(path.parent) == ["a.txt"]
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_an_error_leaves_what_was_there(tmp_path, folder):
+    path = tmp_path / "a"
+    write_json(path / "in.json" if folder else path, 1)
+    with pytest.raises(KeyboardInterrupt), replacing(path) as temporary:
+        write_json(temporary / "in.json" if folder else temporary, 2)
+        raise KeyboardInterrupt
+    assert (path / "in.json" if folder else path).read_text() == "1\n"
+    assert names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize(("keep", "left"), [(False, "new"), (True, "old")])
+def test_a_folder_takes_the_place_of_another_unless_that_is_kept(tmp_path, keep, left):
+    path = tmp_path / "weights"
+    (path / "old").mkdir(parents=True)
+    with replacing(path, keep=keep) as temporary:
+        (temporary / "new").mkdir(parents=True)
+    assert names(path) == [left] and names(tmp_path) == ["weights"]
+
+
+def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):
+    path = tmp_path / "a.bin"
+    small_files(10)
+    with pytest.raises(WriteError) as raised, writing(tmp_path), replacing(path) as temporary:
+        temporary.write_bytes(bytes(100))
+    assert str(raised.value) == f"{path}: expected to write it, found: File too large"
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_made_is_an_error_that_names_the_file(tmp_path):
+    (tmp_path / "file").write_text("")
+    path = tmp_path / "file" / "a.txt"
+    with pytest.raises(WriteError, match=rf"^{path}: expected to write it, found: (Not a directory|File exists)"):
+        write_json(path, {})
+
+
+def test_an_error_of_another_file_stays_as_it_is(tmp_path):
+    with pytest.raises(FileNotFoundError, match="elsewhere"), replacing(tmp_path / "a.txt"):
+        (tmp_path / "elsewhere").read_text()
+
+
+def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
+    (tmp_path / "run" / ".weights.1.tmp" / "in").mkdir(parents=True)
+    (tmp_path / "run" / "test").mkdir()
+    for name in (".config.json.2.tmp", "test/.a.png.3.tmp", "test/a.png"):
+        (tmp_path / "run" / name).write_text("")
+    assert [path.name for path in half_written(tmp_path, "a.png")] == [".a.png.3.tmp"]
+    remove_half_written(tmp_path)
+    assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]

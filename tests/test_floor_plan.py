@@ -1,0 +1,66 @@
+"""The plan of the house holds: imports point down, files import each other in no circle, linen stays in the models."""
+
+import ast
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "sglpr_jax"
+FLOORS = (
+    ("bev", "files", "labels", "losses", "metrics", "poses", "progress", "revisits"),
+    ("data",),
+    ("models", "sim"),
+    ("methods",),
+    ("retrieval", "training"),
+    ("evaluation",),
+    ("reproduce",),
+    ("cli",),
+)
+"""From the ground up; rooms on one floor do not know each other, but for what the ground's files share."""
+FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+FILES = {
+    ".".join(("sglpr_jax", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if "configs" not in path.parts
+}
+
+
+def imported(path: Path) -> Iterator[str]:
+    """The modules that a file imports; of `from a import b` the file b of the package a where there is one."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for name in node.names:
+                inner = f"{node.module}.{name.name}"
+                yield inner if inner in FILES else node.module
+
+
+def room(module: str) -> str:
+    """The folder, or the file on the ground floor, that a module is in."""
+    return module.split(".")[1]
+
+
+@pytest.mark.parametrize("module", [module for module in FILES if module != "sglpr_jax"])
+def test_imports_point_down(module):
+    for other in imported(FILES[module]):
+        assert other != "sglpr_jax", f"{module} imports the table of contents"
+        if other.startswith("sglpr_jax.") and room(other) != room(module):
+            assert FLOOR[room(other)] < FLOOR[room(module)] or FLOOR[room(module)] == 0, f"{module} imports {other}"
+
+
+def test_every_room_has_a_floor():
+    assert {room(module) for module in FILES if module != "sglpr_jax"} == set(FLOOR)
+
+
+def test_no_two_files_import_each_other():
+    graph = {module: {other for other in imported(path) if other in FILES} for module, path in FILES.items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_flax_modules_are_in_the_models_alone():
+    for module, path in FILES.items():
+        if "flax.linen" in set(imported(path)):
+            assert room(module) == "models", module

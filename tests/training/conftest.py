@@ -1,0 +1,78 @@
+"""A model that compiles fast, with random weights, and batches for it made in memory."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.data.sampling.batch import Batch
+from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.training.batch_queue import BatchSource
+from sglpr_jax.training.config import OptimizerConfig, TrainConfig
+
+POINTS = 200
+
+
+class Made(BatchSource):
+    """Batches that a function of the step makes."""
+
+    def __init__(self, make: Callable[[int], Batch], *, places: Callable[[int], str] = lambda step: ""):
+        self.batch, self.places = make, places
+
+
+MODEL = dataclasses.replace(
+    model_preset("tiny"),
+    grid=Grid(resolution_m=3.2, height=16, width=16),
+    backbone=SwinConfig(embed_dim=8, depths=(2,), heads=(2,), window=4, drop_path=0.0),
+    head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4, descriptor_size=16),
+)
+
+
+@pytest.fixture(scope="session")
+def config() -> TrainConfig:
+    """Two tuples of four places, the whole batch at once, no stochastic depth."""
+    return TrainConfig(
+        model=MODEL,
+        sampling=TupleConfig(positives=1, negatives=2),
+        optimizer=OptimizerConfig(learning_rate=3e-3),
+        steps=6,
+        tuples=2,
+        max_points=POINTS,
+        log_every=1,
+        score_every=2,
+    )
+
+
+@pytest.fixture(scope="session")
+def params(config, random_params) -> Params:
+    """Ready-made weights of that model."""
+    return random_params(config.model)
+
+
+@pytest.fixture(scope="session")
+def make_batch(config):
+    """The batch of a step: clouds that differ from place to place, each with a class per point, or images."""
+
+    def make(step: int, *, labels: bool = True, images: bool = False) -> Batch:
+        rng = np.random.default_rng([7, step])
+        b, grid = config.images, config.model.grid
+        far = np.kron(np.eye(config.tuples, dtype=bool), np.array([False, False, True, True]))
+        if images:
+            pictures = rng.poisson(0.5, (b, grid.height, grid.width)).astype(np.float32)
+            return Batch(np.zeros(b, bool), far, 1, images=pictures)
+        return Batch(
+            labelled=np.arange(b) % 3 != 0 if labels else np.zeros(b, bool),
+            negatives=far,
+            positives=1,
+            points=rng.normal(scale=10, size=(b, POINTS, 3)).astype(np.float32),
+            count=rng.integers(POINTS // 2, POINTS, b).astype(np.int32),
+            classes=rng.integers(0, 20, (b, POINTS)).astype(np.int32) if labels else None,
+        )
+
+    return make

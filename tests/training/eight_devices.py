@@ -1,0 +1,118 @@
+"""Tests for eight devices, which `test_devices.py` runs in a process that has them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.training import loop
+from sglpr_jax.training.devices import data_mesh, own_copy, replicate, split
+from sglpr_jax.training.loop import METRICS_FILE, run_steps
+from sglpr_jax.training.metrics_log import read_metrics
+from sglpr_jax.training.state import new_state
+from sglpr_jax.training.step import train_step
+
+from .conftest import Made
+
+STEP = jax.jit(
+    train_step.__wrapped__,
+    static_argnames="config",
+    donate_argnames="state",
+    compiler_options={"xla_backend_optimization_level": 0},
+)
+
+
+@pytest.fixture(scope="session")
+def config(config):
+    """Eight tuples of four places, with stochastic depth."""
+    backbone = dataclasses.replace(config.model.backbone, drop_path=0.3)
+    return dataclasses.replace(config, tuples=8, model=dataclasses.replace(config.model, backbone=backbone))
+
+
+def shared(batch):
+    """Every place of the other tuples is a negative too."""
+    others = ~np.eye(8, dtype=bool)
+    return batch.replace(negatives=batch.negatives | np.repeat(others, 4, axis=1))
+
+
+def make_steps(config, params, batches, devices):
+    """The weights after some steps and the measurements of each."""
+    mesh = data_mesh(config, devices)
+    state = replicate(new_state(config, params=params), mesh)
+    measured = []
+    for batch in batches:
+        before = state
+        with jax.set_mesh(mesh):
+            state, metrics = STEP(before, split(batch, mesh), config=config)
+        measured.append(jax.device_get(metrics))
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before.params))
+    for leaf in jax.tree.leaves(state):
+        assert leaf.sharding.is_fully_replicated and len(leaf.sharding.device_set) == len(devices)
+    return jax.device_get(own_copy(state.params.weights)), measured
+
+
+def assert_same_weights(found, expected):
+    """Equal to float32 rounding; but nothing feels the bias of the keys, and Adam makes steps of its rounding."""
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(found), jax.tree.leaves(expected), strict=True):
+        if jax.tree_util.keystr(path, simple=True, separator="/").endswith("qkv/bias"):
+            a, b = (np.asarray(x).reshape(3, -1)[[0, 2]] for x in (a, b))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["labels", "labels and shared negatives", "chunks", "images"])
+def test_eight_devices_make_the_steps_of_one(config, params, make_batch, kind):
+    batches = [make_batch(step, labels=kind != "images", images=kind == "images") for step in range(3)]
+    if kind == "labels and shared negatives":
+        batches = [shared(batch) for batch in batches]
+    if kind == "chunks":
+        config = dataclasses.replace(config, chunk=16, loss=dataclasses.replace(config.loss, segment_every=2))
+    one = make_steps(config, params, batches, jax.devices()[:1])
+    eight = make_steps(config, params, batches, jax.devices())
+    for found, expected in zip(eight[1], one[1], strict=True):
+        assert found.keys() == expected.keys() and found["triplet"] > 0
+        for name in expected:
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-4)
+    assert_same_weights(eight[0], one[0])
+
+
+def test_a_run_of_eight_devices_is_resumed_on_one(config, params, make_batch, monkeypatch, tmp_path):
+    monkeypatch.setattr(loop, "new_state", lambda c, **_: new_state(c, params=jax.tree.map(jnp.copy, params)))
+    monkeypatch.setattr(loop, "train_step", STEP)
+    config = dataclasses.replace(config, score_every=100)
+
+    def score(params):
+        assert {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(params)} == {1}
+        return {"score": float(sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(params.weights)))}
+
+    def run(folder, *, devices, stop=lambda: False):
+        monkeypatch.setattr(loop, "data_mesh", lambda c: data_mesh(c, jax.devices()[:devices]))
+        return run_steps(config, Made(make_batch), folder, score=score, resume=True, stopped=stop)
+
+    whole = run(tmp_path / "whole", devices=1)
+    checks = iter([False, False, True])
+    assert run(tmp_path / "moved", devices=8, stop=lambda: next(checks)).step == 3
+    moved = run(tmp_path / "moved", devices=1)
+    assert_same_weights(moved.params.weights, whole.params.weights)
+    logs = [read_metrics(tmp_path / name / METRICS_FILE) for name in ("moved", "whole")]
+    assert [line["step"] for line in logs[0]] == [line["step"] for line in logs[1]] == [1, 2, 3, 4, 5, 6, 6]
+    for found, expected in zip(*logs, strict=True):
+        for name in expected.keys() - {"steps_per_second", "data_wait"}:
+            np.testing.assert_allclose(found[name], expected[name], rtol=1e-4)
+
+
+def test_each_device_does_its_share(config, params, make_batch):
+    mesh = data_mesh(config)
+    state = replicate(new_state(config, params=params), mesh)
+    with jax.set_mesh(mesh):
+        lowered = STEP.lower(state, split(make_batch(0), mesh), config=config)
+    whole, share = (each.cost_analysis()["flops"] for each in (lowered, lowered.compile()))
+    assert whole / 10 < share < whole / 6
+
+
+def test_as_many_devices_as_divide_the_step(config, capsys):
+    assert data_mesh(config).size == 8 and capsys.readouterr().err == ""
+    for tuples, chunk, size in ((6, 0, 6), (20, 0, 5), (8, 4, 4), (1, 0, 1)):
+        assert data_mesh(dataclasses.replace(config, tuples=tuples, chunk=chunk)).size == size
+        assert f"using {size} of 8 devices" in capsys.readouterr().err

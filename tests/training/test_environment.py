@@ -1,0 +1,52 @@
+"""A run's folder says with what, where and by which command it was made, each time it was started."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+
+from sglpr_jax.training.environment import git_commit, note_environment
+
+
+def git(folder, *arguments):
+    identity = ("-c", "user.name=tester", "-c", "user.email=tester@example.com")
+    return subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def test_versions_machine_and_command_line_are_noted(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train", "--out", "a folder"])
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    note_environment(tmp_path, seed=3)
+    noted = json.loads((tmp_path / "environment.json").read_text())
+    assert noted["command"] == "train --out 'a folder'"
+    assert noted["packages"].keys() == {"sglpr-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy"}
+    assert (noted["packages"]["jax"], noted["packages"]["numpy"]) == (jax.__version__, np.__version__)
+    assert noted["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert noted["backend"] == jax.default_backend() and len(noted["devices"]) == jax.device_count()
+    assert noted["cores"] >= 1 and noted["seed"] == 3 and noted["resumes"] == []
+    assert noted["variables"]["XLA_FLAGS"] == "--xla_cpu_enable_fast_math=false"
+
+
+def test_a_resumed_run_keeps_what_it_began_with(tmp_path, monkeypatch):
+    for arguments in (["train"], ["train", "--resume"], ["train", "--resume", "--steps", "9"]):
+        monkeypatch.setattr(sys, "argv", arguments)
+        note_environment(tmp_path, seed=0)
+    noted = json.loads((tmp_path / "environment.json").read_text())
+    assert noted["command"] == "train"
+    assert [start["command"] for start in noted["resumes"]] == ["train --resume", "train --resume --steps 9"]
+    assert all(start["packages"] == noted["packages"] for start in noted["resumes"])
+
+
+def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
+    assert git_commit(tmp_path) is None
+    git(tmp_path, "init")
+    assert git_commit(tmp_path) is None  # no commit yet
+    (tmp_path / "file").write_text("a")
+    git(tmp_path, "add", "file")
+    git(tmp_path, "commit", "-m", "first")
+    commit = git(tmp_path, "rev-parse", "HEAD").strip()
+    assert git_commit(tmp_path) == {"commit": commit, "dirty": False}
+    (tmp_path / "file").write_text("b")
+    assert git_commit(tmp_path) == {"commit": commit, "dirty": True}

@@ -1,0 +1,82 @@
+"""Measurements survive interruptions: nothing is lost, nothing is there twice."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sglpr_jax.training.metrics_log import MetricsLog, read_metrics
+
+
+def write(path, steps, *, start_step=0):
+    log = MetricsLog(path, start_step=start_step)
+    for step in steps:
+        log.append(step, {"loss": step / 10})
+    return log
+
+
+def test_lines_come_back(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    log = MetricsLog(path)
+    log.append(1, {"loss": np.float32(0.5), "score": 1})
+    log.append(2, {"loss": float("nan"), "other": np.float32("inf")})
+    log.close()
+    assert read_metrics(path) == [
+        {"step": 1, "loss": 0.5, "score": 1.0},
+        {"step": 2, "loss": None, "other": None},
+    ]
+    assert all(json.loads(line) for line in path.read_text().splitlines())
+
+
+def test_every_line_is_on_disk_at_once(tmp_path):
+    log = write(tmp_path / "metrics.jsonl", [1, 2])
+    assert len(read_metrics(tmp_path / "metrics.jsonl")) == 2
+    log.close()
+
+
+def test_a_resumed_run_drops_the_steps_it_makes_again(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 2, 3, 4]).close()
+    write(path, [3, 4, 5], start_step=2).close()
+    assert [line["step"] for line in read_metrics(path)] == [1, 2, 3, 4, 5]
+
+
+def test_a_line_cut_short_is_left_out_and_does_not_spoil_the_next(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 2]).close()
+    whole = path.read_text()
+    path.write_text(whole[:-5])
+    assert [line["step"] for line in read_metrics(path)] == [1]
+    write(path, [2], start_step=1).close()
+    assert path.read_text() == whole
+
+
+def test_a_run_from_the_start_begins_an_empty_file(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 2]).close()
+    write(path, [1]).close()
+    assert [line["step"] for line in read_metrics(path)] == [1]
+
+
+def test_a_full_disk_is_an_error_that_names_the_file_and_what_was_cut_short_is_repaired(tmp_path, small_files):
+    path = tmp_path / "metrics.jsonl"
+    log = write(path, [1, 2])
+    whole = path.read_bytes()
+    small_files(len(whole) + 10)
+    with pytest.raises(OSError, match=rf"{path}: expected to write it, found: File too large"):
+        log.append(3, {"loss": 0.3})
+    log.close()
+    assert len(path.read_bytes()) == len(whole) + 10  # a part of the third line
+    small_files(len(whole))
+    write(path, [], start_step=2).close()
+    assert path.read_bytes() == whole
+
+
+def test_a_full_disk_leaves_the_metrics_of_a_run_to_be_resumed_as_they_were(tmp_path, small_files):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 2, 3]).close()
+    whole = path.read_bytes()
+    small_files(10)
+    with pytest.raises(OSError, match=rf"{path}: expected to write it, found: File too large"):
+        write(path, [], start_step=3)
+    assert path.read_bytes() == whole
