@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -33,6 +34,7 @@ def run(command: Callable[[], object]) -> None:
     """Run a command line: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
     for chatty in ("absl", "asyncio"):  # pages about a checkpoint that failed, which orbax raises too
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)  # the same at the very end
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _show_unraisable
     jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
