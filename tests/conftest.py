@@ -1,5 +1,6 @@
-"""Test-wide settings: strict ranks, and where the development data lies."""
+"""Test-wide settings: strict ranks, compiled programs that are kept, and where the development data lies."""
 
+import os
 import resource
 from pathlib import Path
 
@@ -13,6 +14,16 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax-tests"
+"""Two thirds of the suite's time is XLA's: what it has compiled is kept, for all workers and for the next time."""
+KEPT_FROM_S = 0.2
+jax.config.update("jax_compilation_cache_dir", str(COMPILED))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", KEPT_FROM_S)
+os.environ |= {  # for the processes that tests start
+    "JAX_COMPILATION_CACHE_DIR": str(COMPILED),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(KEPT_FROM_S),
+}
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

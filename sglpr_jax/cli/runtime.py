@@ -37,8 +37,9 @@ def run(command: Callable[[], object]) -> None:
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)  # the same at the very end
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _show_unraisable
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # where the user has chosen a place, JAX has read it
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     try:
         command()
     except (ValueError, OSError, FloatingPointError, ImportError) as error:

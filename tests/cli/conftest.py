@@ -9,10 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from PIL import Image
 
 from sglpr_jax.sim import Sensor, write_dataset
@@ -83,17 +81,10 @@ def assert_one_line_error(ended: Ended, *words: object) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory):
-    """Compiled programs and simulated recordings go to a folder of this session, not to the user's."""
-    folder = tmp_path_factory.mktemp("cache")
+    """Simulated recordings go to a folder of this session, not to the user's."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(os.environ, "XDG_CACHE_HOME", str(folder))
-        patch.setitem(os.environ, "JAX_COMPILATION_CACHE_DIR", str(folder / "sglpr-jax" / "compiled"))
-        before = jax.config.jax_compilation_cache_dir
-        jax.config.update("jax_compilation_cache_dir", str(folder / "sglpr-jax" / "compiled"))
-        compilation_cache.reset_cache()
+        patch.setitem(os.environ, "XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
-        jax.config.update("jax_compilation_cache_dir", before)
-        compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="session")

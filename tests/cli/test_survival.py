@@ -79,6 +79,14 @@ class Runs:
         return self.metrics.stat().st_ino if self.metrics.exists() else None
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _own_compiled(tmp_path_factory):
+    """A killed process may leave a compiled program half-written; the other tests' are not to be among them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("compiled")))
+        yield
+
+
 @pytest.fixture(scope="module")
 def options(images, preset) -> tuple[object, ...]:
     """Lines of the log and checkpoints fall apart, so that stops come between them."""
