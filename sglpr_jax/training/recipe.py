@@ -18,6 +18,7 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import graft
 from sglpr_jax.models.weights_file import load, save
+from sglpr_jax.models.whitening import unwhitened
 from sglpr_jax.training.batches import TupleBatches, positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
@@ -218,6 +219,7 @@ def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfi
 
 
 def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
-    """These weights, with fresh ones where they have none."""
+    """These weights, with fresh ones where they have none, and without a whitening layer where the model has none."""
     given = weights if isinstance(weights, Params) else load(weights)
+    given = given if config.model.head.whiten else unwhitened(given)
     return graft(given, init(jax.random.key(config.seed), config=config.model))

@@ -3,11 +3,14 @@
 import dataclasses
 import json
 
+import chex
+import numpy as np
 import pytest
 
 from sglpr_jax.data import open_recording
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
+from sglpr_jax.models.whitening import whitened
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.recipe import train
@@ -43,6 +46,15 @@ def test_a_training_is_one_call(images, preset, tmp_path):
     assert settings["recordings"] == ["00"] and settings["test"] is None
     whole = train(config, recordings, out=tmp_path / "whole", cache=tmp_path / "packs")
     assert weights_hash(whole.params) == weights_hash(result.params)
+
+
+@pytest.mark.slow
+def test_a_run_begins_without_the_whitening_layer_of_the_weights_it_is_given(images, preset, random_params, tmp_path):
+    config = dataclasses.replace(load_preset(str(preset)), steps=0)
+    plain = random_params(config.model)
+    samples = np.random.default_rng(0).normal(size=(600, 256)).astype(np.float32)
+    begun = train(config, [open_recording(images, "00")], out=tmp_path / "run", weights=whitened(plain, samples))
+    chex.assert_trees_all_equal(begun.params.weights["place_head"], plain.weights["place_head"])
 
 
 def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images, preset, tmp_path):
