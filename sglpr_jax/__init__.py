@@ -7,7 +7,7 @@
 - describe a place: `load`, `scan_image`, `describe`; `segment`, `forward`; under jit, vmap and grad
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
 - find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
-- train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`
+- train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
 - what a model is: `ModelConfig`, its backbones `SwinConfig`, `RingConfig`, `SglprConfig`, its `HeadConfig`
@@ -36,6 +36,7 @@ from sglpr_jax.retrieval.nearest import Nearest, nearest
 
 if TYPE_CHECKING:
     from sglpr_jax.evaluation.scoring import Evaluation, evaluate
+    from sglpr_jax.models.program import save_program
     from sglpr_jax.sim.simulation import simulate
     from sglpr_jax.training.presets import load_preset as preset
     from sglpr_jax.training.recipe import TrainResult, train
@@ -45,6 +46,7 @@ __version__ = "0.1.0"
 _LATER = {
     "Evaluation": ("evaluation.scoring", "Evaluation"),
     "evaluate": ("evaluation.scoring", "evaluate"),
+    "save_program": ("models.program", "save_program"),
     "simulate": ("sim.simulation", "simulate"),
     "preset": ("training.presets", "load_preset"),
     "TrainResult": ("training.recipe", "TrainResult"),
@@ -102,6 +104,7 @@ __all__ = [
     "rotate_image",
     "rotate_points",
     "save",
+    "save_program",
     "scan_image",
     "segment",
     "shipped_weights",

@@ -6,7 +6,7 @@ GROUPS = {
     "From a scan to a descriptor": ["load", "read_scan", "scan_image", "describe", "segment", "forward", "Outputs"],
     "Recordings": ["open_recording", "recording_names", "Recording", "Record"],
     "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "evaluate", "Evaluation"],
-    "Training": ["preset", "train", "TrainResult", "init", "save", "for_places"],
+    "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],
     "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],
     "What a model is": ["ModelConfig", "SwinConfig", "RingConfig", "SglprConfig", "HeadConfig"],

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -9,24 +10,29 @@ from sglpr_jax.bev import ImageKind
 from sglpr_jax.cli.runtime import progress_bar, run
 from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.models.params import Params
+from sglpr_jax.models.program import ProgramFormat, save_program
 from sglpr_jax.models.weights import for_places
-from sglpr_jax.models.weights_file import WEIGHTS_FILE, load, save
+from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.whiten import whiten
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportCommand:
-    """Write weights to hand out: what describes places, without the segmentation head.
+    """Write weights to hand out: what describes places, without the segmentation head; or a program with them inside.
 
     Examples:
       bin/export --weights runs/small-08 --out mine --half
       bin/export --weights sglpr --whiten my_scans/ --out mine      for one's own sensor, without labels or poses
+      bin/export --weights sglpr --format onnx --out mine           for other runtimes
     """
 
     weights: str
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     out: Path
     """The folder to write; there must be none yet."""
+    format: Literal["weights"] | ProgramFormat = "weights"
+    """`weights` for this package. `stablehlo` (what jax.export reads) and `onnx` are programs that make descriptors of
+    images, with the weights inside, for runtimes that do not know this package."""
     half: bool = False
     """Store float16 numbers, in half the room; they are read as float32."""
     keep_segmentation: bool = False
@@ -45,6 +51,9 @@ def export(command: ExportCommand) -> Path:
     """Do what the command says; returns the folder written. Raises FileExistsError where there is one."""
     if command.out.exists():
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")
+    if command.format != "weights" and (command.half or command.keep_segmentation):
+        flag = "half" if command.half else "keep-segmentation"
+        raise ValueError(f"expected --{flag} with --format weights alone, found it with {command.format}")
     params = load(command.weights)
     params = params if command.keep_segmentation else for_places(params)
     if command.image is not None:
@@ -53,8 +62,12 @@ def export(command: ExportCommand) -> Path:
         recordings = [open_recording(folder, name) for folder in command.whiten for name in recording_names(folder)]
         with progress_bar("embed", max(map(len, recordings))) as show:
             params = whiten(params, recordings, power=command.whiten_power, on_progress=show)
-    save(params, command.out, half=command.half)
-    print(f"{command.out}: {(command.out / WEIGHTS_FILE).stat().st_size / 1e6:.1f} MB of weights")
+    if command.format == "weights":
+        save(params, command.out, half=command.half)
+    else:
+        save_program(params, command.out, format=command.format)
+    size = sum(file.stat().st_size for file in command.out.iterdir())
+    print(f"{command.out}: {size / 1e6:.1f} MB of {'weights' if command.format == 'weights' else command.format}")
     return command.out
 
 

@@ -32,7 +32,7 @@ def to_polar(
     row = (grid.height - 1) / 2 - np.outer(radius, np.sin(angle))
     column = (grid.width - 1) / 2 + np.outer(radius, np.cos(angle))
     taps = _bilinear(row.clip(0, grid.height - 1), column.clip(0, grid.width - 1), grid.height, grid.width)
-    return _read(_flat(image), taps).reshape(len(image), radii, sectors, -1)
+    return _read(_flat(image), taps).reshape(image.shape[0], radii, sectors, -1)
 
 
 def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {grid.height} {grid.width} c"]:
@@ -57,11 +57,11 @@ def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {g
         return _read(flat, taps)
 
     read.defvjp(lambda flat: (read(flat), None), lambda _, cotangent: (_read(cotangent, back),))
-    return read(_flat(polar)).reshape(len(polar), grid.height, grid.width, -1)
+    return read(_flat(polar)).reshape(polar.shape[0], grid.height, grid.width, -1)
 
 
 def _flat(image: Float[Array, "b h w c"]) -> Float[Array, "b h*w c"]:
-    return image.reshape(len(image), -1, image.shape[-1])
+    return image.reshape(image.shape[0], -1, image.shape[-1])
 
 
 def _bilinear(row: np.ndarray, column: np.ndarray, height: int, width: int) -> Taps:

@@ -127,7 +127,7 @@ def forward(
     return outputs
 
 
-def _check_labels(labels: Array | None, shape: tuple[int, ...], config: ModelConfig) -> None:
+def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:
     """Labels must be there exactly where the head reads them."""
     found = "none" if labels is None else f"shape {labels.shape}"
     if config.head.reads_labels and (labels is None or labels.shape != shape):

@@ -89,3 +89,17 @@ def test_whitened_weights_describe_with_the_layer_fitted_to_a_dataset(command, w
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-4)
     again = command("export", "--weights", tmp_path / "out", "--whiten", town, "--out", tmp_path / "again")
     assert again.status == 0, again.error  # in place of the layer that is there
+
+
+@pytest.mark.slow
+def test_a_program_is_written_in_place_of_weights(command, weights, tmp_path):
+    ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--format", "stablehlo")
+    assert ended.status == 0 and "MB of stablehlo" in ended.out, ended.error
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files == {"describe.stablehlo", "config.json", "input.json"}
+
+
+def test_flags_of_weights_are_refused_beside_a_program(command, weights, tmp_path):
+    ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--format", "onnx", "--half")
+    assert_one_line_error(ended, "expected --half with --format weights alone, found it with onnx")
+    assert not (tmp_path / "out").exists()

@@ -32,7 +32,7 @@ class NetVLAD(nn.Module):
         weights = assignment.astype(features.dtype)
         residuals = jnp.einsum("bnd,bnk->bdk", features, weights, preferred_element_type=jnp.float32)
         residuals = residuals - assignment.sum(1)[:, None, :] * centres[None]
-        vlad = l2_normalize(residuals, axis=1).reshape(len(features), -1)
+        vlad = l2_normalize(residuals, axis=1).reshape(features.shape[0], -1)
         y = Linear(self.output, kernel_init=weights_init, name="hidden")(l2_normalize(vlad))
         if not self.gating:
             return y

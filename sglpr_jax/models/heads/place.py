@@ -46,7 +46,7 @@ class PlaceHead(nn.Module):
         config = self.config
         if config.pooling == "spectrum":
             return Spectrum(config.descriptor_size, name="spectrum")(x)
-        locals_ = x.reshape(len(x), -1, x.shape[-1])
+        locals_ = x.reshape(x.shape[0], -1, x.shape[-1])
         if config.pooling == "mean":
             return MeanPooling(config.descriptor_size, name="mean_pooling")(locals_)
         return NetVLAD(config.clusters, config.descriptor_size, name="netvlad")(locals_)

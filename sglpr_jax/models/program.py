@@ -1,0 +1,124 @@
+"""`describe` with its weights inside, as a program for runtimes that do not know this package: StableHLO and ONNX."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.export
+import numpy as np
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.data.density_image import (
+    CEILING_M,
+    EDGE_STEP_M,
+    FIRST_EDGE_M,
+    FLOOR_M,
+    MAX_VOXELS,
+    REACH_M,
+)
+from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M
+from sglpr_jax.files import replacing, write_json
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights_file import CONFIG_FILE, save
+
+ProgramFormat = Literal["stablehlo", "onnx"]
+PLATFORMS = ("cpu", "cuda", "tpu")
+INPUT_FILE = "input.json"
+NEEDS = "pip install 'sglpr-jax[export]'"
+NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
+"""Without its own requirements: they ask for an older Orbax than this package's, and the conversion uses none."""
+
+
+def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:
+    """Write `describe` as a program into `folder`, whole or not at all; one that is there is replaced.
+
+    The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`, which says how
+    a scan becomes the program's input. Both take any number of images (b, h, w) in float32 and return (b, d).
+
+    `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; it needs the package flatbuffers. `onnx`
+    needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; ValueError for a model
+    that reads labels too.
+    """
+    folder = Path(folder)
+    if params.config.head.reads_labels:
+        raise ValueError(f"expected a model that reads images alone, found one that reads {params.config.head.input}")
+    params = for_places(params)
+    program = stablehlo(params) if format == "stablehlo" else onnx(params)
+    with replacing(folder) as new:
+        new.mkdir()
+        (new / f"describe.{format}").write_bytes(program)
+        write_json(new / CONFIG_FILE, dataclasses.asdict(params.config))
+        write_json(new / INPUT_FILE, input_description(params.config))
+    return folder
+
+
+def stablehlo(params: Params) -> bytes:
+    """`describe` of these weights as `jax.export` serialises it, with a symbolic number of images."""
+    try:
+        import flatbuffers  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"StableHLO needs the package flatbuffers: {NEEDS}") from error
+    grid = params.config.grid
+    shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
+    program = jax.jit(lambda bev: describe(params, bev))
+    return bytes(jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32)).serialize())
+
+
+def onnx(params: Params) -> bytes:
+    """`describe` of these weights as an ONNX model, converted in a process of its own.
+
+    The conversion leaves JAX in a state in which the model cannot be called any more.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
+        save(params, weights)
+        command = [sys.executable, "-m", "sglpr_jax.models.onnx_conversion", str(weights), str(program)]
+        on_the_cpu = os.environ | {"JAX_PLATFORMS": "cpu"}
+        ended = subprocess.run(command, capture_output=True, text=True, env=on_the_cpu)
+        if ended.returncode:
+            last = (ended.stderr.strip().splitlines() or ["no message"])[-1]
+            error = ImportError if "ModuleNotFoundError" in last else RuntimeError
+            raise error(f"the conversion to ONNX failed ({last}); it needs: {NEEDS_ONNX}")
+        return program.read_bytes()
+
+
+def input_description(config: ModelConfig) -> dict[str, str]:
+    """How a scan becomes the program's input, in words and formulas, for whoever writes that in another language."""
+    grid = config.grid
+    return {
+        "input": f"bev: float32 [b, {grid.height}, {grid.width}]",
+        "output": f"descriptor: float32 [b, {config.head.descriptor_size}] of length 1; compared by Euclidean distance",
+        "points": "metres in the LiDAR frame: x forward, y left, z up",
+        **(_counts_of_points(grid) if config.image == "points" else _counts_of_voxels(grid)),
+    }
+
+
+def _counts_of_points(grid: Grid) -> dict[str, str]:
+    r, u, v = grid.resolution_m, grid.width // 2, grid.height // 2 - 1
+    return {
+        "cells": f"{r} m wide; a point lies in bev[i, v, u] with u = floor(x / {r}) + {u}, v = {v} - floor(y / {r})",
+        "values": "the number of points in each cell; points outside are left out",
+    }
+
+
+def _counts_of_voxels(grid: Grid) -> dict[str, str]:
+    """What `density_bev`, `even_cells` and `centre_crop` do."""
+    u, v = grid.width // 2, grid.height // 2
+    return {
+        "voxels": f"points with |x| < {REACH_M}, |y| < {REACH_M}, {FLOOR_M} < z < {CEILING_M} are sorted into voxels, "
+        f"floor(point / edge); the edge is the smallest of {FIRST_EDGE_M}, {FIRST_EDGE_M + EDGE_STEP_M}, ... m that "
+        f"leaves at most {MAX_VOXELS} voxels with points; each of these gives one centroid, the mean of its points",
+        "counts": f"n = min(number of centroids, {MAX_COUNT}) for each pair i = trunc(x / {RESOLUTION_M}), "
+        f"j = trunc(y / {RESOLUTION_M}); value = round(255 n / N) {MAX_COUNT} / 255, N being the largest n",
+        "cells": f"the value of (i, j) stands in bev[b, v, u] with u = {u} + i for i > 0, {u - 1} + i for i < 0, and "
+        f"v = {v - 1} - j for j > 0, {v} - j for j < 0; for i = 0 half of it stands in u = {u - 1}, half in u = {u}, "
+        f"for j = 0 half in v = {v - 1} and half in v = {v}; all other cells are 0, and what lies outside is left out",
+    }
