@@ -42,8 +42,8 @@ def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128
 def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
     """Return for each plane its axes p_x = e_x - (e_x . n) n and p_y = n x p_x, n being its normal.
 
-    They are as long as the x axis of space, seen from the normal: from 1 down to 1/2. The published code leaves them so,
-    and a plane that is oblique to x is counted in a smaller picture.
+    They are as long as the x axis of space, seen from the normal: from 1 down to 1/2. The published code leaves them
+    so: the more a plane is oblique to x, the nearer to its centre points are counted.
     """
     phi, theta = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, AZIMUTHS), np.linspace(0, np.pi / 2, ELEVATIONS), indexing="ij"
