@@ -182,6 +182,18 @@ def similarity(a: Int[Array, "rings 360"], b: Int[Array, "rings 360"]) -> Float[
     return jnp.sum(either & (a == b)) / jnp.maximum(either.sum(), 1)
 
 
+def ssc_24(points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"]) -> Float32[np.ndarray, " d"]:
+    """Return `ssc` with the grid `NEWEST`."""
+    return ssc(points, classes, NEWEST)
+
+
+def ssc_24_distance(
+    queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]
+) -> Float32[np.ndarray, "q n"]:
+    """Return `ssc_distance` with the grid `NEWEST`."""
+    return ssc_distance(queries, database, NEWEST)
+
+
 SSC = HandcraftedMethod(
     "ssc",
     'Li et al., "SSC: Semantic Scan Context for Large-Scale Place Recognition", IROS 2021',
@@ -193,6 +205,6 @@ SSC_24 = HandcraftedMethod(
     "ssc-24",
     "SSC with the 24 rings from 5 m of its authors' last version",
     "labelled points",
-    functools.partial(ssc, grid=NEWEST),
-    distance=functools.partial(ssc_distance, grid=NEWEST),
+    ssc_24,
+    distance=ssc_24_distance,
 )
