@@ -29,7 +29,7 @@ class Spectra(NamedTuple):
 def spectra(images: Float[Array, "n rows columns"]) -> Spectra:
     """Return the spectra of images; rows and columns are even."""
     filtered = _high_pass(*images.shape[1:])
-    places = _log_polar_places(*images.shape[1:])
+    places = list(_log_polar_places(*images.shape[1:]))
 
     def of_one(image):
         amplitudes = jnp.fft.fftshift(jnp.abs(jnp.fft.fft2(image))) / image.size * filtered
@@ -48,7 +48,7 @@ def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
     """
 
     def shifts(query, other):
-        turned = jnp.fft.rfft2(_turned_and_scaled(query.image, *_turn_and_scale(query, other)))
+        turned = jnp.fft.rfft2(_turned_and_scaled(query.image, *turn_and_scale(query, other)))
         surface = _correlation(turned, other.spectrum, query.image.shape)
         half = surface.shape[1] // 2
         here, opposite = _peak(surface)[1], _peak(jnp.roll(surface, half, axis=1))[1]
@@ -57,7 +57,7 @@ def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
     return jax.lax.map(lambda query: jax.lax.map(lambda other: shifts(query, other), database), queries)
 
 
-def _turn_and_scale(query: Spectra, other: Spectra) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def turn_and_scale(query: Spectra, other: Spectra) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return by how many radians to turn the query, and by how much it is larger than the other."""
     rows, columns = query.image.shape
     down, right = _peak(_correlation(query.log_polar, other.log_polar, (rows, columns)))
