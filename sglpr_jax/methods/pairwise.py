@@ -31,12 +31,6 @@ def correlate(
     queries: Float32[np.ndarray, "q rings sectors"], database: Float32[np.ndarray, "n rings sectors"]
 ) -> Float32[np.ndarray, "q n sectors"]:
     """Return the sums over rings r and sectors j of queries[r, j] * database[r, j + shift], for all circular shifts."""
-    return correlate_spectra(np.fft.rfft(queries), np.fft.rfft(database), sectors=queries.shape[-1])
-
-
-def correlate_spectra(
-    queries: np.ndarray, database: np.ndarray, *, sectors: int
-) -> Float32[np.ndarray, "q n {sectors}"]:
-    """Return what `correlate` does, from the Fourier transforms along the sectors: complex (q, rings, frequencies)."""
-    by_frequency = np.moveaxis(queries, -1, 0).conj() @ np.moveaxis(database, -1, 0).swapaxes(1, 2)
-    return np.fft.irfft(np.moveaxis(by_frequency, 0, -1), n=sectors)
+    spectra = (np.moveaxis(np.fft.rfft(scans), -1, 0) for scans in (queries, database))
+    by_frequency = next(spectra).conj() @ next(spectra).swapaxes(1, 2)
+    return np.fft.irfft(np.moveaxis(by_frequency, 0, -1), n=queries.shape[-1])

@@ -1,9 +1,12 @@
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.methods.handcrafted.lidar_iris import lidar_iris, lidar_iris_distance, responses
+from sglpr_jax.methods.handcrafted.lidar_iris import FAINT, lidar_iris, lidar_iris_distance, responses
+from sglpr_jax.methods.phase_correlation import Spectra, column_shifts, spectra, turn_and_scale
+from tests.methods import published_iris as published
 
 
 def in_loops(points):
@@ -11,11 +14,9 @@ def in_loops(points):
     image = np.zeros((80, 360), int)
     for x, y, z in points.tolist():
         radius = math.hypot(x, y)
-        if radius >= 80:
-            continue
-        column = math.floor(math.degrees(math.atan2(y, x)) % 360) % 360
+        column = min(math.floor(180 + math.degrees(math.atan2(y, x)) + 0.5), 359)
         bit = math.floor((math.degrees(math.atan2(z, radius)) + 24) / 4)
-        image[math.floor(radius), column] |= 2 ** min(max(bit, 0), 7)
+        image[min(math.floor(radius), 79), column] |= 2 ** min(max(bit, 0), 7)
     return image
 
 
@@ -28,34 +29,6 @@ def response_in_loops(row, wavelength):
         amplitude = np.sum(row * np.exp(-2j * math.pi * k * columns / 360))
         response += gain * amplitude * np.exp(2j * math.pi * k * columns / 360) / 360
     return response
-
-
-def alignment_in_loops(query, other):
-    """The shift at the peak of the phase correlation, from the whole cross-power spectrum summed over the rings."""
-    a, b = np.fft.fft(query), np.fft.fft(other)
-    cross = np.zeros(360, complex)
-    for ring in range(80):
-        product = a[ring].conj() * b[ring]
-        size = np.abs(a[ring]) * np.abs(b[ring])
-        cross += np.where(size > 1e-6, product / np.maximum(size, 1e-6), 0)
-    return int(np.argmax(np.fft.ifft(cross).real))
-
-
-def distance_in_loops(query, other):
-    """The least Hamming distance over the ten shifts, on arrays of bits."""
-    bits, faint = [], []
-    for image in (query, other):
-        found = responses(image.astype(np.float64))
-        bits.append(np.stack([found.real > 0, found.imag > 0]))
-        faint.append(np.stack([np.abs(found) < 1e-4] * 2))
-    shift, best = alignment_in_loops(query, other), 1.0
-    for turn in (0, 180):
-        for step in (-2, -1, 0, 1, 2):
-            other_bits, other_faint = (np.roll(x[1], -(shift + step + turn), axis=-1) for x in (bits, faint))
-            clear = ~(faint[0] | other_faint)
-            if clear.any():
-                best = min(best, np.sum((bits[0] != other_bits) & clear) / np.sum(clear))
-    return best
 
 
 def test_the_image_has_a_bit_for_every_height_with_a_point(places):
@@ -73,14 +46,78 @@ def test_the_filters_are_log_gabor(places, filter_, wavelength):
         np.testing.assert_allclose(responses(image)[filter_, ring], expected, atol=1e-8)
 
 
-def test_the_distance_is_the_hamming_distance_of_the_signs(places, turn_points):
-    images = [lidar_iris(points) for points, _ in places[:3]]
-    images.append(lidar_iris(turn_points(places[0][0], 2.0)))
-    images.append(np.zeros(28800, np.float32))
-    rows = np.stack(images)
-    expected = [[distance_in_loops(a.reshape(80, 360), b.reshape(80, 360)) for b in rows] for a in rows[:3]]
-    np.testing.assert_allclose(lidar_iris_distance(rows[:3], rows), expected, atol=1e-5)
+@pytest.fixture(scope="module")
+def images(places, turn_points):
+    """Images of three places, of the first one turned and moved, and of nothing."""
+    scans = [points for points, _ in places[:3]]
+    scans += [
+        turn_points(scans[0] + np.float32([dx, 0.5, 0]), turn) for dx, turn in ((0.4, 0.031), (1.5, 2.0), (0, 3.1))
+    ]
+    return np.stack([*map(lidar_iris, scans), np.zeros(28800, np.float32)]).reshape(-1, 80, 360)
+
+
+def test_the_alignment_is_the_published_one(images):
+    images = images[:-1].astype(np.float64)
+    found = column_shifts(*[spectra(jnp.asarray(images, jnp.float32) / 255)] * 2)
+    expected = [
+        [(published.shift_of(a, b), published.shift_of(a, np.roll(b, 180, axis=1)) - 180) for b in images]
+        for a in images
+    ]
+    different = ~np.eye(len(images), dtype=bool)  # of an image with itself the peak is at 0, but for rounding
+    np.testing.assert_array_equal((found - np.array(expected))[different] % 360, 0)
+    between = (found[..., 0] - found[..., 1])[different] % 360
+    assert set(np.unique(between)) == {1, 359}, "rounded from the other side"
+
+
+def test_an_image_moved_across_the_rings_is_found_along_the_columns(images):
+    # Along the columns alone, the rings of another distance have nothing in common.
+    image = images[0] / 255
+    moved = np.roll(image, (7, 41), axis=(0, 1))
+    found = column_shifts(*(spectra(jnp.asarray(x)[None]) for x in (image, moved)))
+    assert abs(int(found[0, 0, 0]) - 41) <= 1
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    """A blurred image that ends in nothing."""
+    frequency = np.hypot(*np.meshgrid(*map(np.fft.fftfreq, (360, 80))))
+    blurred = np.fft.ifft2(np.fft.fft2(np.random.default_rng(0).random((80, 360))) / (1 + 40 * frequency)).real
+    return (blurred - blurred.mean()) * np.outer(np.hanning(80), np.hanning(360))
+
+
+@pytest.mark.parametrize(("degrees", "scale"), [(9.0, 1.0), (0.0, 1.15), (4.0, 0.95)])
+def test_turn_and_scale_are_taken_out_first(smooth, degrees, scale):
+    other = np.roll(published.turned_and_scaled(smooth, math.radians(degrees), scale), 25, axis=1)
+    found = column_shifts(*(spectra(jnp.asarray(x, jnp.float32)[None]) for x in (smooth, other)))
+    assert int(found[0, 0, 0]) == published.shift_of(255 * smooth, 255 * other)
+    assert abs(int(found[0, 0, 0]) - 25) <= 3
+
+
+@pytest.mark.parametrize(("down", "right"), [(5, 20), (-5, -60), (5, 60)])
+def test_a_scale_beyond_1_8_is_taken_for_its_inverse(down, right):
+    polar = np.random.default_rng(0).random((80, 360))
+    there, here = (jnp.fft.rfft2(jnp.asarray(x)) for x in (polar, np.roll(polar, (-down, -right), axis=(0, 1))))
+    image = jnp.zeros((80, 360))
+    angle, scale = turn_and_scale(Spectra(image, there, here), Spectra(image, there, there))
+    side = -1 if right == 60 else 1
+    assert float(angle) == pytest.approx(side * math.pi * down / 80, abs=1e-3)
+    assert float(scale) == pytest.approx(math.hypot(40, 180) ** (side * right / 360), rel=1e-2)
+
+
+def test_the_distance_is_the_hamming_distance_of_the_signs(images):
+    rows = images.reshape(len(images), -1)
+    expected = [[published.distance(a.astype(float), b.astype(float)) for b in images] for a in images[:3]]
+    found = lidar_iris_distance(rows[:3], rows)
+    np.testing.assert_allclose(found, expected, atol=1e-4)  # of 230,400 bits, those of a response of 0 are rounding
     assert expected[0][-1] == 1
+
+
+def test_bits_are_faint_by_the_published_measure(images):
+    # The published inverse transform is not divided by 360, and 1e-4 is measured on it.
+    image = images[0].astype(np.float64)
+    faint = np.abs(responses(image)) < FAINT
+    np.testing.assert_array_equal(np.stack([faint, faint], axis=1), published.signs(image)[1])
+    assert faint.mean() < 0.95 * np.mean(np.abs(responses(image)) < 360 * FAINT)
 
 
 def test_whole_degrees_of_turn_change_nothing(places):

@@ -3,11 +3,11 @@ import math
 import numpy as np
 import pytest
 
-from sglpr_jax.methods.handcrafted.m2dp import m2dp
+from sglpr_jax.methods.handcrafted.m2dp import m2dp, plane_axes, signature
 
 
-def in_loops(points):
-    """M2DP from its definition: plane by plane, point by point; the singular vectors by power iteration."""
+def signature_in_loops(points):
+    """The paper's matrix A from its definition: plane by plane, point by point."""
     centred = points.astype(np.float64) - points.mean(axis=0, dtype=np.float64)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     first, second = (axis * (1 if np.sum((centred @ axis) ** 3) >= 0 else -1) for axis in axes[:2])
@@ -16,21 +16,29 @@ def in_loops(points):
     edges = np.linspace(0, math.sqrt(rho), 9) ** 2
     edges[-1] += 0.001
     rows = []
+    for normal in normals():
+        x_axis = np.array([1.0, 0, 0]) - normal[0] * normal
+        y_axis = np.cross(normal, x_axis)
+        counts = np.zeros((8, 16))
+        for point in cloud:
+            x, y = point @ x_axis, point @ y_axis
+            ring = max(k for k in range(8) if math.hypot(x, y) >= edges[k])
+            sector = min(int((math.atan2(y, x) + math.pi) / (2 * math.pi) * 16), 15)
+            counts[ring, sector] += 1
+        rows.append(counts.ravel() / len(cloud))
+    return np.array(rows)
+
+
+def normals():
+    """The normal of every plane: 16 elevations of each of 4 azimuths."""
     for azimuth in np.linspace(-math.pi / 2, math.pi / 2, 4):
         for elevation in np.linspace(0, math.pi / 2, 16):
             flat = math.cos(elevation)
-            normal = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
-            x_axis = np.array([1.0, 0, 0]) - normal[0] * normal
-            x_axis /= np.linalg.norm(x_axis)
-            y_axis = np.cross(normal, x_axis)
-            counts = np.zeros((8, 16))
-            for point in cloud:
-                x, y = point @ x_axis, point @ y_axis
-                ring = max(k for k in range(8) if math.hypot(x, y) >= edges[k])
-                sector = min(int((math.atan2(y, x) + math.pi) / (2 * math.pi) * 16), 15)
-                counts[ring, sector] += 1
-            rows.append(counts.ravel() / len(cloud))
-    a = np.array(rows)
+            yield np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+
+
+def first_singular_vectors(a):
+    """By power iteration."""
     right = np.ones(128)
     for _ in range(200):
         left = a @ right / np.linalg.norm(a @ right)
@@ -38,11 +46,28 @@ def in_loops(points):
     return np.concatenate([left, right])
 
 
+def points_of(seed):
+    return (np.random.default_rng(seed).gamma(2.0, 1.0, (150, 3)) * [9, 4, 1]).astype(np.float32)
+
+
+def test_planes_oblique_to_the_first_axis_keep_their_short_axes():
+    # |p_x| = sqrt(1 - n_x^2): scaled to 1, these planes would put the points into rings farther out.
+    lengths = np.linalg.norm(plane_axes(), axis=-1)
+    expected = [math.sqrt(1 - normal[0] ** 2) for normal in normals()]
+    np.testing.assert_allclose(lengths, np.stack([expected, expected], axis=1), atol=1e-6)
+    assert lengths.min() == pytest.approx(0.5) and np.sum(lengths[:, 0] < 0.97) > 20
+    for seed in (0, 1):
+        points = points_of(seed)
+        found, wanted = signature(points), signature_in_loops(points)
+        for plane in np.flatnonzero(lengths[:, 0] < 0.8):
+            np.testing.assert_allclose(found[plane], wanted[plane], atol=1e-9, err_msg=f"plane {plane}")
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_descriptor_is_the_papers(seed):
-    rng = np.random.default_rng(seed)
-    points = (rng.gamma(2.0, 1.0, (150, 3)) * [9, 4, 1]).astype(np.float32)
-    np.testing.assert_allclose(m2dp(points), in_loops(points), atol=1e-4)
+    points = points_of(seed)
+    np.testing.assert_allclose(signature(points), signature_in_loops(points), atol=1e-9)
+    np.testing.assert_allclose(m2dp(points), first_singular_vectors(signature_in_loops(points)), atol=1e-4)
 
 
 def test_both_halves_are_directions_without_negative_numbers(places):

@@ -6,7 +6,7 @@ import pytest
 from sglpr_jax.methods import pairwise
 from sglpr_jax.methods.handcrafted.lidar_iris import lidar_iris
 from sglpr_jax.methods.handcrafted.scan_context import scan_context
-from sglpr_jax.methods.handcrafted.ssc import ssc
+from sglpr_jax.methods.handcrafted.ssc import ssc, ssc_24
 from sglpr_jax.retrieval.distances import DISTANCES
 
 
@@ -44,6 +44,7 @@ def test_blocks_change_no_distance(places, monkeypatch, name):
         "scan-context": lambda points, _: scan_context(points),
         "lidar-iris": lambda points, _: lidar_iris(points),
         "ssc": ssc,
+        "ssc-24": ssc_24,
     }.get(name, lambda points, _: points[:4].ravel())
     everything = np.stack([rows(*place) for place in places])
     whole = DISTANCES[name](everything, everything)

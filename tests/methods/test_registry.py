@@ -1,18 +1,26 @@
 """Every handcrafted method declares itself in its file, and the registry knows it by that."""
 
+import importlib
 from pathlib import Path
 
 import pytest
 
 from sglpr_jax.methods import handcrafted as package
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.method import HandcraftedMethod
 from sglpr_jax.methods.registry import METHODS
 from sglpr_jax.retrieval.distances import DISTANCES
 
 
 def test_every_file_of_the_folder_is_registered():
-    files = [path for path in Path(package.__path__[0]).glob("*.py") if path.stem != "__init__"]
-    assert len(files) == len(HANDCRAFTED) and ("sglpr", *HANDCRAFTED) == METHODS
+    declared = []
+    for path in Path(package.__path__[0]).glob("*.py"):
+        if path.stem != "__init__":
+            file = importlib.import_module(f"{package.__name__}.{path.stem}")
+            found = [value for value in vars(file).values() if isinstance(value, HandcraftedMethod)]
+            assert found, f"{path.name} declares no method"
+            declared += [method.name for method in found]
+    assert sorted(declared) == sorted(HANDCRAFTED) and ("sglpr", *HANDCRAFTED) == METHODS
 
 
 @pytest.mark.parametrize("name", HANDCRAFTED)

@@ -1,92 +1,190 @@
-import math
+import functools
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.methods.handcrafted.ssc import best_move, best_shift, ssc, ssc_distance
+from sglpr_jax.data import open_recording
+from sglpr_jax.labels import to_classes
+from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, ssc, ssc_distance
+from sglpr_jax.methods.outline_alignment import align, best_move, best_shift
+from tests.methods import published_ssc as published
 
-PRIORITY = {9: 10, 10: 11, 11: 12, 12: 13, 13: 15, 14: 16, 15: 14, 16: 17, 17: 9, 18: 18, 19: 19}
-LANDMARKS = (13, 14, 16, 18, 19)
-RING_M = 45 / 24
-
-
-def in_loops(points, classes):
-    """The descriptor from its definition, point by point."""
-    cells, ranges, kinds = np.zeros((24, 360)), np.full(360, np.inf), np.zeros(360)
-    for (x, y, _), category in zip(points.tolist(), classes.tolist(), strict=True):
-        radius = math.hypot(x, y)
-        sector = math.floor(math.degrees(math.atan2(y, x)) % 360) % 360
-        ring = math.floor((radius - 5) / RING_M)
-        if 0 <= ring < 24:
-            cells[ring, sector] = max(cells[ring, sector], PRIORITY.get(category, 0))
-        if category in LANDMARKS and 0 < radius < ranges[sector]:
-            ranges[sector], kinds[sector] = radius, category
-    return cells, np.where(np.isfinite(ranges), ranges, 0), kinds
+SETTINGS = {PAPER: {"rings": 50, "nearest": 0.0}, NEWEST: {"rings": 24, "nearest": 5.0}}
+STRONGER = (0, 17, 9, 10, 11, 12, 15, 13, 14, 16, 18, 19)
+LANDMARK, ROAD = 13, 9
 
 
-def distance_in_loops(query, other):
-    """Yaw, then move, then the share of equal cells, loop by loop."""
-    (cells_q, ranges_q, kinds_q), (cells_d, ranges_d, kinds_d) = (
-        (row[:8640].reshape(24, 360), row[8640:9000], row[9000:]) for row in (query, other)
-    )
-    costs = [sum(abs(ranges_q[j] - ranges_d[(j + s) % 360]) for j in range(360)) for s in range(360)]
-    shift = costs.index(min(costs))
-    ranges_d, kinds_d = np.roll(ranges_d, -shift), np.roll(kinds_d, -shift)
-    directions = np.exp(1j * np.radians(np.arange(360) + 0.5))
-    fixed, landmarks, move = ranges_q * directions, ranges_d * directions, 0j
-    for _ in range(20):
-        differences = []
-        for j in np.flatnonzero(kinds_d):
-            window = [(j + step) % 360 for step in range(-10, 11)]
-            to_fixed = [fixed[k] - landmarks[j] - move for k in window if kinds_q[k] == kinds_d[j]]
-            if to_fixed:
-                differences.append(min(to_fixed, key=abs))
-        move += np.mean(differences) if differences else 0
-    both = equal = 0
-    for ring in range(24):
-        for sector in range(360):
-            place = (5 + RING_M * (ring + 0.5)) * directions[sector] - move
-            there = math.floor((abs(place) - 5) / RING_M)
-            found = 0
-            if 0 <= there < 24:
-                found = cells_d[there, (math.floor(np.degrees(np.angle(place)) % 360) + shift) % 360]
-            both += cells_q[ring, sector] > 0 and found > 0
-            equal += cells_q[ring, sector] == found > 0
-    return 1 - equal / max(both, 1)
+def unpack(row, grid):
+    """The classes of the fine cells (by ring and sector), and the outline."""
+    ranks = row[:-720].astype(int)[:, None] // 16 ** np.arange(6) % 16
+    return np.array(STRONGER)[ranks].reshape(-1, 1080), row[-720:].reshape(2, 360)
 
 
-def test_the_descriptor_is_the_first_class_of_each_cell_and_the_outline(places):
+def fine_cells(points, classes, grid):
+    sizes = {"rings": grid.fine_rings, "sectors": 1080, "farthest": grid.fine_rings * grid.fine_m}
+    return published.cells_of(points.astype(float), classes, **sizes)
+
+
+def fine_centres(scan, grid):
+    """A point in the middle of every fine cell, of its class."""
+    cells = fine_cells(*scan, grid)
+    ring, sector = np.nonzero(cells)
+    class_of = {priority: category for category, priority in published.PRIORITY.items()}
+    places = (ring + 0.5) * grid.fine_m * np.exp(1j * (np.radians((sector + 0.5) / 3) - np.pi))
+    return np.stack([places.real, places.imag], axis=1), np.array([class_of[p] for p in cells[ring, sector]])
+
+
+@pytest.mark.parametrize("grid", [PAPER, NEWEST])
+def test_the_descriptor_is_the_strongest_class_of_each_cell_and_the_outline(places, grid):
     rng = np.random.default_rng(0)
     random = rng.uniform(-55, 55, (3000, 3)).astype(np.float32), rng.integers(0, 20, 3000).astype(np.int32)
+    assert grid.fine_rings * grid.fine_m >= 50 + 5 * np.sqrt(2)
     for points, classes in (places[0], random):
-        expected = np.concatenate([part.ravel() for part in in_loops(points, classes)])
-        np.testing.assert_allclose(ssc(points, classes), expected, rtol=1e-6)
+        row = ssc(points, classes, grid)
+        assert row.shape == (grid.numbers,) and row.max() < 2**24
+        found, outline = unpack(row, grid)
+        cells = fine_cells(points, classes, grid)
+        np.testing.assert_array_equal(np.vectorize(lambda c: published.PRIORITY.get(c, 0))(found), cells)
+        np.testing.assert_allclose(outline, published.outline_of(points, classes), rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_the_distance_is_the_one_described(places, turn_points):
-    (points, classes), other = places[0], places[1]
-    moved = turn_points(points + np.float32([1.2, -0.7, 0]), 2.5)
-    rows = np.stack([ssc(points, classes), ssc(moved, classes), ssc(*other), np.zeros(9360, np.float32)])
-    found = ssc_distance(rows[:1], rows)[0]
-    # A centre that comes to lie on a border may fall to either side.
-    np.testing.assert_allclose(found, [distance_in_loops(rows[0], row) for row in rows], atol=3e-3)
-    assert found[0] == 0 and found[3] == 1
-    assert found[1] < found[2] - 0.2
+def test_an_outline_keeps_the_last_landmark_of_a_sector():
+    points = np.array([[8.0, 0.05, 0], [20.0, 0.1, 0], [12.0, 0.05, 0], [5.0, 0.02, 0]], np.float32)
+    classes = np.array([LANDMARK, 18, 14, ROAD], np.int32)
+    _, outline = unpack(ssc(points, classes), PAPER)
+    assert outline.any(axis=0).sum() == 1
+    np.testing.assert_allclose(outline[:, 180], [12.0, 0.05])
 
 
-@pytest.mark.slow
-def test_turn_and_move_are_found(places, turn_points):
+def test_rings_begin_at_the_sensor_or_at_five_metres():
+    # Two roads that agree up to 5 m and nowhere else: 5 of 5 + 2 x 5 cells of one sector.
+    def road(*radii):
+        points = np.array([[r + 0.5, 0.01, 0] for r in radii], np.float32)
+        return points, np.full(len(points), ROAD, np.int32)
+
+    here, there = road(*range(5), *range(10, 20, 2)), road(*range(5), *range(21, 31, 2))
+    for grid, expected in ((PAPER, 1 - 5 / 15), (NEWEST, 1.0)):
+        assert ssc_distance(ssc(*here, grid)[None], ssc(*there, grid)[None], grid)[0, 0] == pytest.approx(expected)
+
+
+def test_cells_empty_in_one_scan_count_against_it():
+    points = np.array([[10.0 + k, 0.01, 0] for k in range(8)], np.float32)
+    row = ssc(points, np.full(8, ROAD, np.int32))[None]
+    half = ssc(points[:4], np.full(4, ROAD, np.int32))[None]
+    other = ssc(points, np.array([ROAD] * 6 + [11] * 2, np.int32))[None]
+    assert ssc_distance(row, row)[0, 0] == 0
+    assert ssc_distance(row, half)[0, 0] == ssc_distance(half, row)[0, 0] == pytest.approx(0.5)
+    assert ssc_distance(row, other)[0, 0] == pytest.approx(0.25)
+
+
+def chain(offsets):
+    """Outlines of landmarks far apart from each other, of which the k-th is offsets[k] metres behind in x."""
+    query, other = np.zeros((2, 2, 360), np.float32)
+    for k, offset in enumerate(offsets):
+        sector = 20 + 60 * k
+        query[:, sector] = 20 * np.cos(np.radians(sector)), 20 * np.sin(np.radians(sector))
+        other[:, sector] = query[:, sector] - [offset, 0]
+    return query, other
+
+
+@pytest.mark.parametrize(
+    ("offsets", "moved"),
+    [
+        ((2.0,), 2.0),
+        ((2.0, 5.5), 2.0),  # beyond the gate of 3 m, and it stays there
+        ((2.0, 4.5), 3.25),  # beyond it at first
+        ((2.0, 4.999, 6.499), 4.499),  # joins so late that 20 steps do not end
+    ],
+)
+def test_partners_within_three_metres_move_the_scan_step_by_step(offsets, moved):
+    query, other = chain(offsets)
+    expected, steps = published.move_of(query, other)
+    assert expected[0] == pytest.approx(moved, abs=0.01)
+    found = best_move(jnp.asarray(query), jnp.asarray(other))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    if len(offsets) == 3:
+        assert steps > 25 and abs(published.move_of(query, other, limit=20)[0][0] - moved) > 0.1
+
+
+def test_a_move_beyond_five_metres_is_given_up():
+    for offsets, given_up in (((2.0, 4.999, 6.499), False), ((2.9, 5.0, 6.9, 7.9), True)):
+        query, other = chain(offsets)
+        free, _ = published.move_of(query, other)
+        assert (free[0] > 5) == given_up
+        shift, move = align(jnp.asarray(query), jnp.asarray(other))
+        assert int(shift) == 0
+        np.testing.assert_allclose(move, [0, 0] if given_up else free, atol=1e-4)
+        _, backwards = align(jnp.asarray(-query), jnp.asarray(-other))
+        np.testing.assert_allclose(backwards, -move, atol=1e-4)
+
+
+def outline(seed):
+    rng = np.random.default_rng(seed)
+    ranges = (rng.uniform(4, 30, 24).repeat(15) + rng.normal(0, 1, 360)) * (rng.random(360) < 0.7)
+    angles = np.radians(np.arange(360) - 179.5)
+    return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)]).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_outlines_are_aligned_as_published(seed):
+    query = outline(seed)
+    turned = published.rotate(np.roll(query, 100 + seed, axis=1), 100 + seed)
+    for other in (outline(seed + 100), (turned + [[1.2], [-0.8]] * turned.any(axis=0)).astype(np.float32)):
+        shift, move = align(jnp.asarray(query), jnp.asarray(other))
+        expected = published.alignment(query.astype(float), other.astype(float))
+        assert int(shift) == expected[0]
+        np.testing.assert_allclose(move, expected[1], atol=1e-3)
+
+
+def test_landmarks_of_different_classes_are_partners(places, turn_points):
     points, classes = places[0]
-    here = ssc(points, classes)
-    turned = ssc(turn_points(points, np.radians(77)), classes)
-    shift = best_shift(jnp.asarray(here[8640:9000]), jnp.asarray(turned[8640:9000]))
-    assert abs(int(shift) - 77) <= 1
-    move = np.float32([0.8, -0.5, 0])
-    there = ssc(points - move, classes)
-    found = best_move(jnp.asarray(here[8640:].reshape(2, 360)), jnp.asarray(there[8640:].reshape(2, 360)))
+    move = np.float32([1.2, -0.7, 0])
+    landmarks = np.isin(classes, published.LANDMARKS)
+    renamed = np.where(landmarks, 13 + 14 - np.clip(classes, 13, 14), classes).astype(np.int32)
+    here, there = ssc(points, classes), ssc(points - move, renamed)
+    assert (classes != renamed).sum() > 1000
+    shift, found = align(jnp.asarray(here[-720:].reshape(2, 360)), jnp.asarray(there[-720:].reshape(2, 360)))
+    assert int(shift) == 0
     np.testing.assert_allclose(found, move[:2], atol=0.3)
+    turned = ssc(turn_points(points, np.radians(77)), classes)[-720:].reshape(2, 360)
+    assert abs(int(best_shift(jnp.hypot(*here[-720:].reshape(2, 360)), jnp.hypot(*turned))) - 77) <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grid", [PAPER, NEWEST])
+def test_the_distance_is_the_published_one_of_the_middles_of_the_fine_cells(places, turn_points, grid):
+    points, classes = places[0]
+    scans = [
+        (points, classes),
+        (turn_points(points + np.float32([1.2, -0.7, 0]), 2.5), classes),
+        (turn_points(points, np.radians(77)), classes),
+        places[1],
+    ]
+    rows = np.stack([ssc(*scan, grid) for scan in scans])
+    found = ssc_distance(rows[:1], rows, grid)[0]
+    kept = functools.partial(fine_centres, grid=grid)
+    expected = [published.distance(scans[0], scan, **SETTINGS[grid], moved=kept) for scan in scans]
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert found[0] == 0
+    assert found[1] < found[3] - 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("grid", "distances"),
+    # Of a port of the authors' code to the three pairs: 24 rings from 5 m, and the paper's 50 from the sensor.
+    [(NEWEST, (0.424, 0.220, 0.850)), (PAPER, (0.464, 0.313, 0.846))],
+)
+def test_real_pairs_are_as_far_apart_as_by_the_authors_code(shared, grid, distances):
+    pairs = (("00", 52, 4501), ("08", 720, 1500), ("00", 88, 850))
+    for (name, *frames), distance in zip(pairs, distances, strict=True):
+        recording = open_recording(shared / "data/kitti_odometry", name)
+        rows = [recording.ids.index(f"{frame:06d}") for frame in frames]
+        scans = [(recording.points(row), to_classes(recording.labels(row))) for row in rows]
+        assert published.distance(*scans, **SETTINGS[grid]) == pytest.approx(distance, abs=5e-4)
+        here, there = (ssc(*scan, grid)[None] for scan in scans)
+        assert ssc_distance(here, there, grid)[0, 0] == pytest.approx(distance, abs=0.01)
 
 
 @pytest.mark.parametrize("classes", [np.zeros(40), np.full(40, 1), np.full(40, 9)])

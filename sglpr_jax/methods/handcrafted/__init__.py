@@ -9,11 +9,11 @@ from sglpr_jax.methods.handcrafted.polar_fft import POLAR_FFT
 from sglpr_jax.methods.handcrafted.random_vector import RANDOM
 from sglpr_jax.methods.handcrafted.scan_context import SCAN_CONTEXT
 from sglpr_jax.methods.handcrafted.solid import SOLID
-from sglpr_jax.methods.handcrafted.ssc import SSC
+from sglpr_jax.methods.handcrafted.ssc import SSC, SSC_24
 from sglpr_jax.methods.handcrafted.thumbnail import THUMBNAIL
 from sglpr_jax.methods.method import HandcraftedMethod
 
 HANDCRAFTED: dict[str, HandcraftedMethod] = {
-    method.name: method for method in (SCAN_CONTEXT, M2DP, LIDAR_IRIS, SSC, SOLID, POLAR_FFT, THUMBNAIL, RANDOM)
+    method.name: method for method in (SCAN_CONTEXT, M2DP, LIDAR_IRIS, SSC, SSC_24, SOLID, POLAR_FFT, THUMBNAIL, RANDOM)
 }
 """Every handcrafted method, by the name that a command line takes."""

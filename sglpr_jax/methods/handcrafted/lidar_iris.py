@@ -2,11 +2,13 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Complex64, Complex128, Float, Float32, Float64, Int, UInt64
+from jaxtyping import Bool, Complex128, Float, Float32, Float64, Int, UInt64
 
 from sglpr_jax.methods.method import HandcraftedMethod
-from sglpr_jax.methods.pairwise import correlate_spectra, in_blocks
+from sglpr_jax.methods.pairwise import in_blocks
+from sglpr_jax.methods.phase_correlation import Spectra, column_shifts, spectra
 
 RINGS = 80
 COLUMNS = 360
@@ -21,10 +23,10 @@ WAVELENGTHS = tuple(18 * 1.6**scale for scale in range(4))
 """In columns, of the four log-Gabor filters."""
 SIGMA = 0.75
 """Width of a filter: its standard deviation over its frequency."""
-FAINT = 1e-4
-"""Responses below it have no certain sign."""
+FAINT = 1e-4 / COLUMNS
+"""Responses below it have no certain sign. The published 1e-4 is that of an inverse transform without 1 / columns."""
 NEAR = 2
-"""Columns that are tried to either side of the alignment, and of the opposite one."""
+"""Columns that are tried to either side of each alignment."""
 
 BLOCK = 128
 
@@ -33,24 +35,24 @@ def lidar_iris(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "28800
     """Return the LiDAR-Iris image, 80 rings of 1 m x 360 degrees, flat: whole numbers 0 to 255.
 
     Bit k of a pixel is set where it has a point (metres, z up) with floor((elevation + 24 degrees) / 4 degrees) = k;
-    lower and higher elevations count for the first and the last bit. Points from 80 m on are left out.
+    lower and higher elevations count for the first and the last bit, points from 79 m on for the last ring. Columns are
+    degrees from the back, rounded to the nearest; what is nearest to 360 counts for column 359, not for 0.
     """
     x, y, z = points.astype(np.float64).T
-    radius, azimuth = np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360
-    inside = radius < RINGS * RING_M
-    ring = np.floor(radius / RING_M).astype(np.int64)
-    column = np.floor(azimuth).astype(np.int64) % COLUMNS
+    radius, azimuth = np.hypot(x, y), 180 + np.degrees(np.arctan2(y, x))
+    ring = np.minimum(radius / RING_M, RINGS - 1).astype(np.int64)
+    column = np.minimum(azimuth + 0.5, COLUMNS - 1).astype(np.int64)
     elevation = np.degrees(np.arctan2(z, radius))
-    bit = np.clip(np.floor((elevation - LOWEST_DEG) / BIT_DEG), 0, HEIGHT_BITS - 1).astype(np.int64)
+    bit = np.clip((elevation - LOWEST_DEG) / BIT_DEG, 0, HEIGHT_BITS - 1).astype(np.int64)
     image = np.zeros(NUMBERS, np.int64)
-    np.bitwise_or.at(image, (ring * COLUMNS + column)[inside], 1 << bit[inside])
+    np.bitwise_or.at(image, ring * COLUMNS + column, 1 << bit)
     return image.astype(np.float32)
 
 
 class _Iris(NamedTuple):
     """What is compared of n images. The words of a column hold its bits of all rings, filters and parts."""
 
-    phases: Complex64[np.ndarray, "n 80 frequencies"]
+    spectra: Spectra
     bits: UInt64[np.ndarray, "n 360 words"]
     faint: UInt64[np.ndarray, "n 360 words"]
 
@@ -58,17 +60,17 @@ class _Iris(NamedTuple):
 def lidar_iris_distance(
     queries: Float32[np.ndarray, "q 28800"], database: Float32[np.ndarray, "n 28800"]
 ) -> Float32[np.ndarray, "q n"]:
-    """Return the smallest Hamming distance, 0 to 1, over ten shifts: 2 columns about the alignment and its opposite.
+    """Return the smallest Hamming distance, 0 to 1, over the shifts within 2 columns of an alignment.
 
     D = min over shifts of |(q xor d) and not m| / |not m|, over the bits of 80 x 360 pixels x 4 filters x 2 parts: the
     signs of the real and of the imaginary part of the log-Gabor response. m marks bits that are faint in either image.
-    It is 1 where all are. The alignment is the peak of the phase correlation along the columns.
+    It is 1 where all are. There are two alignments, by `phase_correlation.column_shifts`.
     """
 
     def compare(queries, database):
-        shift = np.argmax(correlate_spectra(queries.phases, database.phases, sectors=COLUMNS), axis=-1)
+        shifts = np.asarray(column_shifts(queries.spectra, database.spectra))
         return np.stack(
-            [_hamming(bits, faint, database, row) for bits, faint, row in zip(*queries[1:], shift, strict=True)]
+            [_hamming(bits, faint, database, row) for bits, faint, row in zip(*queries[1:], shifts, strict=True)]
         )
 
     return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare)
@@ -89,11 +91,8 @@ def responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "f
 
 def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> _Iris:
     images = rows.reshape(-1, RINGS, COLUMNS)
-    spectra = np.fft.rfft(images)
-    size = np.abs(spectra)
-    phases = np.divide(spectra, size, out=np.zeros_like(spectra), where=size > 0)
     bits, faint = zip(*map(_encode, images), strict=True)
-    return _Iris(phases, np.stack(bits), np.stack(faint))
+    return _Iris(spectra(jnp.asarray(images) / 255), np.stack(bits), np.stack(faint))
 
 
 def _encode(image: Float32[np.ndarray, "80 360"]) -> tuple[UInt64[np.ndarray, "360 words"], ...]:
@@ -113,18 +112,18 @@ def _hamming(
     bits: UInt64[np.ndarray, "360 words"],
     faint: UInt64[np.ndarray, "360 words"],
     database: _Iris,
-    shift: Int[np.ndarray, " n"],
+    shifts: Int[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance of one image to each of the database, whose column j + shift[i] lies on its column j."""
-    best = np.ones(len(shift))
-    rows = np.arange(len(shift))[:, None]
-    for step in range(-NEAR, NEAR + 1):
-        for half in (0, COLUMNS // 2):
-            columns = (np.arange(COLUMNS) + (shift + step + half)[:, None]) % COLUMNS
+    """Return the distance of one image to each of the database, whose column j + shift lies on its column j."""
+    best = np.ones(len(shifts))
+    rows = np.arange(len(shifts))[:, None]
+    for shift in shifts.T:
+        for step in range(-NEAR, NEAR + 1):
+            columns = (np.arange(COLUMNS) + (shift + step)[:, None]) % COLUMNS
             clear = ~(faint | database.faint[rows, columns])
             unlike = np.bitwise_count((bits ^ database.bits[rows, columns]) & clear).sum(axis=(1, 2), dtype=np.int64)
             counted = np.bitwise_count(clear).sum(axis=(1, 2), dtype=np.int64)
-            best = np.minimum(best, np.divide(unlike, counted, out=np.ones(len(shift)), where=counted > 0))
+            best = np.minimum(best, np.divide(unlike, counted, out=np.ones(len(shifts)), where=counted > 0))
     return best
 
 

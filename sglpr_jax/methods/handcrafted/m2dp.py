@@ -15,31 +15,41 @@ NUMBERS = PLANES + BINS
 
 
 def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
-    """Return [u1; v1], 64 + 128 numbers, of the counts A = U S V^T. No points give zeros.
+    """Return [u1; v1], 64 + 128 numbers, of `signature(points)` = U S V^T. No points give zeros.
 
-    The points (metres) are moved to their mean and rotated into their principal axes. Plane (theta, phi) goes through
-    the mean with the normal (cos theta cos phi, cos theta sin phi, sin theta), for 16 elevations theta from 0 to 90
-    degrees and 4 azimuths phi from -90 to 90; the projection of the x axis is its axis. A (64 x 128) has for every
-    plane the share of the points in each of 8 rings x 16 sectors; the rings end at (k sqrt(rho) / 8)^2, rho being the
-    farthest point's distance. A is nowhere negative, so neither need u1 and v1 be: that settles their signs.
+    The signature is nowhere negative, so neither need u1 and v1 be: that settles their signs.
     """
     if not len(points):
         return np.zeros(NUMBERS, np.float32)
-    aligned = np.ascontiguousarray(_align(points.astype(np.float64)).T, np.float32)
-    farthest = np.sqrt(np.max(np.sum(aligned**2, axis=0)))
-    counts = np.stack([_count(np.einsum("ad,dn->an", axes, aligned), farthest) for axes in plane_axes()])
-    left, _, right = np.linalg.svd(counts / len(points), full_matrices=False)
+    left, _, right = np.linalg.svd(signature(points), full_matrices=False)
     return np.abs(np.concatenate([left[:, 0], right[0]])).astype(np.float32)
 
 
+def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128"]:
+    """Return for every plane the share of the points in each of its 8 rings x 16 sectors; n is at least 1.
+
+    The points (metres) are moved to their mean and rotated into their principal axes. Plane (theta, phi) goes through
+    the mean with the normal (cos theta cos phi, cos theta sin phi, sin theta), for 16 elevations theta from 0 to 90
+    degrees and 4 azimuths phi from -90 to 90; its axes are those of `plane_axes`. The rings end at (k sqrt(rho) / 8)^2,
+    rho being the farthest point's distance.
+    """
+    aligned = np.ascontiguousarray(_align(points.astype(np.float64)).T, np.float32)
+    farthest = np.sqrt(np.max(np.sum(aligned**2, axis=0)))
+    counts = np.stack([_count(np.einsum("ad,dn->an", axes, aligned), farthest) for axes in plane_axes()])
+    return counts / len(points)
+
+
 def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
-    """Return for each plane its unit x axis, the x axis of space seen from the normal, and its y axis."""
+    """Return for each plane its axes p_x = e_x - (e_x . n) n and p_y = n x p_x, n being its normal.
+
+    They are as long as the x axis of space, seen from the normal: from 1 down to 1/2. The published code leaves them
+    so: the more a plane is oblique to x, the nearer to its centre points are counted.
+    """
     phi, theta = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, AZIMUTHS), np.linspace(0, np.pi / 2, ELEVATIONS), indexing="ij"
     )
     normal = np.stack([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)], axis=-1).reshape(-1, 3)
     x = np.array([1.0, 0, 0]) - normal[:, :1] * normal
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack([x, np.cross(normal, x)], axis=1).astype(np.float32)
 
 
