@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from sglpr_jax.fields import check_value, field_types, require
 from sglpr_jax.models.config import ModelConfig
 
-ADDED_LATER = {"head.whiten": False}
+ADDED_LATER = {"head.means": (), "head.whiten": False}
 """Fields that files handed out before do not have, and what such files mean."""
 
 
