@@ -1,13 +1,16 @@
-"""Files and folders written whole or not at all, JSON read back, and errors that name their file."""
+"""Files and folders written whole or not at all, JSON and arrays read back, and errors that name their file."""
 
 import contextlib
 import json
 import os
 import shutil
 import uuid
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 
 class WriteError(OSError):
@@ -68,6 +71,25 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(set(names)) < len(names):
         raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} stands there twice")
     return dict(pairs)
+
+
+def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
+    """Every array of an .npz file, without pickle.
+
+    Raises FileNotFoundError, or ValueError naming the file and what was `expected`, where it is none or damaged.
+    """
+    expected = f"{path}: expected {expected}"
+    if not path.is_file():
+        raise FileNotFoundError(f"{expected}, found no such file")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{expected}, found {path.stat().st_size} bytes that are no whole .npz archive")
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except MemoryError as error:  # a header that promises more than there is
+        raise ValueError(f"{expected}, found a broken one: an array larger than the memory") from error
+    except Exception as error:  # zip, zlib, numpy's header parser: each has kinds of its own
+        raise ValueError(f"{expected}, found a broken one: {error}") from error
 
 
 @contextlib.contextmanager
