@@ -14,6 +14,8 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int, Num, Shaped
 
+from sglpr_jax.fields import Positive, Size, check_fields
+
 ImageKind = Literal["points", "density"]
 """What the cells of a scan's image count: its points (equation 1), or voxels, as in the ready-made images of KITTI."""
 
@@ -22,16 +24,15 @@ ImageKind = Literal["points", "density"]
 class Grid:
     """The image plane of equation 1: cells of `resolution_m` metres, the sensor at the corner of the middle four."""
 
-    resolution_m: float = 0.2
-    height: int = 224
-    width: int = 224
+    resolution_m: Positive = 0.2
+    height: Size = 224
+    width: Size = 224
 
     def __post_init__(self):
-        if not self.resolution_m > 0:
-            raise ValueError(f"a grid's resolution must be a positive number of metres, found {self.resolution_m}")
+        check_fields(self)
         for name, size in (("height", self.height), ("width", self.width)):
-            if size <= 0 or size % 2:
-                raise ValueError(f"a grid's {name} must be a positive even number of cells, found {size}")
+            if size % 2:
+                raise ValueError(f"{name}: expected an even number of cells, found {size}")
 
 
 def _cell_of_point(points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array, "*b"] | None) -> Int[Array, "*b n"]:

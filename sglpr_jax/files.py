@@ -1,13 +1,16 @@
-"""Files and folders written whole or not at all, and errors of writing that name their file."""
+"""Files and folders written whole or not at all, JSON and arrays read back, and errors that name their file."""
 
 import contextlib
 import json
 import os
 import shutil
 import uuid
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 
 class WriteError(OSError):
@@ -46,6 +49,47 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file whole or not at all. Raises WriteError where it cannot be written."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file. Raises FileNotFoundError, or ValueError where it is damaged; both name the file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a JSON file, found none")
+    return parse_json(path.read_bytes(), source=path)
+
+
+def parse_json(text: str | bytes, *, source: Path | str) -> Any:
+    """What JSON says. Raises ValueError, naming `source`, where it is none or gives one name twice."""
+    try:
+        return json.loads(text, object_pairs_hook=_without_doubles)
+    except (ValueError, RecursionError) as error:  # not JSON, not even text, or brackets without end
+        raise ValueError(f"{source}: expected JSON, found none that is whole ({error})") from error
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{next(name for name in names if names.count(name) > 1)!r} stands there twice")
+    return dict(pairs)
+
+
+def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
+    """Every array of an .npz file, without pickle.
+
+    Raises FileNotFoundError, or ValueError naming the file and what was `expected`, where it is none or damaged.
+    """
+    expected = f"{path}: expected {expected}"
+    if not path.is_file():
+        raise FileNotFoundError(f"{expected}, found no such file")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{expected}, found {path.stat().st_size} bytes that are no whole .npz archive")
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except MemoryError as error:  # a header that promises more than there is
+        raise ValueError(f"{expected}, found a broken one: an array larger than the memory") from error
+    except Exception as error:  # zip, zlib, numpy's header parser: each has kinds of its own
+        raise ValueError(f"{expected}, found a broken one: {error}") from error
 
 
 @contextlib.contextmanager

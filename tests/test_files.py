@@ -4,7 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from sglpr_jax.files import WriteError, half_written, remove_half_written, replacing, write_json, writing
+from sglpr_jax.files import (
+    WriteError,
+    half_written,
+    read_json,
+    remove_half_written,
+    replacing,
+    write_json,
+    writing,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -71,3 +79,17 @@ def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     assert [path.name for path in half_written(tmp_path, "a.png")] == [".a.png.3.tmp"]
     remove_half_written(tmp_path)
     assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]
+
+
+def test_json_comes_back(tmp_path):
+    write_json(tmp_path / "a.json", {"a": [1, None, "b"]})
+    assert read_json(tmp_path / "a.json") == {"a": [1, None, "b"]}
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
+def test_json_that_is_damaged_names_its_file(tmp_path, content):
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"^{tmp_path}/a\.json: expected JSON, found none that is whole"):
+        read_json(tmp_path / "a.json")
+    with pytest.raises(FileNotFoundError, match=rf"^{tmp_path}/b\.json: expected a JSON file, found none"):
+        read_json(tmp_path / "b.json")

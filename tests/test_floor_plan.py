@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "sglpr_jax"
 FLOORS = (
-    ("bev", "files", "labels", "losses", "metrics", "poses", "progress", "revisits"),
+    ("bev", "fields", "files", "labels", "losses", "metrics", "poses", "progress", "revisits"),
     ("data",),
     ("models", "sim"),
     ("methods",),

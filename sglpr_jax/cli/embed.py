@@ -9,6 +9,7 @@ import tyro
 from sglpr_jax.cli.runtime import progress_bar, run
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.formats.trajectory import PoseFormat
 from sglpr_jax.data.reader import PoseChoice
 from sglpr_jax.methods.registry import MethodName, method_named
 from sglpr_jax.retrieval.embed import embed
@@ -21,6 +22,7 @@ class EmbedCommand:
     Examples:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
       bin/embed --weights simulated --data my_scans/ --out mine.npz --skip-bad
+      bin/embed --weights simulated --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
     """
 
@@ -38,6 +40,12 @@ class EmbedCommand:
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
     """What the scans of a plain folder are, where their names do not tell."""
+    poses: Path | None = None
+    """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
+    pose_format: PoseFormat = "auto"
+    """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
+    times: Path | None = None
+    """Seconds, one number a line, where no times.txt lies beside the scans."""
     rotate: bool = False
     """Rotate every scan about z by its own random angle first."""
     seed: int = 0
@@ -54,7 +62,15 @@ def embed_recording(command: EmbedCommand) -> Path:
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
-    recording = open_recording(command.data, command.seq, pose_source=command.pose_source, format=command.format)
+    recording = open_recording(
+        command.data,
+        command.seq,
+        pose_source=command.pose_source,
+        format=command.format,
+        poses=command.poses,
+        pose_format=command.pose_format,
+        times=command.times,
+    )
     method = method_named(command.method, command.weights, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         file = embed(

@@ -10,6 +10,7 @@ from sglpr_jax.cli.runtime import console, progress_bar, run
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
 from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.formats.trajectory import PoseFormat
 from sglpr_jax.data.readers.kitti import PoseChoice
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
@@ -45,6 +46,12 @@ class StressCommand:
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
     """What the scans of a plain folder are, where their names do not tell."""
+    poses: Path | None = None
+    """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
+    pose_format: PoseFormat = "auto"
+    """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
+    times: Path | None = None
+    """Seconds, one number a line, where no times.txt lies beside the scans."""
     seed: int = 0
     """A scan's corruption is a function of it and the scan's number."""
     batch: int = 16
@@ -55,7 +62,15 @@ def run_stress_test(command: StressCommand) -> Path:
     """Do what the command says; returns the folder written."""
     stress_protocols(command.protocol)  # what is wrong with these is said first
     chosen_corruptions(command.corruption)
-    recording = open_recording(command.data, command.seq, pose_source=command.pose_source, format=command.format)
+    recording = open_recording(
+        command.data,
+        command.seq,
+        pose_source=command.pose_source,
+        format=command.format,
+        poses=command.poses,
+        pose_format=command.pose_format,
+        times=command.times,
+    )
     if recording.has_images and not command.corruption:
         print(f"sequence {recording.name} has only images, which can only be rotated", file=sys.stderr)
     found = stress_test(
@@ -68,6 +83,8 @@ def run_stress_test(command: StressCommand) -> Path:
         batch=command.batch,
         progress=progress_bar,
     )
+    for name, reason in found.left_out.items():
+        print(f"{name} left out: {reason}", file=sys.stderr)
     console().print(found)
     for path in write_stress_test(found, command.out):
         print(f"written: {path}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.formats.trajectory import PoseFormat
 from sglpr_jax.data.recording import Recording
 
 PoseChoice = Literal["auto", "semantickitti", "kitti"]
@@ -19,6 +20,11 @@ class ReadOptions:
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
     """What the scans of a plain folder are."""
+    poses: Path | None = None
+    """The pose file of a plain folder, where it does not lie beside the scans."""
+    pose_format: PoseFormat = "auto"
+    times: Path | None = None
+    """Seconds, one number a line."""
 
 
 @dataclass(frozen=True)
@@ -33,3 +39,5 @@ class Reader:
     """Open one of them."""
     rank: int = 5
     """Where two layouts fit one folder, that of the lower rank is taken; then the first by name of its file."""
+    takes_poses: bool = False
+    """Whether `ReadOptions.poses` and `times` concern it; else the layout has pose files of its own."""

@@ -15,6 +15,7 @@ from rich.table import Table
 from sglpr_jax.evaluation import report
 from sglpr_jax.evaluation.false_positives import FalsePositive, worst_false_positives
 from sglpr_jax.evaluation.inputs import Input, read_input
+from sglpr_jax.evaluation.inputs.agreement import check_agreement
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
 from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import chosen_protocols
@@ -111,13 +112,15 @@ def evaluate_methods(
 ) -> Evaluation:
     """Score several methods by the same protocols: those that fit the first one, where none is named or `all` are.
 
-    `file` is what the first was read from. Raises ValueError, naming the method, where one cannot be scored.
+    `file` is what the first was read from. Raises ValueError, naming the method, where one cannot be scored or is of
+    other frames than the first.
     """
     source = next(iter(methods.values()))
     chosen = chosen_protocols(source, protocols)
     results = {}
     for name, of_one in methods.items():
         try:
+            check_agreement(source, of_one)
             results[name] = score(of_one, chosen_protocols(of_one, chosen))
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error

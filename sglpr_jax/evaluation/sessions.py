@@ -16,7 +16,7 @@ from sglpr_jax.evaluation.protocols.choice import ALL
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
 from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
 APART_M = 25.0
 """The largest distance at which a protocol here calls two frames one place."""
@@ -120,6 +120,11 @@ def evaluate_session_files(
 ) -> AcrossSessions:
     """Do as `evaluate_sessions` with descriptor files. Raises ValueError for files of another kind too."""
     files = [_read(path) for path in (database, *queries)]
+    for path, file in zip(queries, files[1:], strict=True):
+        try:
+            check_same_method(files[0], file)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
     found = evaluate_sessions(files[0], files[1:], names, published=published)
     made_with = {"files": [str(path) for path in queries], "database": str(database)}
     return replace(found, about=f"{database}: {found.about}", made_with=made_with)

@@ -1,7 +1,7 @@
 """Methods on a clean recording and on corrupted ones by the same protocols, side by side."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,8 @@ class StressTest(PrintsItself):
     rows: Sequence[StressRow]
     config: Mapping[str, Any]
     """What was tested, as JSON can hold it."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Why which corruptions were left out, by their names."""
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain values for `json.dump`, a row each."""

@@ -38,11 +38,12 @@ def stress_test(
 
     `corruptions` are names or kinds of them; none named: all, of ready-made images rotation alone. `protocols` are
     names of those that score descriptors; none named: top-1 F1max and pairs F1max. Descriptors are kept in `folder` and
-    used again where they were made alike. `progress` shows how far each embedding is. Raises ValueError where the
-    recording has no poses or no revisit, or a corruption or method does not fit it.
+    used again where they were made alike. `progress` shows how far each embedding is. A corruption that needs the rings
+    of the lasers is left out of a recording that does not tell them; the result says so. Raises ValueError where the
+    recording has no poses or no revisit, another corruption or a method does not fit it, or no corruption is left.
     """
     chosen = stress_protocols(protocols)
-    fitting = fitting_corruptions(recording, corruptions, seed)
+    fitting, left_out = fitting_corruptions(recording, corruptions, seed)
     (folder / "descriptors").mkdir(parents=True, exist_ok=True)
     rows = []
     for i, corruption in enumerate((CLEAN, *fitting)):
@@ -62,7 +63,8 @@ def stress_test(
             _check_revisits(recording, results[name], chosen)
         rows.append(StressRow(corruption.name, corruption.kind, corruption.label, results))
     title = f"sequence {recording.name}, {len(recording)} scans"
-    return StressTest(title, rows, _config(recording, methods, fitting, chosen, seed))
+    config = {**_config(recording, methods, fitting, chosen, seed), "left_out": left_out}
+    return StressTest(title, rows, config, left_out)
 
 
 def stress_protocols(names: Sequence[str]) -> list[str]:
@@ -75,20 +77,38 @@ def stress_protocols(names: Sequence[str]) -> list[str]:
     return chosen
 
 
-def fitting_corruptions(recording: Recording, names: Sequence[str], seed: int) -> tuple[Corruption, ...]:
-    """Return the corruptions asked for, each tried on the first scan; of ready-made images rotation where none is.
+def fitting_corruptions(
+    recording: Recording, names: Sequence[str], seed: int
+) -> tuple[tuple[Corruption, ...], dict[str, str]]:
+    """Return the corruptions asked for, each tried on three scans; of ready-made images rotation where none is.
 
-    Raises ValueError where the recording has no poses, or one does not fit it.
+    Beside them, why which others were left out: those that need rings, where the scans have none. Raises ValueError
+    where the recording has no poses, another one does not fit it, or none is left.
     """
     if recording.positions is None:
         raise ValueError(f"sequence {recording.name}: expected poses to score against, found none")
     if recording.has_images and not names:
-        return (ROTATION,)
-    chosen = chosen_corruptions(names)
-    for corruption in chosen:
-        if corruption != ROTATION:
-            corrupted(recording, corruption, seed=seed).points(0)
-    return chosen
+        return (ROTATION,), {}
+    fitting, left_out = [], {}
+    for corruption in chosen_corruptions(names):
+        try:
+            _try_on(recording, corruption, seed)
+            fitting.append(corruption)
+        except ValueError as error:
+            if recording.has_images or not corruption.needs_lasers:
+                raise
+            left_out[corruption.name] = str(error)
+    if not fitting:
+        raise ValueError(next(iter(left_out.values())))
+    return tuple(fitting), left_out
+
+
+def _try_on(recording: Recording, corruption: Corruption, seed: int) -> None:
+    """Corrupt the first, the middle and the last scan. Raises what that raises."""
+    if corruption != ROTATION:
+        scans = corrupted(recording, corruption, seed=seed)
+        for row in sorted({0, len(recording) // 2, len(recording) - 1}):
+            scans.points(row)
 
 
 def write_stress_test(found: StressTest, folder: Path) -> list[Path]:

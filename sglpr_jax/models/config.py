@@ -8,6 +8,7 @@ from typing import Literal
 
 from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data.density_image import check_density_grid
+from sglpr_jax.fields import NotNegative, Size, SizeOrNone, Sizes, check_fields
 from sglpr_jax.labels import Categories, taxonomy
 from sglpr_jax.models.backbones.rings import RingConfig
 from sglpr_jax.models.backbones.sglpr import SglprConfig
@@ -29,28 +30,29 @@ class HeadConfig:
     (RS), or both (RB+RS). Only `features` needs a backbone; the others have none, and no segmentation head."""
     tap: Literal["pixels", "tokens"] = "pixels"
     """`pixels`: the decoder's map, before the last linear layer. `tokens`: the features that it is decoded from."""
-    channels: tuple[int, ...] = (128, 256, 512)
+    channels: Sizes = (128, 256, 512)
     """Of each convolution."""
-    kernels: tuple[int, ...] = (3, 3, 3)
-    strides: tuple[int, ...] = (2, 2, 2)
-    means: tuple[int, ...] = ()
+    kernels: Sizes = (3, 3, 3)
+    strides: Sizes = (2, 2, 2)
+    means: Sizes = ()
     """How many neighbouring sectors of a polar map become one after each convolution. With these the strides are along
     the radius alone, and convolutions and CBAM go around, so that a rotation of the scan is a shift. (): as in the
     paper."""
     cbam: bool = True
     """Weight the map by channel and by place first."""
-    cbam_reduction: int = 16
+    cbam_reduction: Size = 16
     """Channels for each hidden unit of CBAM's channel gate."""
     pooling: Literal["netvlad", "mean", "spectrum"] = "netvlad"
     """`mean`: the mean over the map and a linear layer stand in for NetVLAD (table 4). `spectrum`: the amplitudes of
     the map's Fourier transform along the sectors of a polar image (models/heads/spectrum.py)."""
-    clusters: int = 64
+    clusters: Size = 64
     """Of NetVLAD."""
-    descriptor_size: int = 256
+    descriptor_size: Size = 256
     whiten: bool = False
     """Whether a last linear layer spreads the descriptors evenly over their directions (models/whitening.py)."""
 
     def __post_init__(self):
+        check_fields(self)
         if not len(self.channels) == len(self.kernels) == len(self.strides):
             raise ValueError(
                 "the head needs as many kernels and strides as channels, found "
@@ -97,25 +99,31 @@ class ModelConfig:
     """How point counts become network input: as they are, log(1 + n), or min(n, 10) / 10."""
     field: Literal["square", "circle"] = "square"
     """`circle` blanks the cells outside the largest circle, so that a rotation moves nothing in or out of view."""
-    blind_m: float = 0.0
+    blind_m: NotNegative = 0.0
     """Blanks the cells nearer than this to the sensor: they hold the vehicle's own body."""
     range_channel: bool = False
     """A second input channel with every cell's distance: how many points the bare ground returns depends on it, and
     windowed attention knows only relative positions."""
-    polar: tuple[int, int] | None = None
+    polar: tuple[Size, Size] | None = None
     """(radii, sectors): let the backbone see the image in polar form, where a rotation of the scan is a shift."""
     backbone: BackboneConfig = SwinConfig()
     head: HeadConfig = HeadConfig()
     """The place head."""
     categories: Categories = 20
     """Into how many categories labels are sorted (figure 9, docs/reference/labels.md); 0: no segmentation head."""
-    detail: int = 0
+    detail: SizeOrNone = 0
     """Width of a layer that shows the segmentation head the image beside the features. 0: none, as in the paper."""
     compute: Literal["float32", "bfloat16"] = "float32"
     """In what matrices are multiplied and images convolved. Weights, norms, softmax, NetVLAD's sums, the descriptor and
     the losses are float32 all the same."""
 
     def __post_init__(self):
+        check_fields(self)
+        reach_m = min(self.grid.height, self.grid.width) * self.grid.resolution_m / 2
+        if self.blind_m >= reach_m:
+            raise ValueError(
+                f"blind_m: expected less than the {reach_m:g} m that the image reaches, found {self.blind_m}"
+            )
         if self.head.reads_labels and not self.categories:
             raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
         if self.image == "density":

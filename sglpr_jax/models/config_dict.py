@@ -1,16 +1,20 @@
-"""A model's configuration from the plain values of a JSON file, every one of which must have its field's type."""
+"""A model's configuration from the plain values of a JSON file, every one of which must fit its field."""
 
 import dataclasses
 import types
 import typing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
+from sglpr_jax.fields import check_value, field_types, require
 from sglpr_jax.models.config import ModelConfig
+
+ADDED_LATER = {"head.means": (), "head.whiten": False}
+"""Fields that files handed out before do not have, and what such files mean."""
 
 
 def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
-    """What `dataclasses.asdict` was made of; fields that are not there have their defaults.
+    """What `dataclasses.asdict` was made of; every field must be there.
 
     Raises ValueError naming `source`, the field, what was expected and what was found.
     """
@@ -20,55 +24,52 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
         raise ValueError(f"{source}: {error}") from error
 
 
-def _read(expected: Any, value: Any, field: str) -> Any:
-    """The value of a field, of a type that a configuration has: a dataclass, a union, Literal, tuple or plain type."""
-    if dataclasses.is_dataclass(expected):
-        return _read_dataclass(expected, value, field)
-    if isinstance(expected, types.UnionType):
-        return _read(_member(expected, value, field), value, field)
-    if typing.get_origin(expected) is Literal:
-        choices = typing.get_args(expected)
-        fits = any(type(value) is type(choice) and value == choice for choice in choices)
-        return _require(value, fits, f"one of {', '.join(map(repr, choices))}", field)
-    if typing.get_origin(expected) is tuple:
-        return _read_tuple(typing.get_args(expected), value, field)
-    if expected is types.NoneType:
-        return _require(value, value is None, "null", field)
-    if expected is float and type(value) is int:
-        return float(value)
-    return _require(value, type(value) is expected, f"a value of type {expected.__name__}", field)
+def _read(annotation: Any, value: Any, field: str) -> Any:
+    """The value of a field: dictionaries become dataclasses, lists tuples and whole numbers floats where one is due."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if dataclasses.is_dataclass(annotation):
+        return _read_dataclass(annotation, value, field)
+    if origin in (typing.Union, types.UnionType):
+        return None if value is None and types.NoneType in parts else _read(_member(parts, value, field), value, field)
+    if origin is tuple:
+        require(value, isinstance(value, list | tuple), "a list", field)
+        items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        require(value, len(value) == len(items), f"a list of {len(items)}", field)
+        value = tuple(_read(item, one, field) for item, one in zip(items, value, strict=True))
+    check_value(value, annotation, field)
+    plain = parts[0] if origin is Annotated else annotation
+    return float(value) if plain is float else value
 
 
 def _read_dataclass(expected: Any, value: Any, field: str) -> Any:
-    _require(value, isinstance(value, dict), f"the fields of a {expected.__name__}", field)
-    hints = typing.get_type_hints(expected)
-    unknown = min(set(value) - set(hints), default=None)
-    _require(unknown, unknown is None, f"the fields of a {expected.__name__} ({', '.join(hints)})", field)
+    require(value, isinstance(value, dict), f"the fields of a {expected.__name__}", field)
     prefix = f"{field}." if field else ""
-    return expected(**{name: _read(hints[name], one, prefix + name) for name, one in value.items()})
+    annotations = field_types(expected)
+    older = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER}
+    value = {**older, **value}
+    unknown, missing = (min(map(str, names), default=None) for names in _differing(value, annotations))
+    every = f"the fields of a {expected.__name__} ({', '.join(annotations)})"
+    require(unknown, unknown is None, every, field)
+    if missing is not None:
+        raise ValueError(f"{field}{': ' if field else ''}expected {every}, found no {missing!r}")
+    read = {name: _read(annotations[name], one, prefix + name) for name, one in value.items()}
+    try:
+        return expected(**read)
+    except ValueError as error:  # the fields do not go together
+        raise ValueError(f"{prefix.removesuffix('.')}{': ' if prefix else ''}{error}") from error
 
 
-def _member(union: Any, value: Any, field: str) -> Any:
-    """The member of a union that a value belongs to: a dataclass says its `kind`, None is None."""
-    members = typing.get_args(union)
-    if not isinstance(value, dict):
-        plain = [member for member in members if not dataclasses.is_dataclass(member)]
-        return types.NoneType if value is None and types.NoneType in plain else next(iter(plain or members))
-    structured: list[Any] = [member for member in members if dataclasses.is_dataclass(member)]
-    kinds = {member.kind: member for member in structured}
-    _require(value.get("kind"), value.get("kind") in kinds, f"a kind, {' or '.join(kinds)}", field)
-    return kinds[value["kind"]]
+def _differing(value: dict[str, Any], annotations: dict[str, Any]) -> tuple[set[str], set[str]]:
+    return set(value) - set(annotations), set(annotations) - set(value)
 
 
-def _read_tuple(item_types: tuple[Any, ...], value: Any, field: str) -> tuple[Any, ...]:
-    _require(value, isinstance(value, list | tuple), "a list", field)
-    if item_types[-1] is Ellipsis:
-        return tuple(_read(item_types[0], one, field) for one in value)
-    _require(value, len(value) == len(item_types), f"a list of {len(item_types)}", field)
-    return tuple(_read(type_, one, field) for type_, one in zip(item_types, value, strict=True))
-
-
-def _require(value: Any, fits: bool, expected: str, field: str) -> Any:
-    if not fits:
-        raise ValueError(f"{field}{': ' if field else ''}expected {expected}, found {value!r:.60}")
-    return value
+def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:
+    """The member of a union that a value belongs to; of several configurations the one of its `kind`."""
+    configs: dict[str, Any] = {member.kind: member for member in members if dataclasses.is_dataclass(member)}
+    if not configs:
+        return next(member for member in members if member is not types.NoneType)
+    names = " or ".join(member.__name__ for member in configs.values())
+    require(value, isinstance(value, dict), f"the fields of a {names}", field)
+    kind = value.get("kind")
+    require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)
+    return configs[kind]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from typing import Any
 
 import flax.traverse_util
@@ -53,8 +54,13 @@ def for_places(params: Params) -> Params:
 
 def weights_hash(params: Params) -> str:
     """SHA-256 over names, shapes and values of all weights, so that a result can say which weights made it."""
+    return hash_of(by_name(params.weights))
+
+
+def hash_of(named: Mapping[str, Any]) -> str:
+    """SHA-256 over names, shapes, types and values of arrays, in the order of their names."""
     digest = hashlib.sha256()
-    for name, leaf in sorted(by_name(params.weights).items()):
+    for name, leaf in sorted(named.items()):
         digest.update(f"{name} {leaf.shape} {leaf.dtype}".encode())
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()

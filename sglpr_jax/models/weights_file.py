@@ -2,37 +2,47 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors
 import safetensors.numpy
 
-from sglpr_jax.files import replacing
+from sglpr_jax.files import read_json, replacing
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.config_dict import config_from_dict
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import weights_folder
-from sglpr_jax.models.weights import as_tree, by_name, weight_shapes
+from sglpr_jax.models.weights import as_tree, by_name, hash_of, weight_shapes
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
+CHECKSUM = "sha256"
+"""Under this name the header of the weights has the `hash_of` what is stored."""
+STORED = ("F32", "F16")
+"""The types that weights are stored in, as safetensors calls them."""
 
 
 def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
     """Write weights and their configuration into `folder`, whole or not at all; one that is there is replaced.
 
-    With `half` as float16, in half the room. Raises OSError, naming `folder`, where they cannot be written, ValueError
-    for a weight too large for float16.
+    With `half` as float16, in half the room. Raises OSError, naming `folder`, where they cannot be written; ValueError,
+    naming the weight, where one is not of its configuration's shape, no float32, not finite or too large for float16.
     """
     folder = Path(folder)
     # safetensors writes an array's memory as it lies, so a transposed view would come back scrambled.
     values = {name: np.asarray(leaf, order="C") for name, leaf in by_name(params.weights).items()}
+    _check_shapes({name: leaf.shape for name, leaf in values.items()}, params.config, source=folder)
+    for name, leaf in values.items():
+        if leaf.dtype != np.float32:
+            raise ValueError(f"{folder}: expected {name} as float32, found {leaf.dtype}")
+        _check_finite(name, leaf, source=folder)
     values = {name: _halved(name, leaf) for name, leaf in values.items()} if half else values
     with replacing(folder) as new:
         new.mkdir()
-        (new / WEIGHTS_FILE).write_bytes(safetensors.numpy.save(values))  # save_file hides the OSError of a full disk
+        content = safetensors.numpy.save(values, {CHECKSUM: hash_of(values)})
+        (new / WEIGHTS_FILE).write_bytes(content)  # save_file hides the OSError of a full disk
         (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
     return folder
 
@@ -52,12 +62,45 @@ def load(weights: Path | str) -> Params:
             raise FileNotFoundError(
                 f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing"
             )
-    config = config_from_dict(_read_json(folder / CONFIG_FILE), source=folder / CONFIG_FILE)
+    config = config_from_dict(read_json(folder / CONFIG_FILE), source=folder / CONFIG_FILE)
+    values = _read_tensors(folder / WEIGHTS_FILE, config)
+    return Params(as_tree({name: np.asarray(leaf, np.float32) for name, leaf in values.items()}), config)
+
+
+def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
+    """The weights as they are stored, once they are known to be those that the configuration asks for, and whole."""
     try:
-        values = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+        with safetensors.safe_open(path, framework="np") as file:
+            about = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            _check_shapes({name: tuple(part.get_shape()) for name, part in about.items()}, config, source=path)
+            for name, part in about.items():
+                if part.get_dtype() not in STORED:
+                    raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)}, found {part.get_dtype()}")
+            values, metadata = {name: file.get_tensor(name) for name in about}, file.metadata() or {}
     except safetensors.SafetensorError as error:
-        raise ValueError(f"{folder / WEIGHTS_FILE}: not a whole safetensors file ({error})") from error
-    return Params(_checked(values, config, source=folder / WEIGHTS_FILE), config)
+        raise ValueError(f"{path}: not a whole safetensors file ({error})") from error
+    for name, leaf in values.items():
+        _check_finite(name, leaf, source=path)
+    if metadata.get(CHECKSUM, found := hash_of(values)) != found:
+        raise ValueError(f"{path}: expected weights of SHA-256 {metadata[CHECKSUM]}, found {found}: it is damaged")
+    return values
+
+
+def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, source: Path) -> None:
+    """Raise ValueError, naming a weight that differs, unless they are all those that the configuration asks for."""
+    expected = weight_shapes(config)
+    if expected != found:
+        name = min(set(expected.items()) ^ set(found.items()))[0]
+        raise ValueError(
+            f"{source}: not the weights of its configuration: {name} should have shape "
+            f"{expected.get(name, 'none (no such weight)')}, found {found.get(name, 'none (missing)')}"
+        )
+
+
+def _check_finite(name: str, leaf: np.ndarray, *, source: Path) -> None:
+    broken = leaf.size - int(np.isfinite(leaf).sum())
+    if broken:
+        raise ValueError(f"{source}: expected finite weights, found {broken} of {leaf.size} others in {name}")
 
 
 def _halved(name: str, leaf: np.ndarray) -> np.ndarray:
@@ -65,23 +108,3 @@ def _halved(name: str, leaf: np.ndarray) -> np.ndarray:
     if np.abs(leaf).max(initial=0) > largest:
         raise ValueError(f"{name}: expected weights up to {largest} to be written as float16, found larger ones")
     return leaf.astype(np.float16)
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:  # not JSON, or not even text
-        raise ValueError(f"{path}: expected JSON ({error})") from error
-
-
-def _checked(values: dict[str, np.ndarray], config: ModelConfig, *, source: Path) -> Any:
-    """The tree of weights, in float32, after checking it against the shapes that the configuration asks for."""
-    expected = weight_shapes(config)
-    found = {name: leaf.shape for name, leaf in values.items()}
-    if expected != found:
-        name = sorted(set(expected.items()) ^ set(found.items()))[0][0]
-        raise ValueError(
-            f"{source}: not the weights of its configuration: {name} should have shape "
-            f"{expected.get(name, 'none (no such weight)')}, found {found.get(name, 'none (missing)')}"
-        )
-    return as_tree({name: np.asarray(leaf, np.float32) for name, leaf in values.items()})

@@ -1,6 +1,5 @@
 """The trained models and descriptors behind the tables: made where they are missing, kept in one folder per run."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from sglpr_jax.data import Recording, open_recording, recording_names
 from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION
 from sglpr_jax.data.readers.kitti import PoseChoice
 from sglpr_jax.evaluation.learning_curves import LearningCurves
-from sglpr_jax.files import write_json
+from sglpr_jax.files import read_json, write_json
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import handcrafted, network
 from sglpr_jax.models.params import Params
@@ -53,7 +52,9 @@ class Runs:
             return False
         require_same_settings(folder, self.config_of(variant), self._settings(seq))
         done = folder / DONE_FILE
-        steps = json.loads(done.read_text())["steps"] if done.is_file() else 0
+        steps = read_json(done) if done.is_file() else {"steps": 0}
+        if not isinstance(steps, dict) or type(steps := steps.get("steps")) is not int:
+            raise ValueError(f'{done}: expected {{"steps": a number}}, found {steps!r:.60}')
         if steps > self.config.steps:
             raise ValueError(f"{folder}: expected a run of up to {self.config.steps} steps, found {steps}")
         return steps == self.config.steps

@@ -1,15 +1,14 @@
 """The descriptor file: what embedding writes and evaluation reads, whatever method made the descriptors."""
 
 import json
-import zipfile
-import zlib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sglpr_jax.files import replacing
+from sglpr_jax.files import parse_json, read_arrays, replacing
 
 FORMAT = "sglpr-jax descriptors 2"
 """Stands in every file; its number grows when an older reader could no longer understand one."""
@@ -17,7 +16,8 @@ FORMAT_1 = "sglpr-jax descriptors 1"
 """Knew no distance: its descriptors are compared by L2."""
 
 REQUIRED = ("about", "ids", "descriptors")
-ABOUT = ("sequence", "pose_source", "config", "weights_hash", "distance")
+ABOUT = {"sequence": str, "pose_source": str | None, "config": dict, "weights_hash": str, "distance": str}
+"""What stands in `about` beside the format, and of what types."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class DescriptorFile:
     """The descriptors of one sequence, with all that scoring them needs.
 
     Row i of every array is frame `ids[i]`, in the order of recording. Raises ValueError where the numbers of rows
-    differ or a value is not finite.
+    differ, a value is not finite, an id stands there twice or times run backwards.
     """
 
     sequence: str
@@ -50,11 +50,19 @@ class DescriptorFile:
         n = len(self.ids)
         if n == 0:
             raise ValueError("expected at least one scan, found none")
+        twice = next((name for name, times in Counter(self.ids).items() if times > 1), None)
+        if twice is not None:
+            raise ValueError(f"expected an id of its own for each scan, found {twice!r} {self.ids.count(twice)} times")
         _check("descriptors", self.descriptors, np.float32, (n, None))
+        if self.descriptors.shape[1] == 0:
+            raise ValueError(f"expected descriptors of at least one number, found {self.descriptors.shape}")
         if self.positions is not None:
             _check("positions", self.positions, np.float64, (n, 3))
         if self.times is not None:
             _check("times", self.times, np.float64, (n,))
+            backwards = np.flatnonzero(np.diff(self.times) < 0)
+            if backwards.size:
+                raise ValueError(f"expected times in order, found an earlier one in row {backwards[0] + 1}")
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -74,13 +82,13 @@ class DescriptorFile:
         Raises FileNotFoundError, or ValueError naming the file, what was expected and what was found.
         """
         path = Path(path)
-        arrays = _read_archive(path)
+        arrays = read_arrays(path, expected="a descriptor file (.npz)")
         if not set(REQUIRED) <= set(arrays):
             raise ValueError(f"{path}: expected arrays {', '.join(REQUIRED)}; found {', '.join(arrays) or 'none'}")
         about = _read_about(path, arrays["about"])
         try:
             return cls(
-                ids=tuple(arrays["ids"].tolist()),
+                ids=_ids(arrays["ids"]),
                 descriptors=arrays["descriptors"],
                 positions=arrays.get("positions"),
                 times=arrays.get("times"),
@@ -105,26 +113,41 @@ def _check(name: str, array: np.ndarray, dtype: type, shape: tuple[int | None, .
         raise ValueError(f"expected finite {name}, found others in {broken.size} rows, the first in row {broken[0]}")
 
 
-def _read_archive(path: Path) -> dict[str, np.ndarray]:
-    """Return every array of an .npz file; one clear error for a file that is not one or is cut short."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a descriptor file, found none")
-    expected = f"{path}: expected a descriptor file (.npz)"
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{expected}, found {path.stat().st_size} bytes that are no whole .npz archive")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{expected}, found a broken one: {error}") from error
+def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
+    """Raise ValueError unless the descriptors of both files can be compared: one method, one model, the same weights.
+
+    What the two were made of may differ: another recording, another rotation.
+    """
+    for what in ("numbers", "distance", "method", "model", "weights"):
+        ours, theirs = _made_by(a)[what], _made_by(b)[what]
+        if ours != theirs:
+            raise ValueError(
+                f"expected the descriptors of {b.sequence} to be made as those of {a.sequence}, with {what} "
+                f"{_short(ours)}, found {_short(theirs)}"
+            )
+
+
+def _made_by(file: DescriptorFile) -> dict[str, Any]:
+    config = {name: file.config.get(name) for name in ("method", "model", "grid")}
+    return {
+        "numbers": file.descriptors.shape[1],
+        "distance": file.distance,
+        "method": config["method"],
+        "model": json.loads(json.dumps([config["model"], config["grid"]])),  # as a file has them: tuples are lists
+        "weights": file.weights_hash,
+    }
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 64 else f"{text[:61]}..."
 
 
 def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
     """Return the file's JSON part; ValueError where another program or version wrote it."""
-    try:
-        about = json.loads(str(text))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: expected JSON in `about`, found {str(text)[:40]!r}") from error
+    if text.ndim != 0 or text.dtype.kind != "U":
+        raise ValueError(f"{path}: expected JSON in `about`, found an array {text.dtype} {text.shape}")
+    about = parse_json(str(text), source=f"{path}, `about`")
     found = about.get("format") if isinstance(about, dict) else about
     if found == FORMAT_1:
         about = {"distance": "l2", **about}
@@ -132,4 +155,14 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
         raise ValueError(f"{path}: expected format {FORMAT!r}, found {found!r}")
     if not set(ABOUT) <= set(about):
         raise ValueError(f"{path}: expected {', '.join(f'`{name}`' for name in ABOUT)}, found {', '.join(about)}")
+    for name, kind in ABOUT.items():
+        if not isinstance(about[name], kind):
+            raise ValueError(f"{path}: expected `{name}` as {kind}, found {about[name]!r:.60}")
     return about
+
+
+def _ids(names: np.ndarray) -> tuple[str, ...]:
+    """The ids of an archive; ValueError where they are no row of names."""
+    if names.ndim != 1 or names.dtype.kind != "U":
+        raise ValueError(f"expected ids as a row of names, found {names.dtype} {names.shape}")
+    return tuple(names.tolist())

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.retrieval.distances import distance_function
 
 BLOCK = 512
@@ -53,8 +53,8 @@ def nearest(
 
     Without a `database` a query looks among the frames before it in its own recording, of which the last
     `exclude_frames` and those less than `exclude_s` seconds old are left out: they show where it still is. Equally near
-    places come in the order of the database. Raises ValueError where the two files' descriptors cannot be compared, and
-    for seconds where there are no times.
+    places come in the order of the database. Raises ValueError where the files are not of one method
+    and one set of weights, and for seconds where there are no times.
 
     Example:
       print(nearest(file))              # places that one recording comes back to
@@ -88,12 +88,7 @@ def _old_enough(
 
 
 def _check(queries: DescriptorFile, database: DescriptorFile, k: int, seconds: float) -> None:
-    ours, theirs = ((file.distance, file.descriptors.shape[1]) for file in (queries, database))
-    if ours != theirs:
-        raise ValueError(
-            f"expected descriptors of {ours[1]} numbers compared by {ours[0]}, as those of {queries.sequence}, found "
-            f"{theirs[1]} numbers compared by {theirs[0]} in {database.sequence}"
-        )
+    check_same_method(queries, database)
     if k < 1:
         raise ValueError(f"expected k of 1 or more, found {k}")
     if seconds > 0 and queries.times is None:

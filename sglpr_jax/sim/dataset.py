@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from sglpr_jax.files import replacing
+from sglpr_jax.files import read_json, replacing
 from sglpr_jax.sim.drive import RATE_HZ, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
@@ -119,12 +119,10 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    try:
-        return dict(json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"{path}: expected the settings of a simulated dataset, found no such JSON ({error})"
-        ) from error
+    settings = read_json(path)
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path}: expected the settings of a simulated dataset, found {settings!r:.60}")
+    return settings
 
 
 def _write_drive(

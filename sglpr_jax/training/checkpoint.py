@@ -1,9 +1,15 @@
-"""Checkpoints of a training run: atomic, the newest and the best kept. The one file that knows orbax."""
+"""Checkpoints of a training run: atomic, with checksums, the newest and the best kept. The one file that knows orbax.
 
+17/               one checkpoint: weights, optimizer, metrics, what was measured and not logged yet, checksums.json
+damaged-17/       one that is not as it was written; it was set aside
+"""
+
+import asyncio
 import contextlib
 import os
 import re
 import shutil
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +18,12 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
+from orbax.checkpoint.path import atomicity
 
 from sglpr_jax.models.params import Params
+from sglpr_jax.training.checksums import damage, write_checksums
 from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.hosts import is_first_host, on_all_hosts
 from sglpr_jax.training.state import TrainState, new_state
 
 _KEPT_LATEST = 2
@@ -24,20 +33,34 @@ _OUTDATED = "outdated"
 """Checkpoints are moved here whole before they are deleted: one deleted in part would look like a checkpoint."""
 
 
+class _WithChecksums(atomicity.AtomicRenameTemporaryPath):
+    """A checkpoint under its temporary name, which gets its checksums before its own name."""
+
+    async def finalize(self) -> None:
+        """Called once for each item, and once for all of them."""
+        if self.get_final().name.isdecimal():
+            await asyncio.to_thread(write_checksums, Path(self.get()))
+        await super().finalize()
+
+
 class Checkpoints:
     """The checkpoints in one folder; weights and optimiser are separate items, so that either can be read alone."""
 
     def __init__(self, folder: Path):
+        """Damaged checkpoints are named on stderr and set aside. Raises ValueError where no other one is there."""
         self._folder = folder.resolve()
         self._sweep()
+        on_all_hosts(lambda: is_first_host() and set_damaged_aside(self._folder))
         policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=_score, n=1)])
         options = ocp.CheckpointManagerOptions(
             best_fn=_score,  # without it scores are not written, and a resumed run keeps all it finds
             preservation_policy=policy,
             cleanup_tmp_directories=True,
             todelete_subdir=_OUTDATED,
+            temporary_path_class=_WithChecksums,
         )
-        handlers = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
+        handlers: dict[str, Any] = {name: ocp.StandardCheckpointHandler() for name in ("weights", "optimizer")}
+        handlers[_UNLOGGED] = ocp.JsonCheckpointHandler()
         self._manager = ocp.CheckpointManager(self._folder, options=options, item_handlers=handlers)
 
     def save(
@@ -54,14 +77,15 @@ class Checkpoints:
         self._wait()
         self._require_room(state)
         items = ocp.args.Composite(
-            weights=ocp.args.StandardSave(state.params.weights), optimizer=ocp.args.StandardSave(state.optimizer)
+            weights=ocp.args.StandardSave(state.params.weights),
+            optimizer=ocp.args.StandardSave(state.optimizer),
+            unlogged=ocp.args.JsonSave([dict(measured) for measured in unlogged]),
         )
         with self._writing():
             self._manager.save(
                 step,
                 args=items,
                 metrics={"score": -1.0 if score is None else score},
-                custom_metadata={_UNLOGGED: [dict(measured) for measured in unlogged]},
                 force=True,
             )
 
@@ -100,8 +124,8 @@ class Checkpoints:
     def unlogged(self) -> list[dict[str, float]]:
         """The measurements that the newest state was saved with."""
         self._wait()
-        found = self._manager.metadata(self.latest_step()).custom_metadata or {}
-        return [dict(measured) for measured in found.get(_UNLOGGED, ())]
+        found: Any = self._manager.restore(self.latest_step(), args=ocp.args.Composite(unlogged=ocp.args.JsonRestore()))
+        return found.unlogged
 
     def best_params(self, config: TrainConfig) -> Params:
         """The weights of the best score among the checkpoints kept, the later of equal ones. ValueError without one."""
@@ -145,6 +169,23 @@ class Checkpoints:
             code = re.search(r"os_error_code='(\d+)'", str(error))
             reason = os.strerror(int(code[1])) if code else getattr(error, "strerror", None) or error
             raise OSError(f"{self._folder}: expected to write a checkpoint, found: {reason}; {_INTACT}") from error
+
+
+def set_damaged_aside(folder: Path) -> None:
+    """Rename the checkpoints in `folder` whose files are not as they were written, and say so on stderr.
+
+    Raises ValueError, and renames none, where all of them are damaged.
+    """
+    steps = [path for path in folder.glob("*") if path.name.isdecimal()]
+    damaged = {path: found for path in steps if (found := damage(path)) is not None}
+    if damaged and len(damaged) == len(steps):
+        newest = max(damaged, key=lambda path: int(path.name))
+        raise ValueError(f"{folder}: expected a whole checkpoint, found {len(damaged)} damaged: {damaged[newest]}")
+    for path, found in damaged.items():
+        names = (path.with_name(f"damaged-{path.name}{suffix}") for suffix in ("", *map("-{}".format, range(2, 100))))
+        aside = next(name for name in names if not name.exists())
+        path.rename(aside)
+        print(f"damaged checkpoint {path} set aside as {aside.name}: {found}", file=sys.stderr)
 
 
 def _score(metrics: Any) -> float:

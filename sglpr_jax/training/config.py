@@ -5,6 +5,7 @@ from typing import Literal
 
 from sglpr_jax.data.sampling.held_out import ValidationConfig
 from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.fields import Count, CountOrNone, check_fields
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.training.loss import LossConfig
 from sglpr_jax.training.optimizer import OptimizerConfig
@@ -21,28 +22,29 @@ class TrainConfig:
     validation: ValidationConfig = ValidationConfig()
     select: Literal["last", "best"] = "last"
     """Which weights a finished run hands out: its last ones, or those of the best score on what is held out."""
-    steps: int = 40_000
-    tuples: int = 1
+    steps: Count = 40_000
+    tuples: Count = 1
     """Tuples a step."""
     share_negatives: bool = False
     """Let every other tuple's places that are far enough away be negatives too."""
-    also_tuples: int = 0
+    also_tuples: CountOrNone = 0
     """How many of a step's tuples come from the second dataset."""
     also_triplets: bool = False
     """Let these count in the triplet loss. Without it they are places at random, for the segmentation alone."""
-    chunk: int = 0
+    chunk: CountOrNone = 0
     """Images that go through the network at a time, on all devices together (0: all). It changes memory and speed; of
     the results only which branches stochastic depth drops."""
     rotate: bool = True
     """Rotate every place about z by its own random angle at every step."""
-    max_points: int = 131072
+    max_points: Count = 131072
     """Clouds are padded to this many points; larger ones are thinned evenly."""
-    seed: int = 0
-    log_every: int = 10
-    score_every: int = 1000
+    seed: CountOrNone = 0
+    log_every: Count = 10
+    score_every: Count = 1000
     """Steps between scores and checkpoints."""
 
     def __post_init__(self):
+        check_fields(self)
         if not 0 <= self.also_tuples < self.tuples:
             raise ValueError(
                 f"also_tuples must be fewer than the {self.tuples} tuples of a step, found {self.also_tuples}"

@@ -2,7 +2,6 @@
 
 import datetime
 import importlib.metadata
-import json
 import os
 import platform
 import shlex
@@ -13,7 +12,7 @@ from typing import Any
 
 import jax
 
-from sglpr_jax.files import write_json
+from sglpr_jax.files import read_json, write_json
 
 ENVIRONMENT_FILE = "environment.json"
 PACKAGES = ("sglpr-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -21,11 +20,20 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def note_environment(folder: Path, *, seed: int) -> None:
-    """Write the environment of a run into its folder; that of a resumed one is added under `resumes`."""
+    """Write the environment of a run into its folder; that of a resumed one is added under `resumes`.
+
+    Raises ValueError where the file that is there is damaged.
+    """
     path = folder / ENVIRONMENT_FILE
     now = environment() | {"seed": seed}
-    first = json.loads(path.read_text()) if path.exists() else None
-    write_json(path, now | {"resumes": []} if first is None else first | {"resumes": [*first["resumes"], now]})
+    if not path.exists():
+        write_json(path, now | {"resumes": []})
+        return
+    first = read_json(path)
+    resumes = first.get("resumes") if isinstance(first, dict) else None
+    if not isinstance(resumes, list):
+        raise ValueError(f"{path}: expected the environment of a run with a list `resumes`, found {first!r:.60}")
+    write_json(path, first | {"resumes": [*resumes, now]})
 
 
 def environment() -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """A run's measurements: one JSON object a line, appended, so that an interrupted run loses nothing."""
 
+import contextlib
+import itertools
 import json
 import math
 import os
@@ -7,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.files import write_text, writing
+from sglpr_jax.files import parse_json, write_text, writing
 
 
 class MetricsLog:
@@ -51,14 +53,30 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics file; a last line cut short by a crash is left out."""
-    lines = []
-    for text in path.read_text().splitlines():
-        try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
+    """The lines of a metrics file; a last line cut short by a crash is left out.
+
+    Raises ValueError, naming the file and the line, where any other is not what `MetricsLog` writes.
+    """
+    *whole, last = path.read_bytes().split(b"\n")
+    lines = [_read_line(text, source=f"{path}, line {i}") for i, text in enumerate(whole, start=1)]
+    with contextlib.suppress(ValueError):
+        lines += [_read_line(last, source=path)]
+    for i, (before, line) in enumerate(itertools.pairwise(lines), start=2):
+        if line["step"] < before["step"]:
+            raise ValueError(f"{path}, line {i}: expected a step from {before['step']} on, found {line['step']}")
     return lines
+
+
+def _read_line(text: bytes, *, source: Path | str) -> dict[str, Any]:
+    line = parse_json(text, source=source)
+    measured = line if isinstance(line, dict) else {}
+    if type(measured.get("step")) is not int or not all(_is_measured(value) for value in measured.values()):
+        raise ValueError(f"{source}: expected a step and its measurements, found {text[:80].decode(errors='replace')}")
+    return measured
+
+
+def _is_measured(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and type(value) is not bool)
 
 
 def _plain(value: Any) -> float | None:

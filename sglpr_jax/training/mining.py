@@ -40,7 +40,7 @@ class Mining:
             return
         self.cache = self._described(step, params)
         self.cache.save(path)
-        self._drop_before(step - 2 * self._config.score_every - every)
+        self._drop_before(step - 3 * self._config.score_every - every)
 
     def _described(self, step: int, params: Params) -> DescriptorCache:
         wanted = self._config.sampling.mined_places
@@ -51,7 +51,7 @@ class Mining:
         return DescriptorCache(places, self._describe(params, places))
 
     def _drop_before(self, step: int) -> None:
-        """Remove caches that no checkpoint can ask for: the newest whole one is at most two scores old."""
+        """Remove caches that no checkpoint can ask for: one is at most two scores old, or three where it is damaged."""
         for path in self._folder.glob("*.npz"):
             if path.stem.isdecimal() and int(path.stem) < step:
                 path.unlink()

@@ -4,19 +4,24 @@ import dataclasses
 
 import optax
 
+from sglpr_jax.fields import Count, CountOrNone, NotNegative, Positive, check_fields
+
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
     """Adam with an exponential decay of the learning rate."""
 
-    learning_rate: float = 1e-5
-    warmup_steps: int = 0
-    decay_rate: float = 0.99
-    decay_steps: int = 1000
+    learning_rate: NotNegative = 1e-5
+    warmup_steps: CountOrNone = 0
+    decay_rate: Positive = 0.99
+    decay_steps: Count = 1000
     """Steps in which the learning rate falls by `decay_rate`."""
     staircase: bool = False
-    clip_norm: float | None = None
-    weight_decay: float = 0.0
+    clip_norm: Positive | None = None
+    weight_decay: NotNegative = 0.0
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 def optimizer(config: OptimizerConfig) -> optax.GradientTransformation:

@@ -17,13 +17,16 @@ def preset_names() -> tuple[str, ...]:
 def load_preset(name: str) -> TrainConfig:
     """The configuration of a preset, or of a Python file of your own that sets CONFIG.
 
-    Raises ValueError where there is none.
+    Raises ValueError where there is none, or running the file fails.
     """
     candidates = [Path(name)] if name.endswith(".py") else [folder / f"{name}.py" for folder in _FOLDERS]
     path = next((path for path in candidates if path.is_file()), None)
     if path is None:
         raise ValueError(f"no preset {name!r}: expected a .py file or one of {', '.join(preset_names())}")
-    config = runpy.run_path(str(path)).get("CONFIG")
+    try:
+        config = runpy.run_path(str(path)).get("CONFIG")
+    except Exception as error:  # whatever a file of one's own raises
+        raise ValueError(f"{path}: expected a preset, found one that fails: {type(error).__name__}: {error}") from error
     if not isinstance(config, TrainConfig):
         raise ValueError(f"{path}: expected CONFIG, a TrainConfig, found {type(config).__name__}")
     return config

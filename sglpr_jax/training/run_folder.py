@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.files import remove_half_written, write_json
+from sglpr_jax.files import read_json, remove_half_written, write_json
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.environment import note_environment
 
@@ -40,7 +40,7 @@ def require_same_settings(folder: Path, config: TrainConfig, settings: Mapping[s
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a run to resume, found none")
-    different = sorted(_differences(json.loads(path.read_text()), _as_json(config, settings)) - {"config.steps"})
+    different = sorted(_differences(read_json(path), _as_json(config, settings)) - {"config.steps"})
     if different:
         raise ValueError(
             f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"

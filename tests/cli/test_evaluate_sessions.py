@@ -144,7 +144,9 @@ def test_wrong_sessions_are_refused(embedded, command, tmp_path):
     ended = refused(tmp_path / "far.npz", "--database", database)
     assert_one_line_error(ended, DAYS[0], "the world frame of the database", MAP, "no place is in both")
     dataclasses.replace(day, descriptors=day.descriptors[:, :40]).save(tmp_path / "short.npz")
-    assert_one_line_error(refused(tmp_path / "short.npz", "--database", database), "1200 numbers", "found 40")
+    assert_one_line_error(
+        refused(tmp_path / "short.npz", "--database", database), "short.npz", "numbers 1200", "found 40"
+    )
     dataclasses.replace(day, sequence="2012-02-05").save(tmp_path / "other.npz")
     ended = refused(tmp_path / "other.npz", "--database", database, "--published")
     assert_one_line_error(ended, "numbers are published", "2012-02-05")

@@ -44,3 +44,19 @@ def test_a_file_without_a_config_is_named(tmp_path):
     (tmp_path / "mine.py").write_text("CONFIG = {'steps': 3}\n")
     with pytest.raises(ValueError, match=r"mine\.py: expected CONFIG, a TrainConfig, found dict"):
         load_preset(str(tmp_path / "mine.py"))
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("CONFIG = TrainConfig(stepz=3)", "TypeError: .*stepz"),
+        ("CONFIG = TrainConfig(", "SyntaxError: "),
+        ("CONFIG = TrainConfig(steps=0)", r"ValueError: TrainConfig\.steps: expected a number from 1"),
+        ("CONFIG = TrainConfig(model=ModelConfig(blind_m=float('nan')))", r"ModelConfig\.blind_m: expected a finite"),
+    ],
+)
+def test_a_file_that_fails_is_named_with_what_it_raises(text, found, tmp_path):
+    imports = "from sglpr_jax.models.config import ModelConfig\nfrom sglpr_jax.training.config import TrainConfig\n"
+    (tmp_path / "mine.py").write_text(f"{imports}{text}\n")
+    with pytest.raises(ValueError, match=rf"mine\.py: expected a preset, found one that fails: .*{found}"):
+        load_preset(str(tmp_path / "mine.py"))

@@ -142,5 +142,23 @@ def test_scans_without_poses_or_rings_are_refused_before_any_work(stress, tmp_pa
     options = ("--data", scans, "--method", "solid")
     assert_one_line_error(stress(*options)[0], "my_scans", "expected poses")
     np.savetxt(scans / "poses.txt", np.tile(np.eye(3, 4).ravel(), (3, 1)))
-    assert_one_line_error(stress(*options)[0], "scan 0 of sequence my_scans: beams-32: expected a scan with rings")
+    only_beams = stress(*options, "--corruption", "beams")[0]
+    assert_one_line_error(only_beams, "scan 0 of sequence my_scans: beams-32: expected a scan with rings")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_corruption_that_needs_rings_is_left_out_of_scans_without(stress, tmp_path):
+    scans = tmp_path / "my_scans"
+    scans.mkdir()
+    places = np.concatenate([np.arange(60), np.arange(12)])
+    for i, place in enumerate(places):
+        np.random.default_rng(place).normal(scale=9, size=(300, 4)).astype("<f4").tofile(scans / f"{i}.bin")
+    rows = "".join(f"1 0 0 {30 * place} 0 1 0 0 0 0 1 0\n" for place in places)
+    (scans / "poses.txt").write_text(rows)
+    (scans / "times.txt").write_text("".join(f"{i}\n" for i in range(len(places))))
+    options = ("--data", scans, "--method", "solid", "--protocol", "top1-f1max")
+    ended, out = stress(*options, "--corruption", "beams-16", "noise-0.05")
+    assert ended.status == 0
+    assert "beams-16 left out: scan 0 of sequence my_scans: beams-16: expected a scan with rings" in ended.error
+    assert "noise-0.05" in ended.out and "beams-16" not in ended.out
+    assert list(json.loads((out / "config.json").read_text())["left_out"]) == ["beams-16"]

@@ -59,5 +59,5 @@ def test_a_drive_without_revisits_gives_its_first_frames_and_share_0_nothing():
 
 @pytest.mark.parametrize("share", [-0.1, 0.6])
 def test_a_share_out_of_range_is_refused(share):
-    with pytest.raises(ValueError, match=r"validation\.share must lie between 0 and 0\.5"):
+    with pytest.raises(ValueError, match=r"ValidationConfig\.share: expected a number from 0 up to 0\.5, found"):
         ValidationConfig(share=share)

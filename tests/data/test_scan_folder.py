@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sglpr_jax.data import readers
 from sglpr_jax.data.readers.scan_folder import open_recording, recording_names
 
 
@@ -77,3 +78,49 @@ def test_real_folders(shared):
     assert [len(samples.points(i)) for i in range(2)] == [32000, 34688]
     nclt = open_recording(shared / "data/samples/nclt/velodyne_sync")
     assert len(nclt.points(0)) == 23546
+
+
+TUM = "1.5 1 2 3 0 0 0 1\n2.5 4 5 6 0 0 0 1\n"
+CSV = "timestamp,x,y,z\n1.5,1,2,3\n2.5,4,5,6\n"
+TWELVE = "1 0 0 1 0 1 0 2 0 0 1 3\n1 0 0 4 0 1 0 5 0 0 1 6\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "timed"),
+    [("poses.txt", TUM, True), ("poses.tum", TUM, True), ("poses.csv", CSV, True), ("poses.txt", TWELVE, False)],
+)
+@pytest.mark.parametrize("beside", [True, False])
+def test_poses_of_any_format_beside_the_scans_or_named(tmp_path, name, text, timed, beside):
+    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
+    path = (folder if beside else tmp_path) / name
+    path.write_text(text)
+    named = {} if beside else {"poses": path, "pose_format": "auto" if timed else "lidar"}
+    found = readers.open_recording(folder, **named)
+    np.testing.assert_array_equal(found.positions, [[1, 2, 3], [4, 5, 6]])
+    assert (None if found.times is None else found.times.tolist()) == ([1.5, 2.5] if timed else None)
+    (folder / "times.txt").write_text("7\n9\n")
+    assert readers.open_recording(folder, **named).times.tolist() == [7, 9]
+    (tmp_path / "other.txt").write_text("8\n8\n")
+    assert readers.open_recording(folder, **named, times=tmp_path / "other.txt").times.tolist() == [8, 8]
+
+
+def test_poses_that_do_not_fit_are_refused(tmp_path):
+    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
+    (folder / "times.txt").write_text("7\n9\n")
+    assert open_recording(folder).times.tolist() == [7, 9] and open_recording(folder).positions is None
+    (folder / "times.txt").write_text("7\n")
+    (folder / "poses.tum").write_text(TUM)
+    with pytest.raises(ValueError, match=r"times\.txt: expected 2 rows, one per scan, found 1"):
+        open_recording(folder)
+    (folder / "times.txt").unlink()
+    (folder / "poses.csv").write_text(CSV)
+    with pytest.raises(ValueError, match=r"scans: expected one pose file, found poses\.csv, poses\.tum"):
+        open_recording(folder)
+    with pytest.raises(FileNotFoundError, match=r"none\.txt: expected a pose file, found none"):
+        open_recording(folder, poses=tmp_path / "none.txt")
+    images = tmp_path / "06"
+    (images / "imgs").mkdir(parents=True)
+    with pytest.raises(
+        ValueError, match=r"a\.txt: expected poses named for a plain folder of scans, found .*BEV images"
+    ):
+        readers.open_recording(tmp_path, "06", poses="a.txt")

@@ -45,6 +45,18 @@ def test_csv_is_read_by_its_header(write):
     assert read_trajectory(write("b.csv", "x,y,z\n1,2,3\n")).times is None
 
 
+@pytest.mark.parametrize("name", ["t", "time", "Timestamp"])
+def test_a_column_of_times_has_one_of_three_names(write, name):
+    np.testing.assert_array_equal(read_trajectory(write("a.csv", f"{name},x,y,z\n0.5,1,2,3\n")).times, [0.5])
+
+
+@pytest.mark.parametrize("row", ["0 0 0 5 0 0 0 6 0 0 0 7", "1 0 0 5 0 1 0 6 0 0 -1 7", "2 0 0 5 0 2 0 6 0 0 2 7"])
+@pytest.mark.parametrize("format", ["kitti", "lidar"])
+def test_what_is_no_rotation_is_refused(write, row, format):
+    with pytest.raises(ValueError, match=rf"p\.txt: expected a rotation and a translation in row 2, found {row}"):
+        read_trajectory(write("p.txt", f"{KITTI}{row}\n"), format=format)
+
+
 def test_a_file_of_times_replaces_those_of_the_poses(write):
     path, times = write("a.csv", "x,y,z,t\n1,2,3,0\n4,5,6,1\n"), write("times.txt", "7\n9\n")
     np.testing.assert_array_equal(read_trajectory(path, times=times).times, [7, 9])
@@ -63,6 +75,11 @@ def test_a_file_of_times_replaces_those_of_the_poses(write):
         ("nan.csv", "x,y,z\n1,2,nan\n", "line 2: expected finite numbers"),
         ("short.csv", "x,y,z\n1,2,3\n1,2\n", "line 3: expected 3 numbers, found 2"),
         ("back.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", r"expected a time >= 1\.0, found 0\.0"),
+        ("zeros.txt", "0 0 0 0 0 0 0 0\n", r"rotation qx qy qz qw of length 1 in row 1, found 0 0 0 0"),
+        ("far.csv", "x,y,z\n1,2,1e30\n", r"expected positions in metres, up to 1e\+08, found .* in row 1"),
+        ("nanoseconds.csv", "timestamp,x,y,z\n1700000000000000000,1,2,3\n", r"expected seconds, found 1\.7e\+18"),
+        ("clocks.csv", "t,time,x,y,z\n1,1,1,2,3\n", "expected every column once, and one of t, time, timestamp"),
+        ("twice.csv", "x,y,z,x\n1,1,2,3\n", "expected every column once"),
         ("half.txt", "1 0 0 0 0 0 0 1\n0 0 0\n", "line 2: expected 8 numbers, found 3"),
     ],
 )

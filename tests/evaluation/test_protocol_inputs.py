@@ -173,9 +173,9 @@ def test_protocols_go_by_their_name():
 @pytest.mark.parametrize("name", protocols_taking("sessions"))
 def test_sessions_must_be_described_alike(make_file, two_laps, name):
     database, queries = make_file(two_laps, np.ones((800, 4))), make_file(two_laps, np.ones((800, 5)), sequence="later")
-    with pytest.raises(ValueError, match="of 4 numbers, compared by l2, in later as in town; found 5, l2"):
+    with pytest.raises(ValueError, match="descriptors of later to be made as those of town, with numbers 4, found 5"):
         PROTOCOLS[name](database, queries)
-    with pytest.raises(ValueError, match="compared by l2, in town as in town; found 4, cosine"):
+    with pytest.raises(ValueError, match="with distance l2, found cosine"):
         PROTOCOLS[name](database, replace(database, distance="cosine"))
     with pytest.raises(ValueError, match="expected positions to score sequence town"):
         PROTOCOLS[name](replace(database, positions=None), database)

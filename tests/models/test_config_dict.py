@@ -1,6 +1,7 @@
 """A configuration survives JSON, and every value of a wrong type or name is one clear error."""
 
 import dataclasses
+import functools
 import json
 from typing import Any
 
@@ -22,11 +23,20 @@ def test_every_preset_s_configuration_survives_json(preset):
     assert found == config and hash(found) == hash(config)
 
 
-def test_fields_that_are_not_there_have_their_defaults():
+@pytest.mark.parametrize("path", ["image", "compute", "head.pooling", "backbone.average", "grid.height"])
+def test_a_missing_field_is_an_error_and_no_default(path):
+    """Weights of density images without `image` would be fed point counts."""
     values = values_of(model_preset("rings"))
-    del values["head"]["cbam_reduction"], values["compute"], values["backbone"]["average"]
+    *way, name = path.split(".")
+    del functools.reduce(lambda place, step: place[step], way, values)[name]
+    with pytest.raises(ValueError, match=rf"^here: .*expected the fields of a \w+ \(.*\), found no '{name}'$"):
+        config_from_dict(values, source="here")
+
+
+def test_a_field_that_came_later_may_be_missing():
+    values = values_of(model_preset("rings"))
+    del values["head"]["whiten"]
     assert config_from_dict(values, source="here") == model_preset("rings")
-    assert config_from_dict({}, source="here") == ModelConfig()
 
 
 @pytest.mark.parametrize(
@@ -46,10 +56,25 @@ def test_fields_that_are_not_there_have_their_defaults():
         ("head.cbam", "yes", "head.cbam: expected a value of type bool, found 'yes'"),
         ("head.channels", 3, "head.channels: expected a list, found 3"),
         ("head", [], "head: expected the fields of a HeadConfig, found []"),
-        ("backbone", None, "backbone: expected the fields of a SwinConfig, found None"),
+        ("backbone", None, "backbone: expected the fields of a SwinConfig or RingConfig or SglprConfig, found None"),
         ("backbone.kind", "vgg", "backbone: expected a kind, swin or rings or sglpr, found 'vgg'"),
         ("backbone.kind", "swin", "backbone: expected the fields of a SwinConfig ("),
         ("backbone.widths", [[16]], "backbone.widths: expected a value of type int, found [16]"),
+        ("backbone.kind", ["rings"], "backbone: expected a kind, swin or rings or sglpr, found ['rings']"),
+        ("image", "Density", "image: expected one of 'points', 'density', found 'Density'"),
+        ("counts", "log", "counts: expected one of 'raw', 'log1p', 'clipped', found 'log'"),
+        ("head.pooling", "gem", "head.pooling: expected one of 'netvlad', 'mean', 'spectrum', found 'gem'"),
+        ("blind_m", float("nan"), "blind_m: expected a finite number, found nan"),
+        ("blind_m", float("inf"), "blind_m: expected a finite number, found inf"),
+        ("blind_m", 10**400, "blind_m: expected a finite number, found 1000"),
+        ("blind_m", -1.0, "blind_m: expected a number from 0, found -1.0"),
+        ("blind_m", 30.0, "blind_m: expected less than the 25.6 m that the image reaches, found 30.0"),
+        ("grid.resolution_m", 0.0, "grid.resolution_m: expected a number above 0, found 0.0"),
+        ("grid.height", 127, "grid: height: expected an even number of cells, found 127"),
+        ("head.clusters", 0, "head.clusters: expected a number from 1 up to 1048576, found 0"),
+        ("backbone.widths", [], "backbone: widths: expected at least one block, found ()"),
+        ("polar", {}, "polar: expected a list, found {}"),
+        ("head.channels", [[1]], "head.channels: expected a value of type int, found [1]"),
         ("depths", [2, 2], "here: expected the fields of a ModelConfig (grid, "),
     ],
 )
@@ -68,5 +93,7 @@ def test_a_wrong_value_is_one_line_with_file_field_expected_and_found(path, valu
 
 
 def test_a_whole_number_is_a_float_too():
-    found = config_from_dict({"grid": {"resolution_m": 1}}, source="here")
+    values = values_of(model_preset("tiny"))
+    values["grid"]["resolution_m"] = 1
+    found = config_from_dict(values, source="here")
     assert found.grid.resolution_m == 1.0 and type(found.grid.resolution_m) is float

@@ -119,7 +119,7 @@ def test_what_does_not_fit_is_an_error():
         ModelConfig(backbone=BACKBONE)
     with pytest.raises(ValueError, match="a head that goes around needs a polar image"):
         ModelConfig(head=HeadConfig(means=(1, 1, 1)))
-    with pytest.raises(ValueError, match="one number of heads per stage"):
+    with pytest.raises(ValueError, match="a number of heads for each"):
         SglprConfig(depths=(2,))
     with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
         dataclasses.replace(CONFIG, polar=(20, 32))

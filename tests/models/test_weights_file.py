@@ -106,13 +106,21 @@ def test_damaged_weights_are_named(params, tmp_path, damage):
         (b'{"grid": ', "expected JSON"),
         (b"\xff\xfe\x00", "expected JSON"),
         (b"[1, 2]", "expected the fields of a ModelConfig"),
-        (b'{"grid": []}', "grid: expected the fields of a Grid"),
-        (b'{"grid": {"colour": 3}, "head": {}}', "grid: expected the fields of a Grid .*, found 'colour'"),
-        (b'{"grid": {"height": 33}, "head": {}}', "height must be a positive even number"),
+        (b"[" * 100_000, "expected JSON"),
+        (b'{"image": "points", "image": "density"}', "expected JSON, .*'image' stands there twice"),
+        (b'{"grid": []}', "expected the fields of a ModelConfig .*, found no 'backbone'"),
+        (lambda values: values["grid"].update(colour=3), "grid: expected the fields of a Grid .*, found 'colour'"),
+        (lambda values: values["grid"].update(height=33), "grid: height: expected an even number of cells, found 33"),
+        (lambda values: values.update(blind_m=float("nan")), "blind_m: expected a finite number, found nan"),
+        (lambda values: values.update(image="Density"), "image: expected one of 'points', 'density', found 'Density'"),
     ],
 )
 def test_a_damaged_configuration_is_named(params, tmp_path, text, expected):
     folder = save(params, tmp_path / "weights")
+    if callable(text):
+        values = json.loads((folder / CONFIG_FILE).read_text())
+        text(values)
+        text = json.dumps(values).encode()
     (folder / CONFIG_FILE).write_bytes(text)
     with pytest.raises(ValueError, match=rf"{CONFIG_FILE}: .*{expected}"):
         load(folder)
@@ -151,3 +159,52 @@ def test_the_hash_changes_with_one_value_and_one_name(params):
     assert len(set(hashes)) == 4
     assert changed(jnp.asarray(kernel)) == weights_hash(params)
     assert len(hashes[0]) == 64
+
+
+def test_weights_that_are_not_finite_are_refused_on_load_and_on_export(params, tmp_path):
+    folder = save(params, tmp_path / "weights")
+    flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    for value in (np.nan, np.inf):
+        broken = flat["segmentation_head/kernel"].copy()
+        broken[0, 1] = value
+        safetensors.numpy.save_file({**flat, "segmentation_head/kernel": broken}, folder / WEIGHTS_FILE)
+        found = rf"found 1 of {broken.size} others in segmentation_head/kernel"
+        with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected finite weights, {found}"):
+            load(folder)
+        weights = {**params.weights, "segmentation_head": {"kernel": broken}}
+        with pytest.raises(ValueError, match=rf"new: expected finite weights, {found}"):
+            save(Params(weights, params.config), tmp_path / "new")
+        assert [path.name for path in tmp_path.iterdir()] == ["weights"]
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.bool_, np.float64, np.uint8])
+def test_weights_of_another_type_are_refused_on_load_and_on_export(params, tmp_path, dtype):
+    folder = save(params, tmp_path / "weights")
+    flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    other = flat["segmentation_head/kernel"].astype(dtype)
+    safetensors.numpy.save_file({**flat, "segmentation_head/kernel": other}, folder / WEIGHTS_FILE)
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected segmentation_head/kernel as F32 or F16, found "):
+        load(folder)
+    weights = {**params.weights, "segmentation_head": {"kernel": other}}
+    with pytest.raises(ValueError, match="new: expected segmentation_head/kernel as float32, found "):
+        save(Params(weights, params.config), tmp_path / "new")
+
+
+def test_weights_of_other_names_or_shapes_are_not_written(params, tmp_path):
+    kernel = params.weights["segmentation_head"]["kernel"]
+    for head in ({}, {"kernel": kernel, "bias": kernel}, {"kernel": kernel[:-1]}):
+        with pytest.raises(
+            ValueError, match=r"new: not the weights of its configuration: segmentation_head/\w+ should"
+        ):
+            save(Params({**params.weights, "segmentation_head": head}, params.config), tmp_path / "new")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_one_flipped_bit_of_the_weights_is_found(params, tmp_path, half):
+    folder = save(params, tmp_path / "weights", half=half)
+    content = bytearray((folder / WEIGHTS_FILE).read_bytes())
+    content[-1000] ^= 1
+    (folder / WEIGHTS_FILE).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected weights of SHA-256 \w+, found \w+: it is damaged"):
+        load(folder)

@@ -4,7 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
 
 @pytest.fixture
@@ -71,6 +71,9 @@ def test_a_failed_save_leaves_the_older_file_and_nothing_else(tmp_path, file, mo
             {"ids": (), "positions": np.zeros((0, 3)), "times": None, "descriptors": np.zeros((0, 4), np.float32)},
             "expected at least one scan",
         ),
+        ({"ids": ("0", "1", "0")}, "expected an id of its own for each scan, found '0' 2 times"),
+        ({"descriptors": np.zeros((3, 0), np.float32)}, r"expected descriptors of at least one number, found \(3, 0\)"),
+        ({"times": np.array([0.0, 2.0, 1.0])}, "expected times in order, found an earlier one in row 2"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(file, change, message):
@@ -79,7 +82,7 @@ def test_what_does_not_fit_together_is_refused(file, change, message):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a descriptor file, found none"):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a descriptor file \(\.npz\), found no such file"):
         DescriptorFile.load(tmp_path / "none.npz")
 
 
@@ -119,13 +122,13 @@ def test_missing_arrays_are_listed(tmp_path):
     [
         ("{}", "expected format 'sglpr-jax descriptors 2', found None"),
         ("[1]", r"expected format 'sglpr-jax descriptors 2', found \[1\]"),
-        ("{", "expected JSON in `about`, found '{'"),
+        ("{", "expected JSON, found none that is whole"),
         ('{"format": "sglpr-jax descriptors 1"}', "expected `sequence`, `pose_source`, `config`, `weights_hash`"),
     ],
 )
 def test_another_format_is_refused(tmp_path, about, message):
     np.savez(tmp_path / "x.npz", about=np.array(about), ids=np.array(["0"]), descriptors=np.zeros((1, 4), np.float32))
-    with pytest.raises(ValueError, match=r"x\.npz: .*" + message):
+    with pytest.raises(ValueError, match=r"x\.npz.*: .*" + message):
         DescriptorFile.load(tmp_path / "x.npz")
 
 
@@ -152,3 +155,50 @@ def test_a_file_whose_arrays_disagree_is_named(tmp_path, file):
     np.savez(tmp_path / "08.npz", **{**arrays, "positions": np.zeros((5, 3))})
     with pytest.raises(ValueError, match=r"08\.npz: expected positions as float64 \(3, 3\) for 3 ids"):
         DescriptorFile.load(tmp_path / "08.npz")
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"ids": np.array([["0", "1", "2"]])}, r"expected ids as a row of names, found <U1 \(1, 3\)"),
+        ({"ids": np.array([0.0, np.nan, 2.0])}, r"expected ids as a row of names, found float64 \(3,\)"),
+        ({"ids": np.array(["0", "1", "1"])}, "expected an id of its own for each scan, found '1' 2 times"),
+        ({"descriptors": np.zeros((3, 0), np.float32)}, "expected descriptors of at least one number"),
+        ({"about": np.array(["{}", "{}"])}, r"expected JSON in `about`, found an array <U2 \(2,\)"),
+    ],
+)
+def test_arrays_that_cannot_be_are_refused(tmp_path, file, changed, message):
+    file.save(tmp_path / "08.npz")
+    with np.load(tmp_path / "08.npz") as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / "08.npz", **{**arrays, **changed})
+    with pytest.raises(ValueError, match=rf"08\.npz: {message}"):
+        DescriptorFile.load(tmp_path / "08.npz")
+
+
+@pytest.mark.parametrize(("name", "value"), [("sequence", 8), ("config", []), ("weights_hash", None), ("distance", {})])
+def test_what_stands_in_about_has_its_type(tmp_path, file, name, value):
+    file.save(tmp_path / "08.npz")
+    with np.load(tmp_path / "08.npz") as archive:
+        arrays = dict(archive)
+    about = {**json.loads(str(arrays["about"])), name: value}
+    np.savez(tmp_path / "08.npz", **{**arrays, "about": np.array(json.dumps(about))})
+    with pytest.raises(ValueError, match=rf"08\.npz: expected `{name}` as .*, found "):
+        DescriptorFile.load(tmp_path / "08.npz")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"weights_hash": "f" * 64}, "weights"),
+        ({"distance": "cosine"}, "distance"),
+        ({"config": {"method": "m2dp"}}, "method"),
+        ({"config": {"method": "sglpr", "model": {"polar": [64, 128]}}}, "model"),
+        ({"descriptors": np.ones((3, 5), np.float32)}, "numbers"),
+    ],
+)
+def test_descriptors_of_another_method_or_model_cannot_be_compared(file, change, what):
+    file = dataclasses.replace(file, config={"method": "sglpr", "model": {"polar": (64, 256)}, "data": "08"})
+    check_same_method(file, dataclasses.replace(file, sequence="05", config={**file.config, "data": "05"}))
+    with pytest.raises(ValueError, match=rf"of 05 to be made as those of .*, with {what} .*, found "):
+        check_same_method(file, dataclasses.replace(file, sequence="05", **change))

@@ -23,7 +23,10 @@ class Made(BatchSource):
     """Batches that a function of the step makes."""
 
     def __init__(self, make: Callable[[int], Batch], *, places: Callable[[int], str] = lambda step: ""):
-        self.batch, self.places = make, places
+        self._make, self.places = make, places
+
+    def batch(self, step: int) -> Batch:
+        return self._make(step)
 
 
 MODEL = dataclasses.replace(

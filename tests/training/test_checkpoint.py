@@ -1,6 +1,7 @@
 """Checkpoints come back bit by bit, the newest and the best stay, and those of another model are refused."""
 
 import dataclasses
+import json
 import shutil
 from types import SimpleNamespace
 
@@ -9,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from sglpr_jax.training.checkpoint import Checkpoints
+from sglpr_jax.training.checkpoint import Checkpoints, set_damaged_aside
+from sglpr_jax.training.checksums import NOT_COVERED
 from sglpr_jax.training.state import TrainState, new_state
 
 
@@ -143,3 +145,85 @@ def test_the_best_weights_are_those_of_the_highest_score_after_a_resume_too(chec
 def test_without_a_checkpoint_there_are_no_best_weights(checkpoints, config):
     with pytest.raises(ValueError, match="expected a checkpoint with a score, found none"):
         checkpoints.best_params(config)
+
+
+FILES = ["weights/_METADATA", "weights/manifest.ocdbt", "optimizer/_sharding", "metrics/metrics", "unlogged/metadata"]
+
+
+def saved(folder, state, *steps: int) -> None:
+    opened = Checkpoints(folder)
+    for step in steps:
+        opened.save(state.replace(step=jnp.int32(step)), score=step / 10, unlogged=[{"loss": float(step)}])
+    opened.close()
+
+
+def flip(path, *, at: float = 0.5) -> None:
+    content = bytearray(path.read_bytes())
+    content[int(at * len(content))] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("name", [*FILES, "weights/d/*", "optimizer/ocdbt.process_0/d/*", "checksums.json"])
+def test_one_flipped_bit_is_found_the_checkpoint_set_aside_and_the_one_before_used(
+    state, config, tmp_path, capfd, name
+):
+    folder = tmp_path / "checkpoints"
+    saved(folder, state, 2, 4)
+    damaged = min((folder / "4").glob(name))
+    flip(damaged)
+    resumed = Checkpoints(folder)
+    chex.assert_trees_all_equal(resumed.restore(config), state.replace(step=jnp.int32(2)))
+    assert resumed.unlogged() == [{"loss": 2.0}]
+    chex.assert_trees_all_equal(resumed.best_params(config).weights, state.params.weights)
+    resumed.close()
+    said = capfd.readouterr().err
+    assert f"damaged checkpoint {folder / '4'} set aside as damaged-4: " in said
+    assert name == "checksums.json" or str(damaged) in said
+    assert sorted(path.name for path in folder.iterdir()) == ["2", "damaged-4"]
+
+
+@pytest.mark.parametrize("name", [*FILES, "checksums.json", "_CHECKPOINT_METADATA"])
+@pytest.mark.parametrize("how", ["cut off", "gone"])
+def test_a_file_that_is_cut_off_or_gone_is_found(state, config, tmp_path, capfd, name, how):
+    folder = tmp_path / "checkpoints"
+    saved(folder, state, 2, 4)
+    path = folder / "4" / name
+    content = path.read_bytes()
+    path.unlink()
+    if how == "cut off":
+        path.write_bytes(content[: len(content) // 2])
+    resumed = Checkpoints(folder)
+    assert resumed.restore(config).step == 2
+    resumed.close()
+    assert str(path) in capfd.readouterr().err
+
+
+def test_without_a_whole_checkpoint_there_is_one_error_and_nothing_is_renamed(state, tmp_path):
+    folder = tmp_path / "checkpoints"
+    saved(folder, state, 2, 4)
+    for step in ("2", "4"):
+        flip(folder / step / "weights" / "_METADATA")
+    for _ in range(2):
+        message = (
+            rf"{folder}: expected a whole checkpoint, found 2 damaged: {folder}/4/weights/_METADATA: expected SHA-256"
+        )
+        with pytest.raises(ValueError, match=message):
+            Checkpoints(folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["2", "4"]
+
+
+def test_a_step_damaged_twice_is_set_aside_twice(state, config, tmp_path):
+    folder = tmp_path / "checkpoints"
+    saved(folder, state, 2)
+    for _ in range(2):
+        saved(folder, state, 4)
+        flip(folder / "4" / "metrics" / "metrics")
+        set_damaged_aside(folder)
+    assert sorted(path.name for path in folder.iterdir()) == ["2", "damaged-4", "damaged-4-2"]
+
+
+def test_every_file_has_a_checksum_but_those_that_orbax_writes_last(state, tmp_path):
+    folder = tmp_path / "checkpoints"
+    saved(folder, state, 2)
+    there = {path.relative_to(folder / "2").as_posix() for path in (folder / "2").rglob("*") if path.is_file()}
+    assert there == set(json.loads((folder / "2" / "checksums.json").read_text())) | set(NOT_COVERED)

@@ -6,6 +6,7 @@ import sys
 
 import jax
 import numpy as np
+import pytest
 
 from sglpr_jax.training.environment import git_commit, note_environment
 
@@ -50,3 +51,13 @@ def test_a_checkout_has_a_commit_and_may_differ_from_it(tmp_path):
     assert git_commit(tmp_path) == {"commit": commit, "dirty": False}
     (tmp_path / "file").write_text("b")
     assert git_commit(tmp_path) == {"commit": commit, "dirty": True}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"), [("{", "expected JSON"), ("[]", r"a list `resumes`, found \[\]"), ('{"resumes": 3}', "resumes")]
+)
+def test_a_damaged_one_is_named(tmp_path, text, found):
+    (tmp_path / "environment.json").write_text(text)
+    with pytest.raises(ValueError, match=rf"environment\.json: .*{found}"):
+        note_environment(tmp_path, seed=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["environment.json"]

@@ -88,6 +88,20 @@ def test_stopped_and_resumed_is_uninterrupted(config, make_batch, fast_step, tmp
     assert logged(folders[1]) == logged(folders[0])
 
 
+def test_a_run_resumed_past_a_damaged_checkpoint_is_uninterrupted(config, make_batch, fast_step, tmp_path, capfd):
+    folders = tmp_path / "whole", tmp_path / "resumed"
+    whole = run_steps(config, Made(make_batch), folders[0], score=size_of_weights)
+    run_steps(config, Made(make_batch), folders[1], score=size_of_weights, stopped=after(5))
+    damaged = min((folders[1] / CHECKPOINTS / "5" / "weights" / "d").iterdir())
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    resumed = run_steps(config, Made(make_batch), folders[1], score=size_of_weights, resume=True)
+    assert str(damaged) in capfd.readouterr().err
+    chex.assert_trees_all_equal(resumed, whole)
+    assert logged(folders[1]) == logged(folders[0])
+
+
 def test_a_stop_between_two_lines_of_the_log_leaves_no_trace_in_it(config, make_batch, fake_step, tmp_path):
     fake_step()
     config = dataclasses.replace(config, steps=12, log_every=5, score_every=8)

@@ -80,3 +80,35 @@ def test_a_full_disk_leaves_the_metrics_of_a_run_to_be_resumed_as_they_were(tmp_
     with pytest.raises(OSError, match=rf"{path}: expected to write it, found: File too large"):
         write(path, [], start_step=3)
     assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        '{"step": 2, "lo',
+        "[2]",
+        '{"loss": 0.2}',
+        '{"step": "2"}',
+        '{"step": true}',
+        '{"step": 2, "loss": "x"}',
+        "\x00",
+    ],
+)
+def test_a_damaged_line_is_named_and_nothing_is_dropped_for_it(tmp_path, line):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 2, 3]).close()
+    first, _, third = path.read_text().splitlines()
+    damaged = f"{first}\n{line}\n{third}\n"
+    path.write_text(damaged)
+    for read in (read_metrics, MetricsLog):
+        with pytest.raises(ValueError, match=rf"{path}, line 2: expected "):
+            read(path)
+    assert path.read_text() == damaged
+
+
+def test_steps_that_run_backwards_are_an_error(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    write(path, [1, 3, 2]).close()
+    with pytest.raises(ValueError, match=rf"{path}, line 3: expected a step from 3 on, found 2"):
+        read_metrics(path)

@@ -25,7 +25,7 @@ from sglpr_jax.data.cache.stacked import Stacked, StackWriter, map_stacked, sync
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.record import ReadRecord, Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import half_written, replacing
+from sglpr_jax.files import half_written, read_json, replacing
 
 FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
@@ -129,7 +129,7 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 
 def _open(folder: Path) -> dict[str, Stacked]:
     try:
-        lie = json.loads((folder / ABOUT_FILE).read_text())["arrays"]
+        lie = read_json(folder / ABOUT_FILE)["arrays"]
         return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
     except (ValueError, KeyError, TypeError, OSError) as error:
         raise ValueError(

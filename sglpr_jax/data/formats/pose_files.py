@@ -6,13 +6,39 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+ROTATION_TOLERANCE = 0.01
+"""How far R R^T may be from the identity: pose files have few digits."""
+FARTHEST_M = 1e8
+LATEST_S = 1e11
+"""Times beyond the year 5000 are milli-, micro- or nanoseconds."""
+
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
     """Return the poses (n, 3, 4) of a file with 12 numbers a line: a rotation and a translation in metres, row by row.
 
-    Raises FileNotFoundError, and ValueError naming the first line without 12 finite numbers.
+    Raises FileNotFoundError, and ValueError naming the first line without 12 finite numbers, or the first row that is
+    no rotation and translation.
     """
-    return read_rows(path, columns=12).reshape(-1, 3, 4)
+    poses = read_rows(path, columns=12).reshape(-1, 3, 4)
+    rotations = poses[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero(~(apart < ROTATION_TOLERANCE) | ~(np.linalg.det(rotations) > 0))
+    if wrong.size:
+        found = " ".join(f"{value:g}" for value in poses[wrong[0]].ravel())
+        raise ValueError(f"{path}: expected a rotation and a translation in row {wrong[0] + 1}, found {found}")
+    check_positions(path, poses[:, :, 3])
+    return poses
+
+
+def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
+    """Raise ValueError naming the first row of `path` whose position is none on earth."""
+    far = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_M)
+    if far.size:
+        raise ValueError(
+            f"{path}: expected positions in metres, up to {FARTHEST_M:g}, found {positions[far[0]].tolist()} in row "
+            f"{far[0] + 1}"
+        )
 
 
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
@@ -26,7 +52,13 @@ def read_times(path: Path) -> Float[np.ndarray, " n"]:
 
 
 def check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
-    """Raise ValueError naming the first row of numbers in `path` whose time is smaller than the one before."""
+    """Raise ValueError naming the first row of numbers in `path` whose time is smaller than the one before.
+
+    Times that are no seconds are refused too: rules such as "30 s older" would mean something else.
+    """
+    late = np.flatnonzero(np.abs(times) > LATEST_S)
+    if late.size:
+        raise ValueError(f"{path}, line {late[0] + 1}: expected seconds, found {times[late[0]]:g}: a smaller unit?")
     backwards = np.flatnonzero(np.diff(times) < 0)
     if backwards.size:
         row = int(backwards[0]) + 2

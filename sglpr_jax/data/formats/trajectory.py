@@ -3,7 +3,7 @@
 kitti   12 numbers a line, camera frame (x right, y down, z forward): KITTI's own poses and SemanticKITTI's
 lidar   12 numbers a line, z up: poses of the sensor or the car
 tum     t x y z qx qy qz qw, z up
-csv     a header that names columns, x, y and z among them and perhaps t
+csv     a header that names columns, x, y and z among them and perhaps t, time or timestamp (seconds)
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,14 @@ from typing import Literal
 
 import numpy as np
 
-from sglpr_jax.data.formats.pose_files import check_times, read_poses, read_rows, read_times
+from sglpr_jax.data.formats.pose_files import (
+    ROTATION_TOLERANCE,
+    check_positions,
+    check_times,
+    read_poses,
+    read_rows,
+    read_times,
+)
 from sglpr_jax.poses import positions_from_camera
 
 PoseFormat = Literal["auto", "kitti", "lidar", "tum", "csv"]
@@ -30,14 +37,23 @@ class Trajectory:
     """Which poses these are, in words."""
 
 
-def read_trajectory(path: Path, *, format: PoseFormat = "auto", times: Path | None = None) -> Trajectory:
+TIME_COLUMNS = ("t", "time", "timestamp")
+
+
+def read_trajectory(
+    path: Path,
+    *,
+    format: PoseFormat = "auto",
+    times: Path | None = None,
+    twelve_numbers: Literal["kitti", "lidar"] | None = None,
+) -> Trajectory:
     """Read a pose file, one row per frame; a file of `times`, one number a line, replaces those of the pose file.
 
-    "auto" knows csv by its ending and tum by its 8 numbers a line. It does not guess which frame 12 numbers are in:
-    horizontal distances depend on it. Raises FileNotFoundError, and ValueError naming the file, what was expected and
-    what was found.
+    "auto" knows csv by its ending and tum by its 8 numbers a line. It does not guess which frame 12 numbers are in,
+    for horizontal distances depend on it, but may be told (`twelve_numbers`). Raises FileNotFoundError, and ValueError
+    naming the file, what was expected and what was found.
     """
-    trajectory = READERS[_format_of(path) if format == "auto" else format](path)
+    trajectory = READERS[_format_of(path, twelve_numbers) if format == "auto" else format](path)
     if len(trajectory.positions) == 0:
         raise ValueError(f"{path}: expected at least one pose, found none")
     if times is None:
@@ -48,7 +64,7 @@ def read_trajectory(path: Path, *, format: PoseFormat = "auto", times: Path | No
     return replace(trajectory, times=clock)
 
 
-def _format_of(path: Path) -> str:
+def _format_of(path: Path, twelve_numbers: str | None) -> str:
     """Return the format that the ending or the first line tells."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
@@ -56,6 +72,8 @@ def _format_of(path: Path) -> str:
         return "csv"
     lines = (line.split() for line in path.read_text(errors="replace").splitlines() if not line.startswith("#"))
     columns = len(next(lines, []))
+    if columns == 12 and twelve_numbers is not None:
+        return twelve_numbers
     if columns == 12:
         raise ValueError(
             f"{path}: expected --pose-format kitti (camera frame: KITTI, SemanticKITTI) or lidar (z up) for poses of"
@@ -77,6 +95,12 @@ def _read_lidar(path: Path) -> Trajectory:
 def _read_tum(path: Path) -> Trajectory:
     rows = read_rows(path, columns=8)
     check_times(path, rows[:, 0])
+    check_positions(path, rows[:, 1:4])
+    lengths = np.linalg.norm(rows[:, 4:], axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1) > ROTATION_TOLERANCE)
+    if wrong.size:
+        found = " ".join(f"{value:g}" for value in rows[wrong[0], 4:])
+        raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
     return Trajectory(rows[:, 1:4], rows[:, 0], _said(path, "TUM"))
 
 
@@ -85,12 +109,20 @@ def _read_csv(path: Path) -> Trajectory:
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     header = path.read_text(errors="replace").partition("\n")[0]
     names = [name.strip().lower() for name in header.split(",")]
+    clocks = [name for name in names if name in TIME_COLUMNS]
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
+    if len(set(names)) < len(names) or len(clocks) > 1:
+        raise ValueError(
+            f"{path}: expected every column once, and one of {', '.join(TIME_COLUMNS)}, found {header[:80]!r}"
+        )
     columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
-    if "t" in columns:
-        check_times(path, columns["t"])
-    return Trajectory(np.stack([columns[axis] for axis in "xyz"], axis=1), columns.get("t"), _said(path, "csv"))
+    times = columns[clocks[0]] if clocks else None
+    if times is not None:
+        check_times(path, times)
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    check_positions(path, positions)
+    return Trajectory(positions, times, _said(path, "csv"))
 
 
 def _said(path: Path, format: str) -> str:

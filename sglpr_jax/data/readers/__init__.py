@@ -9,6 +9,7 @@ import pkgutil
 from pathlib import Path
 
 from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.formats.trajectory import PoseFormat
 from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
@@ -31,13 +32,21 @@ def recording_names(root: Path | str) -> tuple[str, ...]:
 
 
 def open_recording(
-    root: Path | str, name: str | None = None, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
+    root: Path | str,
+    name: str | None = None,
+    *,
+    pose_source: PoseChoice = "auto",
+    format: ScanFormat = "auto",
+    poses: Path | str | None = None,
+    pose_format: PoseFormat = "auto",
+    times: Path | str | None = None,
 ) -> Recording:
     """Open one sequence of `root`, whatever its layout.
 
     Without `name`, `root` must have one sequence. `pose_source` chooses between the two pose files of KITTI's layout
-    and is not used for the others; `format` tells what the scans of a plain folder are. Raises FileNotFoundError where
-    something is missing, ValueError where a file is malformed.
+    and is not used for the others. `format` tells what the scans of a plain folder are, `poses` and `times` are its
+    pose file and its file of seconds, where they do not lie beside the scans. Raises FileNotFoundError where something
+    is missing, ValueError where a file is malformed, or poses are named for a layout that has its own.
 
     Example:
       recording = open_recording("KITTI", "08")
@@ -49,7 +58,11 @@ def open_recording(
     if name is None or name not in names:
         asked = "the name of one sequence" if name is None else f"sequence {name!r}"
         raise FileNotFoundError(f"{root}: expected {asked}, found {', '.join(names)}")
-    return reader.open(root, name, ReadOptions(pose_source, format))
+    given = next((path for path in (poses, times) if path is not None), None)
+    if given is not None and not reader.takes_poses:
+        raise ValueError(f"{given}: expected poses named for a plain folder of scans, found {root}: {reader.layout}")
+    pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
+    return reader.open(root, name, ReadOptions(pose_source, format, pose_file, pose_format, times_file))
 
 
 def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:

@@ -1,10 +1,11 @@
-"""A plain folder of single scans (.bin, .pcd), with a `poses.txt` beside them or without."""
+"""A plain folder of single scans (.bin, .pcd), with poses and times beside them or without (`folder_poses.py`)."""
 
 from functools import partial
 from pathlib import Path
 
-from sglpr_jax.data.formats.pose_files import read_poses
+from sglpr_jax.data.formats.folder_poses import folder_trajectory
 from sglpr_jax.data.formats.scan_files import ScanFormat, scan_id
+from sglpr_jax.data.formats.trajectory import PoseFormat
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
@@ -15,25 +16,31 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return (root.resolve().name,) if _scan_paths(root) else ()
 
 
-def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
+def open_recording(
+    root: Path,
+    *,
+    format: ScanFormat = "auto",
+    poses: Path | None = None,
+    pose_format: PoseFormat = "auto",
+    times: Path | None = None,
+) -> Recording:
     """Open the folder `root`; scans come in the order of their names, or of their numbers where all are numbers.
 
-    `format`: see `read_scan`. `poses.txt` has 12 numbers a line (LiDAR frame, metres, z up), one line per scan in that
-    order; without it the positions are None. Raises ValueError where it has another number of lines or is malformed.
+    `format`: see `read_scan`. Poses and times have one row per scan in that order; see `folder_trajectory` for the
+    files, and for the errors. Without poses the positions are None.
     """
     scan_paths = _scan_paths(root)
     if not scan_paths:
         raise FileNotFoundError(f"{root}: expected scans (*.bin, *.pcd), found none")
-    pose_path = root / "poses.txt"
-    world_from_lidar = read_poses(pose_path) if pose_path.is_file() else None
-    if world_from_lidar is not None and len(world_from_lidar) != len(scan_paths):
-        raise ValueError(f"{pose_path}: expected {len(scan_paths)} rows, one per scan, found {len(world_from_lidar)}")
+    positions, seconds, source = folder_trajectory(
+        root, scans=len(scan_paths), poses=poses, pose_format=pose_format, times=times
+    )
     return Recording(
         name=root.resolve().name,
         ids=tuple(scan_id(path) for path in scan_paths),
-        positions=None if world_from_lidar is None else world_from_lidar[:, :, 3],
-        times=None,
-        pose_source=None if world_from_lidar is None else pose_path.name,
+        positions=positions,
+        times=seconds,
+        pose_source=source,
         paths=scan_paths,
         read=partial(scan_record, format=format),
     )
@@ -49,6 +56,9 @@ def _scan_paths(root: Path) -> tuple[Path, ...]:
 READER = Reader(
     layout="single scans (*.bin, *.pcd)",
     recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, format=options.format),
+    open=lambda root, name, options: open_recording(
+        root, format=options.format, poses=options.poses, pose_format=options.pose_format, times=options.times
+    ),
     rank=9,
+    takes_poses=True,
 )

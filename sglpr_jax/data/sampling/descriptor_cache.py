@@ -2,13 +2,12 @@
 
 import dataclasses
 import functools
-import zipfile
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int
 
-from sglpr_jax.files import replacing
+from sglpr_jax.files import read_arrays, replacing
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,10 +42,9 @@ class DescriptorCache:
     @classmethod
     def load(cls, path: Path) -> "DescriptorCache":
         """Read what `save` wrote. Raises FileNotFoundError, or ValueError where it is damaged."""
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: expected descriptors of places, found no such file")
-        try:
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-                return cls(file["places"], file["descriptors"])
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path}: expected descriptors of places, found no such archive ({error})") from error
+        found = read_arrays(path, expected="descriptors of places")
+        places, descriptors = found.get("places"), found.get("descriptors")
+        if places is None or descriptors is None or places.shape != descriptors.shape[:1] or descriptors.ndim != 2:
+            shapes = ", ".join(f"{name} {array.shape}" for name, array in found.items())
+            raise ValueError(f"{path}: expected places (n,) and descriptors (n, d), found {shapes or 'no array'}")
+        return cls(places, descriptors)

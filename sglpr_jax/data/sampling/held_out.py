@@ -1,12 +1,14 @@
 """A part of the training recordings that nothing is learnt from: on it a training is judged before the test."""
 
 import dataclasses
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.fields import Bounds, check_fields
 from sglpr_jax.revisits import close_pairs
 
 
@@ -14,12 +16,11 @@ from sglpr_jax.revisits import close_pairs
 class ValidationConfig:
     """What is held out of every training recording."""
 
-    share: float = 0.0
+    share: Annotated[float, Bounds(0, 0.5)] = 0.0
     """The length of a stretch of frames in a row, as a share of the recording; 0: nothing, as in the paper."""
 
     def __post_init__(self):
-        if not 0 <= self.share <= 0.5:
-            raise ValueError(f"validation.share must lie between 0 and 0.5, found {self.share}")
+        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

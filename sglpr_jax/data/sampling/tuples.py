@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
+from sglpr_jax.fields import Count, CountOrNone, NotNegative, Share, check_fields
 from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
 from sglpr_jax.revisits import close_pairs
 
@@ -16,30 +17,31 @@ from sglpr_jax.revisits import close_pairs
 class TupleConfig:
     """How tuples are drawn. Distances are horizontal: ground-truth heights drift by metres within a recording."""
 
-    positives: int = 1
-    negatives: int = 10
-    positive_m: float = POSITIVE_M
-    negative_m: float = NEGATIVE_M
-    revisit_fraction: float = 0.5
+    positives: Count = 1
+    negatives: CountOrNone = 10
+    positive_m: NotNegative = POSITIVE_M
+    negative_m: NotNegative = NEGATIVE_M
+    revisit_fraction: Share = 0.5
     """The share of tuples whose positives come from another visit; the others' come from neighbouring frames."""
-    revisit_gap: int = 50
+    revisit_gap: CountOrNone = 50
     """Frames at most this far apart belong to one visit."""
-    cluster: int = 1
+    cluster: Count = 1
     """Tuples in a row whose anchors lie near each other. Where tuples share their places as negatives, neighbouring
     places of one street are harder to tell apart than any two of a whole recording."""
-    cluster_m: float = 100.0
+    cluster_m: NotNegative = 100.0
     """How near: the distance to the first anchor of the row."""
     mining: Literal["none", "hardest"] = "none"
     """`none`: negatives at random, as in the paper. `hardest`: those that look most like the anchor (BEVPlace++); the
     anchors of a cluster are then alike rather than near each other."""
-    hardest: int = 10
+    hardest: CountOrNone = 10
     """Negatives are drawn from this many places: those that look most like the anchor, beyond the negative distance."""
-    refresh_steps: int = 1000
+    refresh_steps: CountOrNone = 1000
     """Steps after which the descriptors that mining compares are computed anew."""
-    mined_places: int = 0
+    mined_places: CountOrNone = 0
     """Places that are described then, other ones each time, and anchors of the tuples drawn; 0: all."""
 
     def __post_init__(self):
+        check_fields(self)
         if self.mining == "none":
             return
         if self.negatives == 0 and self.cluster == 1:

@@ -7,8 +7,8 @@ from sglpr_jax.evaluation.protocols.nearest import first_hits, nearest_descripto
 from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.recall import score_recall
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.evaluation.protocols.source import check_comparable, pose_sources, positions_of
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.evaluation.protocols.source import pose_sources, positions_of
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.revisits import has_near
 
 
@@ -21,7 +21,7 @@ def bevplace_nclt_recall(database: DescriptorFile, queries: DescriptorFile, *, s
     (zjuluolun/BEVPlace2, nclt_dataset.py); which frames were taken is not published. The interval resamples the queries
     that count.
     """
-    check_comparable(database, queries)
+    check_same_method(database, queries)
     there, here = positions_of(database, 2), positions_of(queries, 2)
     ends = np.full(len(here), len(there))
     nearest, _ = nearest_descriptors(queries.descriptors, database.descriptors, ends, distance=database.distance)

@@ -11,7 +11,8 @@ def bevplace_recall_at_1(source: Source, *, seed: int = 0) -> Result:
 
     A query counts if the database has a frame less than 5 m away; it is found if the nearest descriptor is such a
     frame. The split is the published one where name and number of frames are those of a KITTI sequence that has one.
-    Elsewhere the database is the first 60 % of the frames and the rest are queries, without a gap between them.
+    Elsewhere the database is the first 60 % of the frames, and the queries begin where the recording is first 20 m from
+    the database's last frame: what lies between are neighbours, and no revisits.
     Published on the LiDAR-frame poses that come with the images (zjuluolun/BEVPlace2, kitti_dataset.py); of sequence 08
     the published code takes every fifth frame, here all count. The interval resamples the queries that count.
     """

@@ -27,6 +27,9 @@ V1_SPLITS = {"00": SPLITS["00"], "02": SPLITS["02"], "05": (1000, 1200, 2751), "
 """BEVPlace: ten queries fewer in 05, and no 08."""
 DATABASE_SHARE = 0.6
 """The part of any other recording that is the database."""
+SEAM_M = 20.0
+"""There the queries begin so far from the database's last frame: frames across the seam are neighbours, no revisits.
+The published splits leave 200 frames, which a short recording does not have."""
 
 
 def recall_on_split(
@@ -44,7 +47,7 @@ def recall_on_split(
     `splits` has by sequence where the database ends, where the queries start and where they end.
     """
     positions = positions_of(source, dimensions)
-    end, first, last, split = _split(source, paper, splits)
+    end, first, last, split = _split(source, positions, paper, splits)
     queries, ends = np.arange(first, last), np.full(last - first, end)
     result = Result(
         name=name,
@@ -62,14 +65,22 @@ def recall_on_split(
     return replace(result, decisions=recall_decisions(len(source), queries, ranks, revisited))
 
 
-def _split(source: Source, paper: str, splits: Mapping[str, tuple[int, int, int]]) -> tuple[int, int, int, str]:
+def _split(
+    source: Source,
+    positions: Float[np.ndarray, "n _"],
+    paper: str,
+    splits: Mapping[str, tuple[int, int, int]],
+) -> tuple[int, int, int, str]:
     """Return how many frames are the database, the first query, the end of the queries, and the split in words."""
     n = len(source)
     if source.sequence in splits and FRAMES[source.sequence] == n:
         end, first, last = splits[source.sequence]
         return end, first, last, f"{paper} split: database 0 to {end - 1}, queries {first} to {last - 1}"
-    end = int(DATABASE_SHARE * n)
-    return end, end, n, f"no published split: database is the first {DATABASE_SHARE:.0%} of the frames"
+    end = max(int(DATABASE_SHARE * n), 1)
+    apart = np.linalg.norm(positions[end:] - positions[end - 1], axis=1)
+    first = end + int(next(iter(np.flatnonzero(apart >= SEAM_M)), n - end))
+    database = f"database is the first {DATABASE_SHARE:.0%} of the frames"
+    return end, first, n, f"no published split: {database}, queries begin {SEAM_M:g} m from its end"
 
 
 def near(apart: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:

@@ -12,8 +12,8 @@ from sglpr_jax.evaluation.protocols.nearest import first_hits, nearest_descripto
 from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.recall import recall_at
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.evaluation.protocols.source import check_comparable, pose_sources, positions_of
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.evaluation.protocols.source import pose_sources, positions_of
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.revisits import has_near
 
 POSITIVE_M = 25.0
@@ -53,7 +53,7 @@ def _retrieve(
     database: DescriptorFile, queries: DescriptorFile
 ) -> tuple[Int[np.ndarray, " q"], Bool[np.ndarray, " q"], int]:
     """Return the rank of each query's first right answer, which queries count, and how many answers are 1 %."""
-    check_comparable(database, queries)
+    check_same_method(database, queries)
     there, here = positions_of(database, 2), positions_of(queries, 2)
     ends = np.full(len(here), len(there))
     nearest, _ = nearest_descriptors(

@@ -115,16 +115,6 @@ def check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) 
         raise ValueError(f"expected {what} frames from {first} to {n - 1}, found {found} in row {row}")
 
 
-def check_comparable(database: DescriptorFile, queries: DescriptorFile) -> None:
-    """Raise ValueError unless both files' descriptors have as many numbers and the same distance."""
-    there, here = ((file.descriptors.shape[1], file.distance) for file in (database, queries))
-    if there != here:
-        raise ValueError(
-            f"expected descriptors of {there[0]} numbers, compared by {there[1]}, in {queries.sequence} as in "
-            f"{database.sequence}; found {here[0]}, {here[1]}"
-        )
-
-
 def pose_sources(*files: DescriptorFile) -> str | None:
     """Return every pose source of the files once, as one text; None where none is named."""
     return ", ".join(dict.fromkeys(file.pose_source for file in files if file.pose_source)) or None

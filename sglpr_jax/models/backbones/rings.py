@@ -14,6 +14,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.fields import Size, Sizes, check_fields
 from sglpr_jax.models.backbones.interface import Seen
 from sglpr_jax.models.layers import LayerNorm, Linear
 
@@ -23,16 +24,19 @@ class RingConfig:
     """Convolutions that go around the polar image, a block of them for each width."""
 
     kind: Literal["rings"] = "rings"
-    average: int = 2
+    average: Size = 2
     """Edge of the squares of polar pixels whose means the first block sees: without, the resampling skips cells."""
-    widths: tuple[int, ...] = (16, 32, 64, 96, 128, 160, 160)
+    widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
     """Channels of each block."""
-    strides: tuple[int, ...] = (2, 2, 1, 2, 1, 1, 1)
+    strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
     """Of each block, along the radius."""
-    means: tuple[int, ...] = (1, 1, 2, 1, 2, 1, 1)
+    means: Sizes = (1, 1, 2, 1, 2, 1, 1)
     """How many neighbouring sectors become one after each block."""
 
     def __post_init__(self):
+        check_fields(self)
+        if not self.widths:
+            raise ValueError("widths: expected at least one block, found ()")
         if not len(self.widths) == len(self.strides) == len(self.means):
             raise ValueError(
                 "the ring net needs as many strides and means as widths, found "

@@ -11,8 +11,10 @@ from typing import Literal
 import flax.linen as nn
 from jaxtyping import Array, Float
 
+from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
 from sglpr_jax.models.backbones.interface import Seen
 from sglpr_jax.models.backbones.rings import RingConfig, RingDecoder, RingNet
+from sglpr_jax.models.backbones.swin_layers import check_stages
 from sglpr_jax.models.backbones.swin_unet import SwinUnet
 
 
@@ -23,21 +25,21 @@ class SglprConfig:
     kind: Literal["sglpr"] = "sglpr"
     stem: RingConfig = RingConfig(widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
     """Its last map has a pixel for each token."""
-    embed_dim: int = 64
-    depths: tuple[int, ...] = (2, 2)
+    embed_dim: Size = 64
+    depths: Depths = (2, 2)
     """Blocks of each stage."""
-    heads: tuple[int, ...] = (2, 4)
+    heads: Sizes = (2, 4)
     """Attention heads of each stage."""
-    window: int = 4
+    window: Size = 4
     """Edge of an attention window, in tokens."""
-    mlp_ratio: int = 2
+    mlp_ratio: Size = 2
     """Of the hidden layer of a block's MLP to its channels; 4 in the paper."""
-    drop_path: float = 0.0
+    drop_path: Share = 0.0
     """Stochastic depth: the share of samples for which training leaves the last block out; 0 for the first block."""
 
     def __post_init__(self):
-        if len(self.depths) != len(self.heads):
-            raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
+        check_fields(self)
+        check_stages(self.embed_dim, self.depths, self.heads)
 
     @property
     def token(self) -> tuple[int, int]:

@@ -5,9 +5,10 @@ from typing import Literal
 
 from jaxtyping import Array, Float
 
+from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
 from sglpr_jax.models.backbones.interface import Seen
 from sglpr_jax.models.backbones.stem import Stem, StemDecoder
-from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand
+from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand, check_stages
 from sglpr_jax.models.backbones.swin_unet import SwinUnet
 
 
@@ -16,24 +17,24 @@ class SwinConfig:
     """A Swin-Unet. The default is the paper's; stage i has `embed_dim` * 2**i channels."""
 
     kind: Literal["swin"] = "swin"
-    patch: int = 4
+    patch: Size = 4
     """Edge of a token's patch, in pixels of the image."""
-    stem: tuple[int, ...] = ()
+    stem: Sizes = ()
     """Widths of convolutions before the patch embedding, the second and later ones at half the resolution of the one
     before; the segmentation head sees each of them again. (): none, as in the paper."""
-    embed_dim: int = 96
-    depths: tuple[int, ...] = (2, 2, 2, 2)
+    embed_dim: Size = 96
+    depths: Depths = (2, 2, 2, 2)
     """Blocks of each stage."""
-    heads: tuple[int, ...] = (3, 6, 12, 24)
+    heads: Sizes = (3, 6, 12, 24)
     """Attention heads of each stage."""
-    window: int = 7
+    window: Size = 7
     """Edge of an attention window, in tokens."""
-    drop_path: float = 0.2
+    drop_path: Share = 0.2
     """Stochastic depth: the share of samples for which training leaves the last block out; 0 for the first block."""
 
     def __post_init__(self):
-        if len(self.depths) != len(self.heads):
-            raise ValueError(f"one number of heads per stage is needed, found depths {self.depths}, heads {self.heads}")
+        check_fields(self)
+        check_stages(self.embed_dim, self.depths, self.heads)
         if self.patch % self._stem_pixel:
             raise ValueError(
                 f"a stem of {len(self.stem)} widths makes pixels of {self._stem_pixel} cells, of which a "

@@ -1,0 +1,104 @@
+"""What the fields of a configuration may hold: their annotations say it, and every road in is checked by them.
+
+A configuration is a frozen dataclass whose `__post_init__` calls `check_fields`. Types, choices (`Literal`), tuples and
+`None` mean what they always do; a number is finite, no bool is a number, and `Bounds` may narrow it down.
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+import types
+import typing
+from typing import Annotated, Any, Literal, NamedTuple
+
+
+class Bounds(NamedTuple):
+    """Which numbers a field may hold."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    above: float = -math.inf
+
+    def __contains__(self, value: Any) -> bool:
+        return self.least <= value <= self.most and value > self.above
+
+    def __str__(self) -> str:
+        words = {"above ": self.above, "from ": self.least, "up to ": self.most}
+        return "a number " + " ".join(f"{word}{value:.12g}" for word, value in words.items() if math.isfinite(value))
+
+
+Size = Annotated[int, Bounds(1, 2**20)]
+"""A number of cells, channels or tokens; far more than fit any memory are a slip."""
+SizeOrNone = Annotated[int, Bounds(0, 2**20)]
+Sizes = tuple[Size, ...]
+Depths = tuple[Annotated[int, Bounds(1, 64)], ...]
+"""Blocks of each stage."""
+Count = Annotated[int, Bounds(1, 2**53)]
+CountOrNone = Annotated[int, Bounds(0, 2**53)]
+Positive = Annotated[float, Bounds(above=0)]
+NotNegative = Annotated[float, Bounds(0)]
+Share = Annotated[float, Bounds(0, 1)]
+
+
+def check_fields(config: Any) -> None:
+    """Raise ValueError, with the field, what was expected and what was found, where a field cannot hold its value."""
+    for name, annotation in field_types(type(config)).items():
+        check_value(getattr(config, name), annotation, f"{type(config).__name__}.{name}")
+
+
+@functools.cache
+def field_types(config: type) -> dict[str, Any]:
+    """The annotation of every field of a dataclass, by its name."""
+    return typing.get_type_hints(config, include_extras=True)
+
+
+def check_value(value: Any, annotation: Any, field: str) -> None:
+    """Raise ValueError, which begins with `field`, unless a field with this annotation may hold the value."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        check_value(value, parts[0], field)
+        require(value, value in parts[1], str(parts[1]), field)
+    elif origin in (typing.Union, types.UnionType):
+        _check_union(value, parts, field)
+    elif origin is Literal:
+        fits = any(type(value) is type(choice) and value == choice for choice in parts)
+        require(value, fits, f"one of {', '.join(map(repr, parts))}", field)
+    elif origin is tuple:
+        _check_tuple(value, parts, field)
+    elif annotation is float:
+        require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
+        require(value, abs(value) <= sys.float_info.max, "a finite number", field)  # no whole number is too long for it
+    elif dataclasses.is_dataclass(annotation):
+        require(value, isinstance(value, annotation), f"the fields of a {annotation.__name__}", field)
+    else:
+        expected = "null" if annotation is types.NoneType else f"a value of type {annotation.__name__}"
+        require(value, type(value) is annotation, expected, field)
+
+
+def require(value: Any, fits: bool, expected: str, field: str) -> None:
+    """Raise ValueError, which begins with `field`, with what was expected and the value found, unless it `fits`."""
+    if not fits:
+        found = repr(value)
+        shown = found if len(found) <= 60 else f"{found[:57]}..."
+        raise ValueError(f"{field}{': ' if field else ''}expected {expected}, found {shown}")
+
+
+def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
+    """One member must hold it. The first says what was expected, or all, where they are configurations."""
+    if value is None and types.NoneType in members:
+        return
+    configs = [member for member in members if dataclasses.is_dataclass(member)]
+    if configs:
+        names = " or ".join(member.__name__ for member in configs)
+        require(value, isinstance(value, tuple(configs)), f"the fields of a {names}", field)
+    else:
+        check_value(value, next(member for member in members if member is not types.NoneType), field)
+
+
+def _check_tuple(value: Any, items: tuple[Any, ...], field: str) -> None:
+    require(value, isinstance(value, tuple), "a list", field)
+    if items[-1] is not Ellipsis:
+        require(value, len(value) == len(items), f"a list of {len(items)}", field)
+    for i, one in enumerate(value):
+        check_value(one, items[0] if items[-1] is Ellipsis else items[i], field)

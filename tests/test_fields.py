@@ -1,0 +1,105 @@
+"""A configuration made by hand, by a preset or by flags holds what its annotations say, and nothing else."""
+
+import copy
+import dataclasses
+from typing import Literal
+
+import pytest
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.fields import Bounds, Positive, Share, Sizes, check_fields
+from sglpr_jax.models.backbones.sglpr import SglprConfig
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.loss import LossConfig
+from sglpr_jax.training.optimizer import OptimizerConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """One field of every kind."""
+
+    share: Share = 0.5
+    name: Literal["a", "b"] = "a"
+    sizes: Sizes = ()
+    pair: tuple[int, float] | None = None
+    clip: Positive | None = None
+    grid: Grid = Grid()
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"share": 1}, {"name": "b"}, {"sizes": (1, 2)}, {"pair": (1, 2.5)}, {"clip": 2.0}]
+)
+def test_what_an_annotation_allows_is_allowed(values):
+    assert dataclasses.asdict(Example(**values)) == dataclasses.asdict(Example()) | values
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"share": 1.5}, "Example.share: expected a number from 0 up to 1, found 1.5"),
+        ({"share": True}, "Example.share: expected a value of type float, found True"),
+        ({"share": "1"}, "Example.share: expected a value of type float, found '1'"),
+        ({"share": None}, "Example.share: expected a value of type float, found None"),
+        ({"share": float("nan")}, "Example.share: expected a finite number, found nan"),
+        ({"name": "A"}, "Example.name: expected one of 'a', 'b', found 'A'"),
+        ({"name": ["a"]}, "Example.name: expected one of 'a', 'b', found ['a']"),
+        ({"sizes": [1]}, "Example.sizes: expected a list, found [1]"),
+        ({"sizes": (0,)}, "Example.sizes: expected a number from 1 up to 1048576, found 0"),
+        ({"pair": (1,)}, "Example.pair: expected a list of 2, found (1,)"),
+        ({"pair": (1.0, 1.0)}, "Example.pair: expected a value of type int, found 1.0"),
+        ({"clip": 0.0}, "Example.clip: expected a number above 0, found 0.0"),
+        ({"grid": {}}, "Example.grid: expected the fields of a Grid, found {}"),
+        ({"name": "a" * 100}, f"Example.name: expected one of 'a', 'b', found '{'a' * 56}..."),
+    ],
+)
+def test_anything_else_is_one_error_with_field_expected_and_found(values, message):
+    with pytest.raises(ValueError) as error:
+        Example(**values)
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("config", "values"),
+    [
+        (Grid, dict(resolution_m=float("nan"))),
+        (Grid, dict(height=128.0)),
+        (HeadConfig, dict(pooling="gem")),
+        (HeadConfig, dict(clusters=0)),
+        (ModelConfig, dict(image="Density")),
+        (ModelConfig, dict(counts="log")),
+        (ModelConfig, dict(blind_m=float("nan"))),
+        (ModelConfig, dict(blind_m=-2.0)),
+        (ModelConfig, dict(range_channel=1)),
+        (ModelConfig, dict(backbone="rings")),
+        (SwinConfig, dict(heads=(5, 6, 12, 24))),
+        (SglprConfig, dict(depths=(), heads=())),
+        (TupleConfig, dict(positives=0)),
+        (TupleConfig, dict(positive_m=float("inf"))),
+        (LossConfig, dict(margin="0.3")),
+        (LossConfig, dict(reduction="mean")),
+        (OptimizerConfig, dict(learning_rate=float("nan"))),
+        (OptimizerConfig, dict(warmup_steps=1.5)),
+        (TrainConfig, dict(steps=0)),
+        (TrainConfig, dict(score_every=0)),
+        (TrainConfig, dict(model=None)),
+    ],
+)
+def test_every_configuration_checks_its_fields(config, values):
+    """Set behind its back: tests check the types of all arguments, a user's Python does not."""
+    made = copy.copy(config())
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    with pytest.raises(ValueError, match=r"expected .*found "):
+        made.__post_init__()
+
+
+def test_bounds_say_themselves_in_words():
+    assert str(Bounds(1, 5)) == "a number from 1 up to 5"
+    assert str(Bounds(above=0)) == "a number above 0"
+    assert 0 not in Bounds(above=0) and 5 in Bounds(1, 5) and 6 not in Bounds(1, 5)
