@@ -6,8 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import progress_bar, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.reader import PoseChoice
 from sglpr_jax.methods.registry import MethodName, method_named

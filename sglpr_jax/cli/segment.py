@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, progress_bar, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.evaluation.segmentation import map_confusion
 from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score

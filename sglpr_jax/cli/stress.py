@@ -6,8 +6,8 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, progress_bar, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.readers.kitti import PoseChoice

@@ -40,9 +40,21 @@ class Recording:
     """The edge of a pixel of ready-made images, in metres; None for scans."""
     on_disk: bool = True
     """Whether `read` gives what the files hold: not where it is packed, corrupted or simulated."""
+    found: tuple[str, ...] = ()
+    """What the reader found, for a person: the format of the scans, what was left aside."""
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @property
+    def description(self) -> tuple[str, ...]:
+        """Everything that was found, a line each: how many scans, their format, times, poses and their frame."""
+        times = "none" if self.times is None else f"over {np.ptp(self.times):.1f} s"
+        return (
+            f"{self.name}: {len(self)} {'images' if self.has_images else 'scans'}",
+            *self.found,
+            f"times: {times}; poses: {self.pose_source or 'none'}",
+        )
 
     @property
     def has_images(self) -> bool:

@@ -26,6 +26,10 @@ _RECORDS = {
 _LASER_FIELDS = {"nuscenes": "ring", "nclt": "laser"}
 
 
+ENDINGS = (".bin", ".pcd")
+"""Of files that are scans."""
+
+
 def scan_id(path: Path) -> str:
     """Return the name of a scan file without its endings: "000052" for 000052.bin, "sweep" for sweep.pcd.bin."""
     return path.name.removesuffix(".bin").removesuffix(".pcd")

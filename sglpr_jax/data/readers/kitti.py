@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import PoseChoice, Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
@@ -29,12 +30,12 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str, *, pose_source: PoseChoice = "auto") -> Recording:
     """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses."""
     folder = root / "sequences" / name
-    scan_paths = tuple(sorted((folder / "velodyne").glob("*.bin")))
+    scan_paths = files_in(folder / "velodyne", ".bin")
     if not scan_paths:
         raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
     ids = tuple(path.stem for path in scan_paths)
     positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
-    labels = {path.stem: path for path in (folder / "labels").glob("*.label")}
+    labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
     return Recording(
         name=name,
         ids=ids,

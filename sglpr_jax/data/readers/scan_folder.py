@@ -1,53 +1,109 @@
-"""A plain folder of single scans (.bin, .pcd), with a `poses.txt` beside them or without."""
+"""A plain folder of single scans, with poses and times beside them or without.
 
+    my_scans/full0.bin, full1.bin, ..., full10.bin   in the order of their numbers; hidden files are none
+    my_scans/poses.txt     12 numbers a line (LiDAR frame, z up) or 8 (TUM); or poses.tum or poses.csv
+    my_scans/times.txt     seconds, one number a line
+
+Poses and times have one line for each scan.
+"""
+
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
-from sglpr_jax.data.formats.pose_files import read_poses
-from sglpr_jax.data.formats.scan_files import ScanFormat, scan_id
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.formats.pose_files import columns_of, read_times
+from sglpr_jax.data.formats.scan_files import ENDINGS, ScanFormat, guess_format, scan_id
+from sglpr_jax.data.formats.trajectory import Trajectory, check_order, read_trajectory
+from sglpr_jax.data.listing import files_in, left_aside
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
 
+POSE_FILES = ("poses.txt", "poses.tum", "poses.csv")
+TIMES_FILE = "times.txt"
+
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return the folder's own name if there are scans in it, else nothing."""
-    return (root.resolve().name,) if _scan_paths(root) else ()
+    return (root.resolve().name,) if files_in(root, *ENDINGS) else ()
 
 
 def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
-    """Open the folder `root`; scans come in the order of their names, or of their numbers where all are numbers.
+    """Open the folder `root`; see above for what lies in it, and `read_scan` for `format`.
 
-    `format`: see `read_scan`. `poses.txt` has 12 numbers a line (LiDAR frame, metres, z up), one line per scan in that
-    order; without it the positions are None. Raises ValueError where it has another number of lines or is malformed.
+    Without poses the positions are None. Raises ValueError where poses or times are malformed or not as many as scans,
+    and where two files have the same name but for the ending. Warns where consecutive poses are far apart.
     """
-    scan_paths = _scan_paths(root)
-    if not scan_paths:
-        raise FileNotFoundError(f"{root}: expected scans (*.bin, *.pcd), found none")
-    pose_path = root / "poses.txt"
-    world_from_lidar = read_poses(pose_path) if pose_path.is_file() else None
-    if world_from_lidar is not None and len(world_from_lidar) != len(scan_paths):
-        raise ValueError(f"{pose_path}: expected {len(scan_paths)} rows, one per scan, found {len(world_from_lidar)}")
+    paths = files_in(root, *ENDINGS)
+    if not paths:
+        raise FileNotFoundError(f"{root}: expected scans ({_endings()}), found none")
+    ids = _ids(root, paths)
+    poses = _poses(root, len(paths))
+    times = _times(root, len(paths), poses)
+    if poses is not None:
+        check_order(poses.positions, ids, path=root / poses.source)
     return Recording(
         name=root.resolve().name,
-        ids=tuple(scan_id(path) for path in scan_paths),
-        positions=None if world_from_lidar is None else world_from_lidar[:, :, 3],
-        times=None,
-        pose_source=None if world_from_lidar is None else pose_path.name,
-        paths=scan_paths,
+        ids=ids,
+        positions=None if poses is None else poses.positions,
+        times=times,
+        pose_source=None if poses is None else poses.source,
+        paths=paths,
         read=partial(scan_record, format=format),
+        found=_found(root, paths, format),
     )
 
 
-def _scan_paths(root: Path) -> tuple[Path, ...]:
-    paths = sorted(path for path in root.iterdir() if path.suffix in (".bin", ".pcd")) if root.is_dir() else []
-    if all(scan_id(path).isdecimal() for path in paths):
-        paths.sort(key=lambda path: int(scan_id(path)))
-    return tuple(paths)
+def _endings() -> str:
+    return ", ".join(f"*{ending}" for ending in ENDINGS)
+
+
+def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
+    """The scans' names; ValueError where two files have one: which of them is the scan?"""
+    first: dict[str, Path] = {}
+    for path in paths:
+        other = first.setdefault(scan_id(path), path)
+        if other is not path:
+            raise ValueError(f"{root}: expected one file for each scan, found {other.name} and {path.name}")
+    return tuple(first)
+
+
+def _poses(root: Path, scans: int) -> Trajectory | None:
+    """The poses beside the scans, by the first file there is; None without."""
+    path = next((root / name for name in POSE_FILES if (root / name).is_file()), None)
+    if path is None:
+        return None
+    twelve = path.suffix == ".txt" and columns_of(path) != 8
+    found = read_trajectory(path, format="lidar" if twelve else "auto")
+    if len(found.positions) != scans:
+        raise ValueError(f"{path}: expected {scans} rows, one per scan, found {len(found.positions)}")
+    return Trajectory(found.positions, found.times, path.name)
+
+
+def _times(root: Path, scans: int, poses: Trajectory | None) -> Float[np.ndarray, " n"] | None:
+    """The times of `times.txt`, else those of the poses, else None."""
+    path = root / TIMES_FILE
+    if not path.is_file():
+        return None if poses is None else poses.times
+    times = read_times(path)
+    if len(times) != scans:
+        raise ValueError(f"{path}: expected {scans} times, one per scan, found {len(times)}")
+    return times
+
+
+def _found(root: Path, paths: tuple[Path, ...], format: ScanFormat) -> tuple[str, ...]:
+    """What the files are, and what else lies in the folder."""
+    formats = Counter(guess_format(path) if format == "auto" else format for path in paths)
+    kinds = ", ".join(name if len(formats) == 1 else f"{count} {name}" for name, count in formats.items())
+    aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
+    return (f"format: {kinds}", *([f"left aside: {aside}"] if aside else []))
 
 
 READER = Reader(
-    layout="single scans (*.bin, *.pcd)",
+    layout=f"single scans ({_endings()})",
     recording_names=recording_names,
     open=lambda root, name, options: open_recording(root, format=options.format),
     rank=9,
