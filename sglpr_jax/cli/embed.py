@@ -37,7 +37,7 @@ class EmbedCommand:
     pose_source: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
     rotate: bool = False
     """Rotate every scan about z by its own random angle first."""
     seed: int = 0

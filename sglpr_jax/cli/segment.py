@@ -39,7 +39,7 @@ class SegmentCommand:
     seq: str | None = None
     """Which sequence; may be left out where there is only one."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
     min_confidence: float = 0.0
     """Leave cells unlabelled, and out of the score, whose likeliest class has a smaller probability."""
 

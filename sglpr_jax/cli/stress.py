@@ -44,7 +44,7 @@ class StressCommand:
     pose_source: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
     seed: int = 0
     """A scan's corruption is a function of it and the scan's number."""
     batch: int = 16

@@ -18,7 +18,7 @@ class ReadOptions:
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are."""
+    """What the scans of a plain folder, or of KITTI's layout, are."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from sglpr_jax.data.formats.bin_records import RecordFormat
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.formats.scan_files import ScanFormat, read_labels, read_points_and_lasers
 from sglpr_jax.labels import to_classes
@@ -46,12 +47,19 @@ ReadRecord = Callable[[Path, Path | None, bool], Record]
 """Reads a record: the file of the scan or image, that of its labels (None: without), and whether lasers are wanted."""
 
 
-def scan_record(path: Path, labels: Path | None = None, lasers: bool = False, *, format: ScanFormat = "auto") -> Record:
-    """Read a scan, each of its files once.
+def scan_record(
+    path: Path,
+    labels: Path | None = None,
+    lasers: bool = False,
+    *,
+    format: ScanFormat = "auto",
+    records: RecordFormat = "kitti",
+) -> Record:
+    """Read a scan, each of its files once; "auto" takes a .bin whose name says nothing for `records`.
 
     Raises what `read_scan` and `read_labels` raise: ValueError, for instance, where there is not one label per point.
     """
-    points, laser_of_point = read_points_and_lasers(path, format=format)
+    points, laser_of_point = read_points_and_lasers(path, format=format, records=records)
     raw = None if labels is None else read_labels(labels, points=len(points))
     return Record(points=points, labels=raw, lasers=laser_of_point if lasers else None)
 

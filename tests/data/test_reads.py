@@ -10,7 +10,7 @@ from sglpr_jax.bev import Grid
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import Corruption
-from sglpr_jax.data.formats import scan_files
+from sglpr_jax.data.formats import bin_records, scan_files
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.retrieval.embed import embed_images, embed_scans
@@ -31,7 +31,8 @@ def opened(monkeypatch) -> collections.Counter:
         def __getattr__(self, name: str):
             return fromfile if name == "fromfile" else getattr(real, name)
 
-    monkeypatch.setattr(scan_files, "np", Counted())
+    for module in (bin_records, scan_files):
+        monkeypatch.setattr(module, "np", Counted())
     return counts
 
 

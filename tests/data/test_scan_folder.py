@@ -97,7 +97,9 @@ def test_what_is_left_aside_is_said(tmp_path):
     (folder / "more").mkdir()
     found = open_recording(folder).found
     assert found == ("format: pcd", "left aside: 1 .bak, 1 .jpg, 1 .xyz, 1 folder (more)")
-    assert open_recording(write_scans(tmp_path / "mixed", "0.pcd", "1.bin")).found == ("format: 1 pcd, 1 kitti",)
+    assert open_recording(write_scans(tmp_path / "mixed", "0.pcd", "1.bin")).found == (
+        "format: 1 pcd, 1 kitti (16 bytes a point), too few points to find out",
+    )
 
 
 def test_two_files_of_one_scan_are_refused(tmp_path):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from sglpr_jax.data.formats.scan_files import Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record

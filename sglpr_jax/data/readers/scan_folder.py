@@ -10,12 +10,15 @@ Poses and times have one line for each scan.
 from collections import Counter
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.formats.bin_records import RecordFormat, described
 from sglpr_jax.data.formats.pose_files import columns_of, read_times
-from sglpr_jax.data.formats.scan_files import ENDINGS, ScanFormat, guess_format, scan_id
+from sglpr_jax.data.formats.record_size import find_record
+from sglpr_jax.data.formats.scan_files import ENDINGS, ScanFormat, guess_format, says_its_format, scan_id
 from sglpr_jax.data.formats.trajectory import Trajectory, check_order, read_trajectory
 from sglpr_jax.data.listing import files_in, left_aside
 from sglpr_jax.data.reader import Reader
@@ -34,7 +37,8 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
     """Open the folder `root`; see above for what lies in it, and `read_scan` for `format`.
 
-    Without poses the positions are None. Raises ValueError where poses or times are malformed or not as many as scans,
+    What a .bin holds is found out where neither `format` nor its name says it (`find_record`). Without poses the
+    positions are None. Raises ValueError where poses or times are malformed or not as many as scans,
     and where two files have the same name but for the ending. Warns where consecutive poses are far apart.
     """
     paths = files_in(root, *ENDINGS)
@@ -43,6 +47,7 @@ def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
     ids = _ids(root, paths)
     poses = _poses(root, len(paths))
     times = _times(root, len(paths), poses)
+    records, kinds = _formats(paths, format)
     if poses is not None:
         check_order(poses.positions, ids, path=root / poses.source)
     return Recording(
@@ -52,8 +57,8 @@ def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
         times=times,
         pose_source=None if poses is None else poses.source,
         paths=paths,
-        read=partial(scan_record, format=format),
-        found=_found(root, paths, format),
+        read=partial(scan_record, format=format, records=records),
+        found=(f"format: {kinds}", *_left_aside(root, paths)),
     )
 
 
@@ -94,12 +99,21 @@ def _times(root: Path, scans: int, poses: Trajectory | None) -> Float[np.ndarray
     return times
 
 
-def _found(root: Path, paths: tuple[Path, ...], format: ScanFormat) -> tuple[str, ...]:
-    """What the files are, and what else lies in the folder."""
-    formats = Counter(guess_format(path) if format == "auto" else format for path in paths)
-    kinds = ", ".join(name if len(formats) == 1 else f"{count} {name}" for name, count in formats.items())
+def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
+    """What a .bin is whose name does not say it, and the formats of all scans in words."""
+    unsaid = [path for path in paths if not says_its_format(path)] if format == "auto" else []
+    found, how = find_record(unsaid) if unsaid else (None, "")
+    records: RecordFormat = found or "kitti"
+    counts = Counter(guess_format(path, records=records) if format == "auto" else format for path in paths)
+    said = {name: described(name) if name in get_args(RecordFormat) else name for name in counts}
+    kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
+    return records, f"{kinds}, {how}" if unsaid else kinds
+
+
+def _left_aside(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
+    """What else lies in the folder."""
     aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
-    return (f"format: {kinds}", *([f"left aside: {aside}"] if aside else []))
+    return (f"left aside: {aside}",) if aside else ()
 
 
 READER = Reader(
