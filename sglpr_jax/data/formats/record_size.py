@@ -22,7 +22,7 @@ MOST_M = 300.0
 """Coordinates lie within so many metres, all but a share of `STRANGE`."""
 USUAL_M = 120.0
 """Half of the points are nearer than this on the ground."""
-LEAST_M = 1e-6
+LEAST_M = 1e-20
 """Coordinates that are smaller and not 0 are no measurement but the low half of a wider number."""
 STRANGE = 0.02
 TURNS = (5, 6, 7, 8)
