@@ -4,7 +4,7 @@
     bev = sglpr_jax.scan_image(points, params.config)   # scan (n, 3), metres -> image (h, w)
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 
-- describe a place: `load`, `scan_image`, `describe`; `segment`, `forward`; under jit, vmap and grad
+- describe a place: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`; under jit, vmap and grad
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
 - find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`
@@ -26,7 +26,7 @@ from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import MODELS, model_preset
-from sglpr_jax.models.sglpr import Outputs, describe, forward, init, segment
+from sglpr_jax.models.sglpr import Outputs, describe, forward, init, is_describable, segment
 from sglpr_jax.models.shipped import shipped_weights
 from sglpr_jax.models.weights import for_places
 from sglpr_jax.models.weights_file import load, save
@@ -90,6 +90,7 @@ __all__ = [
     "for_places",
     "forward",
     "init",
+    "is_describable",
     "load",
     "model_preset",
     "nearest",

@@ -21,6 +21,7 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
+from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.density_image import check_density_grid, density_bev, density_label_bev
 from sglpr_jax.data.record import Record
 
@@ -47,12 +48,14 @@ def view(
     """The image (h, w) of a record on `grid` and, with `categories`, its map of so many classes (h, w).
 
     `image` says what the points of a scan are made into; a ready-made image is cut to the grid, or left whole with
-    None. With `angle` (radians, counter-clockwise) the place is rotated first. Raises ValueError for a scan without a
-    grid, for a grid that has no density image, and for a record without the labels asked for.
+    None. With `angle` (radians, counter-clockwise) the place is rotated first. Raises ValueError for a scan that shows
+    no place (`check_cloud`) or has no grid, for a grid that has no density image, and for a record without the labels
+    asked for.
     """
     classes = classes_of(record, categories) if categories else None
     if record.points is None:
         return image_view(*picture(record, classes), grid, angle)
+    check_cloud(record.points, name=record.name)
     if grid is None:
         raise ValueError("scans need a grid to be rasterised on, found none")
     if image == "density":

@@ -54,7 +54,7 @@ def test_a_record_opens_each_of_its_files_once(recording, opened):
 
 def test_labels_that_nobody_asked_for_are_not_read(recording, opened):
     assert recording.record(0, labels=False).labels is None
-    embed_images(flatten, recording, Grid(1.0, 16, 16), config={})
+    embed_images(flatten, recording, Grid(2.0, 160, 160), config={})
     assert set(opened) == {"000000.bin", "000002.bin", "000003.bin"}
 
 
