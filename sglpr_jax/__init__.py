@@ -5,7 +5,8 @@
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 
 - describe a place: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`; under jit, vmap and grad
-- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
+- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
+  `estimate_mounting`
 - find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`
 - recordings without a dataset: `simulate`
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data import Record, Recording, open_recording, read_scan, recording_names
 from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes
 from sglpr_jax.models.backbones.rings import RingConfig
 from sglpr_jax.models.backbones.sglpr import SglprConfig
@@ -73,6 +75,7 @@ __all__ = [
     "Grid",
     "HeadConfig",
     "ModelConfig",
+    "Mounting",
     "Nearest",
     "Outputs",
     "Params",
@@ -86,6 +89,7 @@ __all__ = [
     "density_bev",
     "describe",
     "embed",
+    "estimate_mounting",
     "evaluate",
     "for_places",
     "forward",

@@ -9,7 +9,7 @@ import tyro
 from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import progress_bar, run
 from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.data.reader import PoseChoice, SensorHeight
 from sglpr_jax.methods.registry import MethodName, method_named
 from sglpr_jax.retrieval.embed import embed
 
@@ -38,6 +38,9 @@ class EmbedCommand:
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
     """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     rotate: bool = False
     """Rotate every scan about z by its own random angle first."""
     seed: int = 0
@@ -54,7 +57,13 @@ def embed_recording(command: EmbedCommand) -> Path:
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
-    recording = open_recording(command.data, command.seq, pose_source=command.pose_source, format=command.format)
+    recording = open_recording(
+        command.data,
+        command.seq,
+        pose_source=command.pose_source,
+        format=command.format,
+        sensor_height=command.sensor_height,
+    )
     method = method_named(command.method, command.weights, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         file = embed(

@@ -10,7 +10,7 @@ from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, progress_bar, run
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
 from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.readers.kitti import PoseChoice
+from sglpr_jax.data.reader import PoseChoice, SensorHeight
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
 from sglpr_jax.methods.registry import MethodName, methods_named
@@ -45,6 +45,9 @@ class StressCommand:
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
     """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     seed: int = 0
     """A scan's corruption is a function of it and the scan's number."""
     batch: int = 16
@@ -55,7 +58,13 @@ def run_stress_test(command: StressCommand) -> Path:
     """Do what the command says; returns the folder written."""
     stress_protocols(command.protocol)  # what is wrong with these is said first
     chosen_corruptions(command.corruption)
-    recording = open_recording(command.data, command.seq, pose_source=command.pose_source, format=command.format)
+    recording = open_recording(
+        command.data,
+        command.seq,
+        pose_source=command.pose_source,
+        format=command.format,
+        sensor_height=command.sensor_height,
+    )
     if recording.has_images and not command.corruption:
         print(f"sequence {recording.name} has only images, which can only be rotated", file=sys.stderr)
     found = stress_test(

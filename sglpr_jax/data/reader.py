@@ -12,6 +12,11 @@ PoseChoice = Literal["auto", "semantickitti", "kitti"]
 """Which of the two pose files of KITTI's layout."""
 
 
+SensorHeight = float | Literal["auto", "estimate"]
+"""Metres over the ground; "estimate" finds them, and the tilt, from the scans; "auto" does where the layout does not
+tell how the sensor was mounted."""
+
+
 @dataclass(frozen=True)
 class ReadOptions:
     """What a user may say about a dataset; a reader uses what concerns it."""
@@ -31,5 +36,7 @@ class Reader:
     """The names of the recordings in a folder, in order; none where the folder has another layout."""
     open: Callable[[Path, str, ReadOptions], Recording]
     """Open one of them."""
+    knows_mounting: bool = True
+    """Whether scans of this layout come from sensors as models know them; else the mounting is estimated."""
     rank: int = 5
     """Where two layouts fit one folder, that of the lower rank is taken; then the first by name of its file."""

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int32
 from sglpr_jax.data.formats.bin_records import RecordFormat
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.formats.scan_files import ScanFormat, read_labels, read_points_and_lasers
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.labels import to_classes
 
 
@@ -31,6 +32,14 @@ class Record:
     """Metres, z up."""
     time: float | None = None
     """Seconds."""
+    mounting: Mounting | None = None
+    """How the sensor was mounted; None: as models know it."""
+
+    @property
+    def upright_points(self) -> Float32[np.ndarray, "n 3"]:
+        """The points as an upright sensor 1.73 m above the ground has them, which is what models see of a scan."""
+        assert self.points is not None
+        return self.points if self.mounting is None else self.mounting.level(self.points)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -60,10 +60,10 @@ def view(
         raise ValueError("scans need a grid to be rasterised on, found none")
     if image == "density":
         check_density_grid(grid)
-        points = record.points if angle is None else rotated(record.points, float(angle))
+        points = record.upright_points if angle is None else rotated(record.upright_points, float(angle))
         return image_view(*picture(Record(points=points), classes), grid)
     padding = -len(record.points) % _POINTS_STEP
-    points = jnp.asarray(np.pad(record.points, ((0, padding), (0, 0))))
+    points = jnp.asarray(np.pad(record.upright_points, ((0, padding), (0, 0))))
     padded = None if classes is None else jnp.asarray(np.pad(classes, (0, padding)))
     return cloud_view(points, padded, jnp.int32(len(record.points)), grid, angle)
 
@@ -83,7 +83,8 @@ def picture(
     if record.points is None:
         assert record.image is not None
         return record.image, classes
-    return density_bev(record.points), None if classes is None else density_label_bev(record.points, classes)
+    points = record.upright_points
+    return density_bev(points), None if classes is None else density_label_bev(points, classes)
 
 
 def image_view(

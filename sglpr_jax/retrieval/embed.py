@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, classes_of, rotated, view
@@ -49,7 +50,8 @@ def embed(
     """
     method = network(method) if isinstance(method, Params) else method
     _check(method, recording)
-    config = {"data": recording.name, **method.about}
+    sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
+    config = {"data": recording.name, **sensor, **method.about}
     options = {"rotation_seed": rotation_seed, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
     if isinstance(method, ScanMethod):
         about = {"config": config, "distance": method.distance, "labels": method.labels}
@@ -130,13 +132,16 @@ def embed_scans(
     return _file(recording, rows, descriptors, config={**config, "rotation_seed": rotation_seed}, distance=distance)
 
 
-def scan_image(points: Float32[np.ndarray, "n 3"], config: ModelConfig) -> Float[Array, "h w"]:
+def scan_image(
+    points: Float32[np.ndarray, "n 3"], config: ModelConfig, *, mounting: Mounting | None = None
+) -> Float[Array, "h w"]:
     """The image of a scan (metres; x forward, y left, z up) that a model describes: see `ModelConfig.image`.
 
+    `mounting` says how the sensor was mounted (None: upright, 1.73 m above the ground); `estimate_mounting` finds it.
     Raises ValueError for a scan that shows no place: no finite points, no metres, next to nothing where the model
     looks. For images from elsewhere there is `is_describable`.
     """
-    image = view(Record(points=points), config.grid, image=config.image).image
+    image = view(Record(points=points, mounting=mounting), config.grid, image=config.image).image
     _check_view(np.asarray(image), field_of_view(config)[0], name="the scan")
     return image
 
@@ -203,7 +208,7 @@ def _finite_points(
     assert record.points is not None
     check_cloud(record.points, name=record.name)
     finite = np.isfinite(record.points).all(axis=1)
-    return record.points[finite], classes_of(record, 20)[finite] if labels else None
+    return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
 
 
 def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Float[np.ndarray, "b d"]:

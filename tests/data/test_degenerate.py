@@ -82,7 +82,7 @@ def test_embedding_refuses_an_empty_window_and_an_empty_image(random_params):
     with pytest.raises(ValueError, match="scan 1 of sequence 08: expected points in at least 2 cells"):
         sglpr_jax.embed(params, scans)
     blank = np.zeros((CONFIG.grid.height, CONFIG.grid.width), np.float32)
-    with pytest.raises(ValueError, match="scan 0 of sequence 08: expected points in at least 2 cells .* in 0"):
+    with pytest.raises(ValueError, match=r"scan 0 of sequence 08: expected points in at least 2 cells .* in 0"):
         sglpr_jax.embed(params, of_images({Path("0.png"): blank}))
 
 

@@ -9,7 +9,8 @@ import pkgutil
 from pathlib import Path
 
 from sglpr_jax.data.formats.scan_files import ENDINGS, ScanFormat
-from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions
+from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions, SensorHeight
 from sglpr_jax.data.recording import Recording
 
 
@@ -31,13 +32,19 @@ def recording_names(root: Path | str) -> tuple[str, ...]:
 
 
 def open_recording(
-    root: Path | str, name: str | None = None, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
+    root: Path | str,
+    name: str | None = None,
+    *,
+    pose_source: PoseChoice = "auto",
+    format: ScanFormat = "auto",
+    sensor_height: SensorHeight = "auto",
 ) -> Recording:
     """Open one sequence of `root`, whatever its layout.
 
     Without `name`, `root` must have one sequence. `pose_source` chooses between the two pose files of KITTI's layout
-    and is not used for the others; `format` tells what the scans of a plain folder are. Raises FileNotFoundError where
-    something is missing, ValueError where a file is malformed.
+    and is not used for the others; `format` tells what each point of a .bin is. `sensor_height` (metres over the
+    ground) says how the sensor was mounted; "auto" estimates it, and the tilt, from some scans where the layout does
+    not tell. Raises FileNotFoundError where something is missing, ValueError where a file is malformed.
 
     Example:
       recording = open_recording("KITTI", "08")
@@ -49,7 +56,8 @@ def open_recording(
     if name is None or name not in names:
         asked = "the name of one sequence" if name is None else f"sequence {name!r}"
         raise FileNotFoundError(f"{root}: expected {asked}, found {', '.join(names)}")
-    return reader.open(root, name, ReadOptions(pose_source, format))
+    recording = reader.open(root, name, ReadOptions(pose_source, format))
+    return mounted(recording, sensor_height, known=reader.knows_mounting)
 
 
 def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:

@@ -120,5 +120,6 @@ READER = Reader(
     layout=f"single scans ({_endings()})",
     recording_names=recording_names,
     open=lambda root, name, options: open_recording(root, format=options.format),
+    knows_mounting=False,
     rank=9,
 )

@@ -79,7 +79,7 @@ def read_batch(
     def read(recording: Recording, frame: int) -> Place:
         record = _read(recording, frame, images=images, labels=has_labels)
         classes = record.classes(categories) if has_labels else None
-        return picture(record, classes) if pictures else (record.points, classes)
+        return picture(record, classes) if pictures else (record.upright_points, classes)
 
     found = [read(*place) for place in places]
     labelled = np.array([classes is not None for _, classes in found])
