@@ -139,7 +139,7 @@ def test_a_plain_folder_is_levelled_before_a_model_sees_it(low_robot):
 
 
 def test_every_road_levels(low_robot):
-    folder, expected = low_robot
+    folder, _ = low_robot
     recording = open_recording(folder, sensor_height=0.5)
     config = dataclasses.replace(model_preset("tiny"), grid=Grid(0.4, 32, 32), image="density")
     lifted = street(0, height=0.5) + np.float32([0, 0, 0.5 - MODEL_HEIGHT_M])

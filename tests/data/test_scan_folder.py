@@ -68,7 +68,7 @@ def test_one_bad_scan_leaves_the_others(tmp_path):
 def test_a_folder_without_scans_is_refused(tmp_path):
     assert recording_names(tmp_path) == ()
     assert recording_names(tmp_path / "none") == ()
-    with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.bin, \*\.pcd\), found none"):
+    with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.bin, \*\.pcd, \*\.ply, .*\), found none"):
         open_recording(tmp_path)
 
 

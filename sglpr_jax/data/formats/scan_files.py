@@ -6,16 +6,21 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from sglpr_jax.data.formats.arrays import read_npy, read_npz
 from sglpr_jax.data.formats.bin_records import RecordFormat, read_records
+from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.formats.pcd import read_pcd
+from sglpr_jax.data.formats.ply import read_ply
 
-ScanFormat = Literal["auto", "pcd", RecordFormat]
+ScanFormat = Literal["auto", "pcd", "ply", "npy", "npz", "las", RecordFormat]
 """What a scan file is; "auto": what its name says."""
 
-READERS = {".pcd": read_pcd}
+READERS = {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".npz": read_npz, ".las": read_las}
 """The formats with a header, by the ending of their files."""
-ENDINGS = (".bin", *READERS)
+ENDINGS = (".bin", ".pcd", ".ply")
 """Of files that are scans."""
+ARRAY_ENDINGS = (".npy", ".npz", ".las")
+"""Of files that are scans where none of the others lie beside them: else they are descriptors, poses or a map."""
 
 
 def scan_id(path: Path) -> str:
@@ -50,7 +55,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
     - nclt: uint16 x, y, z and two bytes; metres = value * 0.005 - 100, decoded in float64. Its y points right and its z
       down, so both are negated: a rotation, where negating z alone would mirror the scan.
     - float32x5, float64x3 and so on: so many numbers a point, x, y and z first; the axes stay as they are.
-    - pcd: see `read_pcd`; the axes stay as they are.
+    - pcd, ply, npy, npz, las: see their readers; the axes stay as they are.
 
     "auto" goes by the name, and takes a .bin that says nothing for kitti; `find_record` looks into the files. Points
     that are not finite are kept, so that labels still fit; the rasteriser drops them. Raises FileNotFoundError, and

@@ -8,7 +8,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from sglpr_jax.data.formats.scan_files import ENDINGS, ScanFormat
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat
 from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions, SensorHeight
 from sglpr_jax.data.recording import Recording
@@ -68,7 +68,11 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
             return reader, names
     *layouts, last = (reader.layout for reader in readers())
     if root.is_file():
-        scan = "; put scans into a folder, or read one by read_scan" if root.name.endswith(ENDINGS) else ""
+        scan = (
+            "; put scans into a folder, or read one by read_scan"
+            if root.name.endswith((*ENDINGS, *ARRAY_ENDINGS))
+            else ""
+        )
         raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{scan}")
     found = "nothing of the kind" if root.is_dir() else "no such folder"
     raise FileNotFoundError(f"{root}: expected {', '.join(layouts)} or {last}, found {found}")

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from sglpr_jax.data.formats.bin_records import RecordFormat, described
 from sglpr_jax.data.formats.pose_files import columns_of, read_times
 from sglpr_jax.data.formats.record_size import find_record
-from sglpr_jax.data.formats.scan_files import ENDINGS, ScanFormat, guess_format, says_its_format, scan_id
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat, guess_format, says_its_format, scan_id
 from sglpr_jax.data.formats.trajectory import Trajectory, check_order, read_trajectory
 from sglpr_jax.data.listing import files_in, left_aside
 from sglpr_jax.data.reader import Reader
@@ -31,7 +31,7 @@ TIMES_FILE = "times.txt"
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return the folder's own name if there are scans in it, else nothing."""
-    return (root.resolve().name,) if files_in(root, *ENDINGS) else ()
+    return (root.resolve().name,) if _scans(root) else ()
 
 
 def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
@@ -41,7 +41,7 @@ def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
     positions are None. Raises ValueError where poses or times are malformed or not as many as scans,
     and where two files have the same name but for the ending. Warns where consecutive poses are far apart.
     """
-    paths = files_in(root, *ENDINGS)
+    paths = _scans(root)
     if not paths:
         raise FileNotFoundError(f"{root}: expected scans ({_endings()}), found none")
     ids = _ids(root, paths)
@@ -62,8 +62,13 @@ def open_recording(root: Path, *, format: ScanFormat = "auto") -> Recording:
     )
 
 
+def _scans(root: Path) -> tuple[Path, ...]:
+    """The scans in a folder; arrays are scans where there are no others."""
+    return files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
+
+
 def _endings() -> str:
-    return ", ".join(f"*{ending}" for ending in ENDINGS)
+    return ", ".join(f"*{ending}" for ending in (*ENDINGS, *ARRAY_ENDINGS))
 
 
 def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
