@@ -4,8 +4,9 @@
     bev = sglpr_jax.scan_image(points, params.config)   # scan (n, 3), metres -> image (h, w)
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 
-- describe a place: `load`, `scan_image`, `describe`; `segment`, `forward`; under jit, vmap and grad
-- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
+- describe a place: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`; under jit, vmap and grad
+- read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
+  `estimate_mounting`
 - find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
 - recordings without a dataset: `simulate`
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
 from sglpr_jax.data import Record, Recording, open_recording, read_scan, recording_names
 from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes
 from sglpr_jax.models.backbones.rings import RingConfig
 from sglpr_jax.models.backbones.sglpr import SglprConfig
@@ -26,7 +28,7 @@ from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import MODELS, model_preset
-from sglpr_jax.models.sglpr import Outputs, describe, forward, init, segment
+from sglpr_jax.models.sglpr import Outputs, describe, forward, init, is_describable, segment
 from sglpr_jax.models.shipped import shipped_weights
 from sglpr_jax.models.weights import for_places
 from sglpr_jax.models.weights_file import load, save
@@ -75,6 +77,7 @@ __all__ = [
     "Grid",
     "HeadConfig",
     "ModelConfig",
+    "Mounting",
     "Nearest",
     "Outputs",
     "Params",
@@ -88,10 +91,12 @@ __all__ = [
     "density_bev",
     "describe",
     "embed",
+    "estimate_mounting",
     "evaluate",
     "for_places",
     "forward",
     "init",
+    "is_describable",
     "load",
     "model_preset",
     "nearest",

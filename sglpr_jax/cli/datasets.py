@@ -8,7 +8,7 @@ from typing import Any
 
 from sglpr_jax import sim
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
-from sglpr_jax.data import Recording
+from sglpr_jax.data import Recording, readers
 from sglpr_jax.data import leave_one_out as split
 from sglpr_jax.data.reader import PoseChoice
 from sglpr_jax.sim.simulation import Simulated, default_dataset, default_sessions
@@ -56,6 +56,13 @@ def _announce(dataset: Simulated) -> None:
             f"about {dataset.missing_bytes / 1e6:.0f} MB",
             file=sys.stderr,
         )
+
+
+def open_recording(root: Path, name: str | None, **options: Any) -> Recording:
+    """Do what `data.open_recording` does, and say what was found."""
+    recording = readers.open_recording(root, name, **options)
+    print("\n".join(recording.description), file=sys.stderr)
+    return recording
 
 
 def leave_one_out(

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import progress_bar, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat
-from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.data.reader import PoseChoice, SensorHeight
 from sglpr_jax.methods.registry import MethodName, method_named
 from sglpr_jax.retrieval.embed import embed
 
@@ -39,7 +39,10 @@ class EmbedCommand:
     pose_source: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     poses: Path | None = None
     """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
     pose_format: PoseFormat = "auto"
@@ -70,6 +73,7 @@ def embed_recording(command: EmbedCommand) -> Path:
         poses=command.poses,
         pose_format=command.pose_format,
         times=command.times,
+        sensor_height=command.sensor_height,
     )
     method = method_named(command.method, command.weights, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:

@@ -8,7 +8,9 @@ import tyro
 
 from sglpr_jax.cli.runtime import console, run
 from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat, read_trajectory
+from sglpr_jax.data.reader import SensorHeight
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.inputs.methods import read_methods
 from sglpr_jax.evaluation.page.recording_pictures import check_same_frames, poses_of, take_pictures
@@ -61,6 +63,11 @@ class EvaluateCommand:
     """A dataset with the frames as scans or images: the page then shows them."""
     seq: str | None = None
     """The sequence: which of --data, and the name of a FILE that has none of its own; published splits go by it."""
+    format: ScanFormat = "auto"
+    """What the scans of --data are, where their names do not tell."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     weights: str | None = None
     """The name of shipped weights or a training run's folder: with --data the page then shows semantic maps and feature
     heat maps."""
@@ -84,7 +91,11 @@ def evaluate_file(command: EvaluateCommand) -> Path:
 
 def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     """Score, print and write; returns the paths written."""
-    recording = None if command.data is None else open_recording(command.data, command.seq)
+    recording = (
+        None
+        if command.data is None
+        else open_recording(command.data, command.seq, format=command.format, sensor_height=command.sensor_height)
+    )
     params = None if command.weights is None else load(command.weights)
     poses = None
     if command.poses is not None:

@@ -15,6 +15,8 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sglpr_jax.data.warning import DataWarning
+
 _TABLE_WIDTH = 140
 
 
@@ -35,6 +37,8 @@ def run(command: Callable[[], object]) -> None:
     for chatty in ("absl", "asyncio"):  # pages about a checkpoint that failed, which orbax raises too
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)  # the same at the very end
+    warnings.showwarning = _show_warning
+    warnings.simplefilter("always", DataWarning)
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _show_unraisable
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # where the user has chosen a place, JAX has read it
@@ -46,6 +50,14 @@ def run(command: Callable[[], object]) -> None:
         sys.exit(f"error: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    """What Python does; of what is wrong with the data in one line."""
+    if issubclass(category, DataWarning):
+        print(f"warning: {message}", file=sys.stderr)
+    else:
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
 
 
 def _show_unraisable(unraisable) -> None:

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, progress_bar, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.reader import SensorHeight
 from sglpr_jax.evaluation.segmentation import map_confusion
 from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
 from sglpr_jax.files import write_json
@@ -39,14 +40,17 @@ class SegmentCommand:
     seq: str | None = None
     """Which sequence; may be left out where there is only one."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     min_confidence: float = 0.0
     """Leave cells unlabelled, and out of the score, whose likeliest class has a smaller probability."""
 
 
 def segment_recording(command: SegmentCommand) -> Path:
     """Do what the command says; returns the folder written."""
-    recording = open_recording(command.data, command.seq, format=command.format)
+    recording = open_recording(command.data, command.seq, format=command.format, sensor_height=command.sensor_height)
     least = command.min_confidence
     if not 0 <= least <= 1:
         raise ValueError(f"--min-confidence is a probability: expected 0 to 1, found {least}")

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, progress_bar, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat
-from sglpr_jax.data.readers.kitti import PoseChoice
+from sglpr_jax.data.reader import PoseChoice, SensorHeight
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
 from sglpr_jax.methods.registry import MethodName, methods_named
@@ -45,7 +45,10 @@ class StressCommand:
     pose_source: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     poses: Path | None = None
     """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
     pose_format: PoseFormat = "auto"
@@ -70,6 +73,7 @@ def run_stress_test(command: StressCommand) -> Path:
         poses=command.poses,
         pose_format=command.pose_format,
         times=command.times,
+        sensor_height=command.sensor_height,
     )
     if recording.has_images and not command.corruption:
         print(f"sequence {recording.name} has only images, which can only be rotated", file=sys.stderr)

@@ -13,13 +13,18 @@ PoseChoice = Literal["auto", "semantickitti", "kitti"]
 """Which of the two pose files of KITTI's layout."""
 
 
+SensorHeight = float | Literal["auto", "estimate"]
+"""Metres over the ground; "estimate" finds them, and the tilt, from the scans; "auto" does where the layout does not
+tell how the sensor was mounted."""
+
+
 @dataclass(frozen=True)
 class ReadOptions:
     """What a user may say about a dataset; a reader uses what concerns it."""
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are."""
+    """What each point of a .bin is, in a plain folder or KITTI's layout."""
     poses: Path | None = None
     """The pose file of a plain folder, where it does not lie beside the scans."""
     pose_format: PoseFormat = "auto"
@@ -37,6 +42,8 @@ class Reader:
     """The names of the recordings in a folder, in order; none where the folder has another layout."""
     open: Callable[[Path, str, ReadOptions], Recording]
     """Open one of them."""
+    knows_mounting: bool = True
+    """Whether scans of this layout come from sensors as models know them; else the mounting is estimated."""
     rank: int = 5
     """Where two layouts fit one folder, that of the lower rank is taken; then the first by name of its file."""
     takes_poses: bool = False

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from sglpr_jax.data.formats.bin_records import RecordFormat
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.formats.scan_files import ScanFormat, read_labels, read_points_and_lasers
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.labels import to_classes
 
 
@@ -30,6 +32,14 @@ class Record:
     """Metres, z up."""
     time: float | None = None
     """Seconds."""
+    mounting: Mounting | None = None
+    """How the sensor was mounted; None: as models know it."""
+
+    @property
+    def upright_points(self) -> Float32[np.ndarray, "n 3"]:
+        """The points as an upright sensor 1.73 m above the ground has them, which is what models see of a scan."""
+        assert self.points is not None
+        return self.points if self.mounting is None else self.mounting.level(self.points)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -46,12 +56,19 @@ ReadRecord = Callable[[Path, Path | None, bool], Record]
 """Reads a record: the file of the scan or image, that of its labels (None: without), and whether lasers are wanted."""
 
 
-def scan_record(path: Path, labels: Path | None = None, lasers: bool = False, *, format: ScanFormat = "auto") -> Record:
-    """Read a scan, each of its files once.
+def scan_record(
+    path: Path,
+    labels: Path | None = None,
+    lasers: bool = False,
+    *,
+    format: ScanFormat = "auto",
+    records: RecordFormat = "kitti",
+) -> Record:
+    """Read a scan, each of its files once; "auto" takes a .bin whose name says nothing for `records`.
 
     Raises what `read_scan` and `read_labels` raise: ValueError, for instance, where there is not one label per point.
     """
-    points, laser_of_point = read_points_and_lasers(path, format=format)
+    points, laser_of_point = read_points_and_lasers(path, format=format, records=records)
     raw = None if labels is None else read_labels(labels, points=len(points))
     return Record(points=points, labels=raw, lasers=laser_of_point if lasers else None)
 

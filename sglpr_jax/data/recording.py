@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import ReadRecord, Record
 
 
@@ -40,9 +41,23 @@ class Recording:
     """The edge of a pixel of ready-made images, in metres; None for scans."""
     on_disk: bool = True
     """Whether `read` gives what the files hold: not where it is packed, corrupted or simulated."""
+    mounting: Mounting | None = None
+    """The sensor's height and tilt, where they are not those that models know; None: as the points are."""
+    found: tuple[str, ...] = ()
+    """What the reader found, for a person: the format of the scans, what was left aside."""
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @property
+    def description(self) -> tuple[str, ...]:
+        """Everything that was found, a line each: how many scans, their format, times, poses and their frame."""
+        times = "none" if self.times is None else f"over {np.ptp(self.times):.1f} s"
+        return (
+            f"{self.name}: {len(self)} {'images' if self.has_images else 'scans'}",
+            *self.found,
+            f"times: {times}; poses: {self.pose_source or 'none'}",
+        )
 
     @property
     def has_images(self) -> bool:
@@ -70,6 +85,7 @@ class Recording:
             name=f"scan {self.ids[i]} of sequence {self.name}",
             position=None if self.positions is None else self.positions[i],
             time=None if self.times is None else float(self.times[i]),
+            mounting=self.mounting,
         )
 
     def points(self, i: int) -> Float32[np.ndarray, "n 3"]:

@@ -21,6 +21,7 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
+from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.density_image import check_density_grid, density_bev, density_label_bev
 from sglpr_jax.data.record import Record
 
@@ -47,20 +48,22 @@ def view(
     """The image (h, w) of a record on `grid` and, with `categories`, its map of so many classes (h, w).
 
     `image` says what the points of a scan are made into; a ready-made image is cut to the grid, or left whole with
-    None. With `angle` (radians, counter-clockwise) the place is rotated first. Raises ValueError for a scan without a
-    grid, for a grid that has no density image, and for a record without the labels asked for.
+    None. With `angle` (radians, counter-clockwise) the place is rotated first. Raises ValueError for a scan that shows
+    no place (`check_cloud`) or has no grid, for a grid that has no density image, and for a record without the labels
+    asked for.
     """
     classes = classes_of(record, categories) if categories else None
     if record.points is None:
         return image_view(*picture(record, classes), grid, angle)
+    check_cloud(record.points, name=record.name)
     if grid is None:
         raise ValueError("scans need a grid to be rasterised on, found none")
     if image == "density":
         check_density_grid(grid)
-        points = record.points if angle is None else rotated(record.points, float(angle))
+        points = record.upright_points if angle is None else rotated(record.upright_points, float(angle))
         return image_view(*picture(Record(points=points), classes), grid)
     padding = -len(record.points) % _POINTS_STEP
-    points = jnp.asarray(np.pad(record.points, ((0, padding), (0, 0))))
+    points = jnp.asarray(np.pad(record.upright_points, ((0, padding), (0, 0))))
     padded = None if classes is None else jnp.asarray(np.pad(classes, (0, padding)))
     return cloud_view(points, padded, jnp.int32(len(record.points)), grid, angle)
 
@@ -80,7 +83,8 @@ def picture(
     if record.points is None:
         assert record.image is not None
         return record.image, classes
-    return density_bev(record.points), None if classes is None else density_label_bev(record.points, classes)
+    points = record.upright_points
+    return density_bev(points), None if classes is None else density_label_bev(points, classes)
 
 
 def image_view(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 
 from sglpr_jax.bev import Grid, ImageKind
 
@@ -52,6 +52,8 @@ class ImageMethod:
     """The function wants maps of so many classes too; 0: of none."""
     image: ImageKind = "points"
     """What raw scans are made into."""
+    field: Bool[np.ndarray, "h w"] | None = None
+    """In which cells the function looks; None: in all."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from sglpr_jax.bev import Grid
 from sglpr_jax.data import Recording
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
+from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe
@@ -51,7 +52,15 @@ def network(params: Params) -> ImageMethod:
     config = params.config
     about = {"method": NETWORK, "model": dataclasses.asdict(config)}
     describe_views = functools.partial(describe, params)
-    return ImageMethod(describe_views, config.grid, about, weights_hash(params), config.categories_read, config.image)
+    return ImageMethod(
+        describe_views,
+        config.grid,
+        about,
+        weights_hash(params),
+        config.categories_read,
+        config.image,
+        field=field_of_view(config)[0],
+    )
 
 
 def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:

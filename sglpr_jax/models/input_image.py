@@ -2,20 +2,21 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Num
 
 from sglpr_jax.bev import Grid
+from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.polar import to_polar
 
 CLIP_COUNT = 10.0
+FEWEST_CELLS = 2
+"""An image shows a place from so many cells with points on. All empty images have one descriptor."""
 
 
-def prepare(
-    bev: Float[Array, "b h w"] | Int[Array, "b h w"], config: ModelConfig
-) -> Float[Array, "b h w {config.channels}"]:
+def prepare(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w {config.channels}"]:
     """Point counts as network input: rescaled as `config.counts` says, blank where it does not see."""
-    image = jnp.asarray(bev, jnp.float32)
+    image = _counts(bev, config)
     if config.counts == "log1p":
         image = jnp.log1p(image)
     elif config.counts == "clipped":
@@ -25,6 +26,18 @@ def prepare(
         distance = cell_distance(config.grid) / cell_distance(config.grid).max()
         image = jnp.concatenate([image, jnp.broadcast_to(distance[None, ..., None], image.shape)], axis=-1)
     return image
+
+
+def _counts(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w"]:
+    """The counts of an image. Those of a density image are fractions: bytes are its grey values, integers no image."""
+    if config.image == "density" and not jnp.issubdtype(bev.dtype, jnp.floating):
+        if bev.dtype != jnp.uint8:
+            raise ValueError(
+                "this model describes density images: expected counts 0 to 10 as floats, or grey values 0 to 255 as "
+                f"uint8, found {bev.dtype}, which has lost the fractions of the counts"
+            )
+        return bev.astype(jnp.float32) * np.float32(MAX_COUNT / 255)
+    return jnp.asarray(bev, jnp.float32)
 
 
 def backbone_view(image: Float[Array, "b h w c"], config: ModelConfig) -> Float[Array, "b p q c"]:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.backbones.interface import Backbone, Seen
@@ -13,7 +13,7 @@ from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.heads.place import PlaceHead
 from sglpr_jax.models.heads.raw_input import raw_input
 from sglpr_jax.models.heads.segmentation import segmentation_head
-from sglpr_jax.models.input_image import backbone_view, field_of_view, prepare
+from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
 
@@ -74,20 +74,32 @@ def _decode_every(n: int, backbone: Backbone, seen: Seen) -> Float[Array, "b p q
 @jax.jit
 def describe(
     params: Params,
-    bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
+    bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
     """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
 
     Any leading axes; works under jit, vmap and grad; computes nothing of the segmentation head. The distance between
     two descriptors is the dissimilarity of their places (equation 2). A head that reads labels (`head.input`) needs the
-    maps of classes too. Raises ValueError for images of another size than `params.config.grid`, and for labels that are
-    missing or that nothing reads.
+    maps of classes too. A density image is float counts 0 to 10, or the uint8 grey values 0 to 255 of its file. Raises
+    ValueError for images of another size than `params.config.grid`, for density images of other integers, and for
+    labels that are missing or that nothing reads. An empty image has a descriptor too: see `is_describable`.
     """
     return forward(params, bev, labels, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
 
 
-def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
+@jax.jit
+def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b"]:
+    """Whether each image shows something where the model looks: finite counts, and at least 2 cells that hold points.
+
+    The flag beside `describe`, which gives every empty image the same descriptor. Works under jit and vmap.
+    """
+    seen = jnp.where(field_of_view(params.config)[0], bev > 0, False)
+    enough = seen.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS
+    return enough & jnp.isfinite(bev).all((-2, -1))
+
+
+def segment(params: Params, bev: Num[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
     """The semantic logits of each image, from the head that training uses. Raises ValueError where there is none."""
     if not params.config.segments:
         raise ValueError("expected a model with a segmentation head, found one without: it was made for places alone")
@@ -96,7 +108,7 @@ def segment(params: Params, bev: Float[Array, "*b h w"] | Int[Array, "*b h w"]) 
 
 def forward(
     params: Params,
-    bev: Float[Array, "*b h w"] | Int[Array, "*b h w"],
+    bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
     *,
     key: Array | None = None,

@@ -7,9 +7,11 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32
 
 from sglpr_jax.bev import Grid, ImageKind
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, classes_of, rotated, view
@@ -17,6 +19,7 @@ from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import DescribeFn, DescribeScanFn, ImageMethod, Method, ScanMethod
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
@@ -36,9 +39,9 @@ def embed(
     """Describe every scan or image of a recording by a model's weights, or by another method.
 
     With `rotation_seed` every scan is first rotated about z by its own random angle. A model describes `batch` scans
-    at a time. A scan that cannot be read raises its error, or, given `on_bad_scan(id, error)`, is left out.
-    `on_progress` is told how many scans are done. Raises ValueError where the recording has not the points or the
-    labels that the method needs.
+    at a time. A scan that cannot be read, or shows no place, raises its error, or, given `on_bad_scan(id, error)`, is
+    left out. `on_progress` is told how many scans are done. Raises ValueError where the recording has not the points or
+    the labels that the method needs.
 
     Example:
       params = sglpr_jax.load("simulated")
@@ -47,13 +50,15 @@ def embed(
     """
     method = network(method) if isinstance(method, Params) else method
     _check(method, recording)
-    config = {"data": recording.name, **method.about}
+    sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
+    config = {"data": recording.name, **sensor, **method.about}
     options = {"rotation_seed": rotation_seed, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
     if isinstance(method, ScanMethod):
         about = {"config": config, "distance": method.distance, "labels": method.labels}
         return embed_scans(method.describe, recording, **about, **options)
     about = {"config": config, "weights_hash": method.weights_hash, "categories": method.categories}
-    return embed_images(method.describe, recording, method.grid, **about, image=method.image, batch=batch, **options)
+    about |= {"image": method.image, "field": method.field}
+    return embed_images(method.describe, recording, method.grid, **about, batch=batch, **options)
 
 
 def embed_images(
@@ -65,6 +70,7 @@ def embed_images(
     weights_hash: str = "",
     categories: int = 0,
     image: ImageKind = "points",
+    field: Bool[np.ndarray, "h w"] | None = None,
     rotation_seed: int | None = None,
     batch: int = 16,
     on_bad_scan: OnBadScan | None = None,
@@ -73,8 +79,8 @@ def embed_images(
     """Describe the image of every scan of a recording.
 
     `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. `image` says what raw
-    scans are made into. With `categories` the labels beside the scans are read too, and `describe` gets each scan's map
-    of so many classes. The other options are those of `embed`.
+    scans are made into, `field` in which cells the method looks (None: in all). With `categories` the labels beside the
+    scans are read too, and `describe` gets each scan's map of so many classes. The other options are those of `embed`.
     """
     angles = _angles(len(recording), rotation_seed)
     rows, views, descriptors = [], [], []
@@ -82,7 +88,9 @@ def embed_images(
     def see(row: int) -> View:
         record = recording.record(row, labels=bool(categories))
         angle = None if angles is None else jnp.float32(angles[row])
-        return view(record, grid, image=image, categories=categories, angle=angle)
+        found = view(record, grid, image=image, categories=categories, angle=angle)
+        _check_view(np.asarray(found.image), field, name=record.name)
+        return found
 
     for row, seen in _readable(recording, see, on_bad_scan):
         rows.append(row)
@@ -124,9 +132,28 @@ def embed_scans(
     return _file(recording, rows, descriptors, config={**config, "rotation_seed": rotation_seed}, distance=distance)
 
 
-def scan_image(points: Float32[np.ndarray, "n 3"], config: ModelConfig) -> Float[Array, "h w"]:
-    """The image of a scan (metres; x forward, y left, z up) that a model describes: see `ModelConfig.image`."""
-    return view(Record(points=points), config.grid, image=config.image).image
+def scan_image(
+    points: Float32[np.ndarray, "n 3"], config: ModelConfig, *, mounting: Mounting | None = None
+) -> Float[Array, "h w"]:
+    """The image of a scan (metres; x forward, y left, z up) that a model describes: see `ModelConfig.image`.
+
+    `mounting` says how the sensor was mounted (None: upright, 1.73 m above the ground); `estimate_mounting` finds it.
+    Raises ValueError for a scan that shows no place: no finite points, no metres, next to nothing where the model
+    looks. For images from elsewhere there is `is_describable`.
+    """
+    image = view(Record(points=points, mounting=mounting), config.grid, image=config.image).image
+    _check_view(np.asarray(image), field_of_view(config)[0], name="the scan")
+    return image
+
+
+def _check_view(image: Float[np.ndarray, "h w"], field: Bool[np.ndarray, "h w"] | None, *, name: str) -> None:
+    """Raise ValueError where a method sees too little of an image; `field` says where it looks, None: everywhere."""
+    cells = np.count_nonzero(image if field is None else image * field)
+    if cells < FEWEST_CELLS:
+        raise ValueError(
+            f"{name}: expected points in at least {FEWEST_CELLS} cells of the window of {image.shape[0]} x"
+            f" {image.shape[1]}, found them in {cells}"
+        )
 
 
 def _check(method: Method, recording: Recording) -> None:
@@ -176,11 +203,12 @@ def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], 
 def _finite_points(
     recording: Recording, row: int, *, labels: bool
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """The finite points of one scan and, with `labels`, their classes; ValueError where it has none."""
+    """The finite points of one scan and, with `labels`, their classes; ValueError where it shows no place."""
     record = recording.record(row, labels=labels)
     assert record.points is not None
+    check_cloud(record.points, name=record.name)
     finite = np.isfinite(record.points).all(axis=1)
-    return record.points[finite], classes_of(record, 20)[finite] if labels else None
+    return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
 
 
 def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Float[np.ndarray, "b d"]:

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.density_image import density_image, density_label_image
-from sglpr_jax.data.formats.scan_files import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.formats.bin_records import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 

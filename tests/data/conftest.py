@@ -31,7 +31,7 @@ def kitti_root(tmp_path: Path) -> Path:
     for part in ("velodyne", "labels"):
         (folder / part).mkdir(parents=True)
     for frame in KITTI_FRAMES:
-        points = np.arange(KITTI_POINTS * 4, dtype="<f4").reshape(-1, 4) + 100 * frame
+        points = np.arange(KITTI_POINTS * 4, dtype="<f4").reshape(-1, 4) + 50 * frame
         points.tofile(folder / "velodyne" / f"{frame:06d}.bin")
         if frame != 2:
             (np.arange(KITTI_POINTS, dtype="<u4") + 48 + (7 << 16)).tofile(folder / "labels" / f"{frame:06d}.label")

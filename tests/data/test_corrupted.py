@@ -90,7 +90,7 @@ def test_lasers_named_by_the_file_are_used(tmp_path):
 
 def test_a_scan_without_rings_is_named(tmp_path):
     np.random.default_rng(0).normal(scale=10, size=(4000, 4)).astype("<f4").tofile(tmp_path / "000007.bin")
-    found = corrupted(open_recording(tmp_path), Corruption("beams", 16.0), seed=0)
+    found = corrupted(open_recording(tmp_path, format="kitti"), Corruption("beams", 16.0), seed=0)
     with pytest.raises(ValueError, match=r"scan 000007 of sequence .*: beams-16: expected a scan with rings"):
         found.points(0)
 

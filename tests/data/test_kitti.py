@@ -11,7 +11,7 @@ def test_sparse_scans_take_their_own_rows(kitti_root):
     assert (sequence.name, sequence.ids, len(sequence)) == ("08", ("000000", "000002", "000003"), 3)
     np.testing.assert_array_equal(sequence.positions, [[0, -1, -2], [20, -1, -2], [30, -1, -2]])
     np.testing.assert_array_equal(sequence.times, [0, 0.2, 0.3])
-    np.testing.assert_array_equal(sequence.points(1)[:2], [[200, 201, 202], [204, 205, 206]])
+    np.testing.assert_array_equal(sequence.points(1)[:2], [[100, 101, 102], [104, 105, 106]])
 
 
 def test_labels_where_there_are_any(kitti_root):

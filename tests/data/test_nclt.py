@@ -11,7 +11,7 @@ from sglpr_jax.bev import Grid, rasterize
 from sglpr_jax.data import open_recording, read_scan, recording_names
 from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import Corruption
-from sglpr_jax.data.formats.scan_files import NCLT_RECORD
+from sglpr_jax.data.formats.bin_records import NCLT_RECORD
 from sglpr_jax.data.readers import nclt
 
 DATE = "2012-01-15"

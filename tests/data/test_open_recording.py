@@ -1,5 +1,7 @@
 """One call opens any layout, and says what it expected where there is none."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,11 @@ def test_an_unknown_layout_says_what_was_expected(tmp_path):
         recording_names(tmp_path)
     with pytest.raises(FileNotFoundError, match="found no such folder"):
         open_recording(tmp_path / "none", "08")
+
+
+def test_a_single_file_is_no_recording(tmp_path):
+    np.zeros((2, 4), dtype="<f4").tofile(tmp_path / "000000.bin")
+    with pytest.raises(FileNotFoundError, match=r"000000\.bin: expected the folder .*, found a single file;"):
+        open_recording(tmp_path / "000000.bin")
+    with pytest.raises(FileNotFoundError, match=r"found a single file$"):
+        recording_names(Path(__file__))

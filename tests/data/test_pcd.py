@@ -59,7 +59,11 @@ def test_lines_may_end_with_carriage_returns(tmp_path):
         (b"", {}, "expected 3 points of 16 bytes, found 0 bytes"),
         (CLOUD.tobytes()[:-1], {}, "expected 3 points of 16 bytes, found 47 bytes"),
         (b"", {"points": 0}, "expected at least one point, found POINTS 0"),
-        (CLOUD.tobytes(), {"data": "binary_compressed"}, "expected DATA binary or ascii, found binary_compressed"),
+        (
+            CLOUD.tobytes(),
+            {"data": "binary_packed"},
+            "expected DATA binary, binary_compressed or ascii, found binary_pa",
+        ),
         (CLOUD.tobytes(), {"fields": "a b c d"}, "expected the fields x, y and z, found a b c d"),
         (CLOUD.tobytes(), {"sizes": "4 4 4"}, "expected one SIZE, TYPE and COUNT for each of 4 FIELDS"),
         (CLOUD.tobytes(), {"types": "F F Q F"}, "data type '<q4' not understood"),
@@ -87,3 +91,41 @@ def test_a_real_file(shared):
     points = read_pcd(shared / "data/samples/16_beams.pcd")
     assert points.shape == (32000, 3)
     assert np.isfinite(points).all(axis=1).sum() == 25207
+
+
+def compressed(columns: bytes, *, size: int | None = None) -> bytes:
+    """The body of a binary_compressed file, all literals."""
+    packed = bytearray()
+    for start in range(0, len(columns), 32):
+        run = columns[start : start + 32]
+        packed += bytes([len(run) - 1]) + run
+    return np.array([len(packed), len(columns) if size is None else size], "<u4").tobytes() + bytes(packed)
+
+
+def test_binary_compressed_has_one_field_after_another(tmp_path):
+    columns = np.concatenate([CLOUD[:, 2], CLOUD[:, 3], CLOUD[:, 0], CLOUD[:, 1]]).tobytes()
+    path = write(tmp_path / "a.pcd", compressed(columns), data="binary_compressed", fields="z intensity x y")
+    np.testing.assert_array_equal(read_pcd(path), CLOUD[:, :3])
+
+
+def test_binary_compressed_with_several_numbers_a_field(tmp_path):
+    histogram, xyz = np.arange(12, dtype="<u2"), CLOUD[:, :3].T.astype("<f8")
+    body = compressed(histogram.tobytes() + xyz.tobytes())
+    layout = {"fields": "h x y z", "sizes": "2 8 8 8", "types": "U F F F", "counts": "4 1 1 1"}
+    np.testing.assert_array_equal(
+        read_pcd(write(tmp_path / "a.pcd", body, data="binary_compressed", **layout)), CLOUD[:, :3]
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (b"\x01", "expected two sizes in front of the points, found 1 bytes"),
+        (compressed(CLOUD.tobytes(), size=64), "expected 3 points of 16 bytes in 50 bytes, found 64 in 50"),
+        (compressed(CLOUD.tobytes())[:-4], "expected 3 points of 16 bytes in 50 bytes, found 48 in 46"),
+        (compressed(CLOUD.tobytes())[:8] + b"\xff" * 50, "expected LZF, found a copy from before the beginning"),
+    ],
+)
+def test_a_broken_compressed_file_is_named(tmp_path, body, message):
+    with pytest.raises(ValueError, match=rf"a\.pcd: not a readable \.pcd file: {message}"):
+        read_pcd(write(tmp_path / "a.pcd", body, data="binary_compressed"))

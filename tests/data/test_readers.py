@@ -38,7 +38,7 @@ def with_another(tmp_path, monkeypatch):
 
 def test_the_readers_look_in_their_order():
     layouts = [reader.layout.rpartition("(")[2] for reader in readers.readers()]
-    known = ["KITTI)", "BEV images)", "NCLT)", "*.bin, *.pcd)"]
+    known = ["KITTI)", "BEV images)", "NCLT)", "*.bin, *.pcd, *.ply, *.npy, *.npz, *.las)"]
     assert [layout for layout in layouts if layout in known] == known
     assert layouts[-1] == known[-1], "single scans lie in other layouts too: that reader looks last"
 

@@ -10,7 +10,7 @@ from sglpr_jax.bev import Grid
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import Corruption
-from sglpr_jax.data.formats import scan_files
+from sglpr_jax.data.formats import bin_records, scan_files
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.retrieval.embed import embed_images, embed_scans
@@ -31,7 +31,8 @@ def opened(monkeypatch) -> collections.Counter:
         def __getattr__(self, name: str):
             return fromfile if name == "fromfile" else getattr(real, name)
 
-    monkeypatch.setattr(scan_files, "np", Counted())
+    for module in (bin_records, scan_files):
+        monkeypatch.setattr(module, "np", Counted())
     return counts
 
 
@@ -53,7 +54,7 @@ def test_a_record_opens_each_of_its_files_once(recording, opened):
 
 def test_labels_that_nobody_asked_for_are_not_read(recording, opened):
     assert recording.record(0, labels=False).labels is None
-    embed_images(flatten, recording, Grid(1.0, 16, 16), config={})
+    embed_images(flatten, recording, Grid(2.0, 160, 160), config={})
     assert set(opened) == {"000000.bin", "000002.bin", "000003.bin"}
 
 

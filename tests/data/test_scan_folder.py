@@ -5,6 +5,7 @@ import pytest
 
 from sglpr_jax.data import readers
 from sglpr_jax.data.readers.scan_folder import open_recording, recording_names
+from sglpr_jax.data.warning import DataWarning
 
 
 def write_scans(folder, *names, points=3):
@@ -68,7 +69,7 @@ def test_one_bad_scan_leaves_the_others(tmp_path):
 def test_a_folder_without_scans_is_refused(tmp_path):
     assert recording_names(tmp_path) == ()
     assert recording_names(tmp_path / "none") == ()
-    with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.bin, \*\.pcd\), found none"):
+    with pytest.raises(FileNotFoundError, match=r"expected scans \(\*\.bin, \*\.pcd, \*\.ply, .*\), found none"):
         open_recording(tmp_path)
 
 
@@ -124,3 +125,75 @@ def test_poses_that_do_not_fit_are_refused(tmp_path):
         ValueError, match=r"a\.txt: expected poses named for a plain folder of scans, found .*BEV images"
     ):
         readers.open_recording(tmp_path, "06", poses="a.txt")
+
+
+def test_numbers_in_names_sort_as_numbers(tmp_path):
+    folder = write_scans(tmp_path / "scans", "full10.bin", "full0.bin", "full2.bin", "full1.bin", "full02.bin")
+    assert open_recording(folder).ids == ("full0", "full1", "full2", "full02", "full10")
+
+
+def test_hidden_files_are_no_scans(tmp_path):
+    folder = write_scans(tmp_path / "scans", "000003.bin", "._000003.bin", ".old.pcd")
+    assert open_recording(folder).ids == ("000003",)
+    write_scans(tmp_path / "hidden", "._000003.bin")
+    assert recording_names(tmp_path / "hidden") == ()
+
+
+def test_what_is_left_aside_is_said(tmp_path):
+    folder = write_scans(tmp_path / "scans", "0.pcd", "1.pcd", "view.jpg", "map.xyz", "times.txt.bak")
+    (folder / "more").mkdir()
+    found = open_recording(folder).found
+    assert found == ("format: pcd", "left aside: 1 .bak, 1 .jpg, 1 .xyz, 1 folder (more)")
+    assert open_recording(write_scans(tmp_path / "mixed", "0.pcd", "1.bin")).found == (
+        "format: 1 pcd, 1 kitti (16 bytes a point), too few points to find out",
+    )
+
+
+def test_two_files_of_one_scan_are_refused(tmp_path):
+    folder = write_scans(tmp_path / "scans", "0.bin", "1.bin", "1.pcd")
+    with pytest.raises(ValueError, match=r"scans: expected one file for each scan, found 1\.bin and 1\.pcd"):
+        open_recording(folder)
+
+
+def test_times_beside_the_scans(tmp_path):
+    folder = write_scans(tmp_path / "scans", "0.bin", "1.bin", "2.bin")
+    (folder / "times.txt").write_text("0\n0.1\n0.2\n")
+    recording = open_recording(folder)
+    np.testing.assert_array_equal(recording.times, [0, 0.1, 0.2])
+    assert "times: over 0.2 s; poses: none" in recording.description
+    (folder / "times.txt").write_text("0\n0.1\n")
+    with pytest.raises(ValueError, match=r"times\.txt: expected 3 times, one per scan, found 2"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "poses.tum"])
+def test_tum_poses_beside_the_scans(tmp_path, name):
+    folder = write_scans(tmp_path / "scans", "0.bin", "1.bin")
+    (folder / name).write_text("# t x y z qx qy qz qw\n5 1 2 3 0 0 0 1\n6 4 5 6 0 0 0 1\n")
+    recording = open_recording(folder)
+    np.testing.assert_array_equal(recording.positions, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(recording.times, [5, 6])
+    assert recording.pose_source == name
+
+
+def test_consecutive_poses_far_apart_are_told(tmp_path, recwarn):
+    folder = write_scans(tmp_path / "scans", *(f"full{i}.bin" for i in range(30)))
+    way = np.stack([np.arange(30.0) * 2, np.zeros(30), np.zeros(30)], axis=1)
+    write_poses(folder / "poses.txt", way)
+    open_recording(folder)
+    assert not recwarn.list
+    write_poses(folder / "poses.txt", way[np.random.default_rng(0).permutation(30)])
+    with pytest.warns(DataWarning, match=r"poses\.txt: expected scans near the ones before them, found full\d+ and"):
+        open_recording(folder)
+    way[20:] += 300
+    write_poses(folder / "poses.txt", way)
+    with pytest.warns(DataWarning, match=r"full19 and full20 5\d\d m apart \(1 jumps; half .* below 2\.0 m"):
+        open_recording(folder)
+
+
+def test_poses_of_the_camera_are_told(tmp_path):
+    folder = write_scans(tmp_path / "scans", *(f"{i}.bin" for i in range(200)))
+    way = np.linspace(0, 1, 200)[:, None] * [60, 1, 180]
+    write_poses(folder / "poses.txt", way)
+    with pytest.warns(DataWarning, match=r"expected z up, found heights over 180 m and 60 x 1 m on the ground"):
+        open_recording(folder)

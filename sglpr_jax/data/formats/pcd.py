@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from sglpr_jax.data.formats.lzf import decompress_lzf
+
 
 def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of a .pcd file with `DATA binary` or `DATA ascii`, NaN points included.
+    """Return the points (n, 3) of a .pcd file with `DATA binary`, `binary_compressed` or `ascii`, NaN points included.
 
     Raises FileNotFoundError, and ValueError where the header, the fields or the number of points are not as expected.
     """
@@ -40,9 +42,11 @@ def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
     encoding, body = data[1], content[data.end() :]
     if encoding == b"binary":
         return _decode_binary(header, body)
+    if encoding == b"binary_compressed":
+        return _decode_compressed(header, body)
     if encoding == b"ascii":
         return _decode_ascii(header, body)
-    raise ValueError(f"expected DATA binary or ascii, found {encoding.decode()}")
+    raise ValueError(f"expected DATA binary, binary_compressed or ascii, found {encoding.decode()}")
 
 
 def _parse_header(text: str) -> _Header:
@@ -84,6 +88,25 @@ def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
         raise ValueError(f"expected {header.points} points of {record.itemsize} bytes, found {len(body)} bytes")
     records = np.frombuffer(body, dtype=record, count=header.points)
     return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+
+
+def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
+    """Two sizes, then LZF of the fields one after another: all x, all y and so on."""
+    if len(body) < 8:
+        raise ValueError(f"expected two sizes in front of the points, found {len(body)} bytes")
+    packed, size = (int(number) for number in np.frombuffer(body, "<u4", count=2))
+    widths = [dtype.itemsize * count for dtype, count in zip(header.dtypes, header.counts, strict=True)]
+    if size != header.points * sum(widths) or len(body) < 8 + packed:
+        raise ValueError(
+            f"expected {header.points} points of {sum(widths)} bytes in {packed} bytes, found {size} in {len(body) - 8}"
+        )
+    columns = decompress_lzf(body[8 : 8 + packed], size=size)
+    starts = [header.points * offset for offset in accumulate(widths, initial=0)]
+    found = [
+        np.frombuffer(columns, header.dtypes[field], count=header.points * header.counts[field], offset=starts[field])
+        for field in map(header.fields.index, "xyz")
+    ]
+    return np.stack([column[:: len(column) // header.points] for column in found], axis=1).astype(np.float32)
 
 
 def _decode_ascii(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:

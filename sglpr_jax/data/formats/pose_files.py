@@ -97,6 +97,12 @@ def read_rows(
     return values
 
 
+def columns_of(path: Path) -> int:
+    """Return how many words the first line of a text file has that is no comment; 0 for none."""
+    lines = path.read_text(errors="replace").splitlines()
+    return len(next((line.split() for line in lines if line.strip() and not line.startswith("#")), []))
+
+
 def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.ndarray, " {columns}"]:
     """Return words as numbers; ValueError, which begins with `where`, unless there are `columns` finite ones."""
     if len(words) != columns:

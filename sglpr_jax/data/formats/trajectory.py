@@ -6,23 +6,34 @@ tum     t x y z qx qy qz qw, z up
 csv     a header that names columns, x, y and z among them and perhaps t, time or timestamp (seconds)
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from sglpr_jax.data.formats.pose_files import (
     ROTATION_TOLERANCE,
     check_positions,
     check_times,
+    columns_of,
     read_poses,
     read_rows,
     read_times,
 )
+from sglpr_jax.data.warning import warn
 from sglpr_jax.poses import positions_from_camera
 
 PoseFormat = Literal["auto", "kitti", "lidar", "tum", "csv"]
+
+MOST_HEIGHT_M = 100.0
+"""Over a drive; more is believed where it reaches farther still on the ground."""
+JUMP_M = 10.0
+JUMP_STEPS = 8.0
+"""A step from scan to scan is a jump above so many metres, and above so many times the usual step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +67,7 @@ def read_trajectory(
     trajectory = READERS[_format_of(path, twelve_numbers) if format == "auto" else format](path)
     if len(trajectory.positions) == 0:
         raise ValueError(f"{path}: expected at least one pose, found none")
+    check_height(trajectory.positions, path=path)
     if times is None:
         return trajectory
     clock = read_times(times)
@@ -64,14 +76,46 @@ def read_trajectory(
     return replace(trajectory, times=clock)
 
 
+def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
+    """Warn of a height that runs as far as a road does: the poses are in another frame than they were read in."""
+    forward, left, up = np.ptp(positions, axis=0)
+    if up > MOST_HEIGHT_M and up > min(forward, left):
+        warn(
+            f"{path}: expected z up, found heights over {up:.0f} m and {forward:.0f} x {left:.0f} m on the ground;"
+            " are these poses in another frame (kitti: the camera's, lidar: z up)?"
+        )
+
+
+def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path: Path) -> None:
+    """Warn where consecutive scans are much farther apart than most: their order may not be that of the poses."""
+    if len(positions) < 3:
+        return
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    usual = float(np.median(steps))
+    far = np.flatnonzero(steps > max(JUMP_M, JUMP_STEPS * usual))
+    near = _nearest(positions)
+    if not len(far) and usual <= max(JUMP_M, JUMP_STEPS * near):
+        return
+    worst = int(np.argmax(steps))
+    warn(
+        f"{path}: expected scans near the ones before them, found {ids[worst]} and {ids[worst + 1]} {steps[worst]:.0f}"
+        f" m apart ({len(far)} jumps; half of the steps are below {usual:.1f} m, the nearest other pose is"
+        f" {near:.1f} m away); are the poses in the order of the scans?"
+    )
+
+
+def _nearest(positions: Float[np.ndarray, "n 3"]) -> float:
+    """How far the nearest other pose is, in the middle of all."""
+    return float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))
+
+
 def _format_of(path: Path, twelve_numbers: str | None) -> str:
     """Return the format that the ending or the first line tells."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     if path.suffix == ".csv":
         return "csv"
-    lines = (line.split() for line in path.read_text(errors="replace").splitlines() if not line.startswith("#"))
-    columns = len(next(lines, []))
+    columns = columns_of(path)
     if columns == 12 and twelve_numbers is not None:
         return twelve_numbers
     if columns == 12:

@@ -8,9 +8,10 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat
-from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions
+from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions, SensorHeight
 from sglpr_jax.data.recording import Recording
 
 
@@ -37,6 +38,7 @@ def open_recording(
     *,
     pose_source: PoseChoice = "auto",
     format: ScanFormat = "auto",
+    sensor_height: SensorHeight = "auto",
     poses: Path | str | None = None,
     pose_format: PoseFormat = "auto",
     times: Path | str | None = None,
@@ -44,9 +46,11 @@ def open_recording(
     """Open one sequence of `root`, whatever its layout.
 
     Without `name`, `root` must have one sequence. `pose_source` chooses between the two pose files of KITTI's layout
-    and is not used for the others. `format` tells what the scans of a plain folder are, `poses` and `times` are its
-    pose file and its file of seconds, where they do not lie beside the scans. Raises FileNotFoundError where something
-    is missing, ValueError where a file is malformed, or poses are named for a layout that has its own.
+    and is not used for the others; `format` tells what each point of a .bin is. `sensor_height` (metres over the
+    ground) says how the sensor was mounted; "auto" estimates it, and the tilt, from some scans where the layout does
+    not tell. `poses` and `times` are the pose file of a plain folder and its file of seconds, where they do not lie
+    beside the scans. Raises FileNotFoundError where something is missing, ValueError where a file is malformed, or
+    poses are named for a layout that has its own.
 
     Example:
       recording = open_recording("KITTI", "08")
@@ -62,7 +66,8 @@ def open_recording(
     if given is not None and not reader.takes_poses:
         raise ValueError(f"{given}: expected poses named for a plain folder of scans, found {root}: {reader.layout}")
     pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
-    return reader.open(root, name, ReadOptions(pose_source, format, pose_file, pose_format, times_file))
+    recording = reader.open(root, name, ReadOptions(pose_source, format, pose_file, pose_format, times_file))
+    return mounted(recording, sensor_height, known=reader.knows_mounting)
 
 
 def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
@@ -71,6 +76,13 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
         names = reader.recording_names(root)
         if names:
             return reader, names
-    found = "nothing of the kind" if root.is_dir() else "no such folder"
     *layouts, last = (reader.layout for reader in readers())
+    if root.is_file():
+        scan = (
+            "; put scans into a folder, or read one by read_scan"
+            if root.name.endswith((*ENDINGS, *ARRAY_ENDINGS))
+            else ""
+        )
+        raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{scan}")
+    found = "nothing of the kind" if root.is_dir() else "no such folder"
     raise FileNotFoundError(f"{root}: expected {', '.join(layouts)} or {last}, found {found}")

@@ -13,6 +13,7 @@ from jaxtyping import Float32, UInt8
 
 from sglpr_jax.data.formats.grey_png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
+from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import image_record
 from sglpr_jax.data.recording import Recording
@@ -31,12 +32,12 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str) -> Recording:
     """Open `root/<name>`. Raises FileNotFoundError without images or poses, ValueError on malformed poses."""
     folder = root / name
-    image_paths = tuple(sorted((folder / "imgs").glob("*.png")))
+    image_paths = files_in(folder / "imgs", ".png")
     if not image_paths:
         raise FileNotFoundError(f"{folder / 'imgs'}: expected images (*.png), found none")
     ids = tuple(path.stem for path in image_paths)
     world_from_lidar = read_poses(folder / "pose.txt")
-    labels = {path.stem: path for path in (folder / "labels").glob("*.png")}
+    labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
     rows = rows_of(ids, rows=len(world_from_lidar), path=folder / "pose.txt")
     return Recording(
         name=name,

@@ -9,12 +9,15 @@
 Both pose files move the left camera, so `calib.txt` is not needed for positions.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import PoseChoice, Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
@@ -26,15 +29,17 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(sorted(folder.parent.name for folder in root.glob("sequences/*/velodyne")))
 
 
-def open_recording(root: Path, name: str, *, pose_source: PoseChoice = "auto") -> Recording:
+def open_recording(
+    root: Path, name: str, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
+) -> Recording:
     """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses."""
     folder = root / "sequences" / name
-    scan_paths = tuple(sorted((folder / "velodyne").glob("*.bin")))
+    scan_paths = files_in(folder / "velodyne", ".bin")
     if not scan_paths:
         raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
     ids = tuple(path.stem for path in scan_paths)
     positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
-    labels = {path.stem: path for path in (folder / "labels").glob("*.label")}
+    labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
     return Recording(
         name=name,
         ids=ids,
@@ -43,7 +48,7 @@ def open_recording(root: Path, name: str, *, pose_source: PoseChoice = "auto") -
         pose_source=pose_file,
         paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
-        read=scan_record,
+        read=partial(scan_record, format=format),
     )
 
 
@@ -68,6 +73,6 @@ def read_trajectory(
 READER = Reader(
     layout="sequences/NN/velodyne/*.bin (KITTI)",
     recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name, pose_source=options.pose_source),
+    open=lambda root, name, options: open_recording(root, name, pose_source=options.pose_source, format=options.format),
     rank=0,
 )

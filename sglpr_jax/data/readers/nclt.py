@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from sglpr_jax.data.formats.scan_files import Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
@@ -89,14 +90,14 @@ def nearest_rows(stamps: Int64[np.ndarray, " n"], utimes: Int64[np.ndarray, " q"
 
 
 def _scan_paths(folder: Path) -> tuple[Path, ...]:
-    paths = sorted(folder.glob("*.bin"), key=lambda path: (len(path.stem), path.stem))
+    paths = files_in(folder, ".bin")
     if not paths:
         found = "none" if folder.is_dir() else "no such folder"
         raise FileNotFoundError(f"{folder}: expected scans (*.bin), found {found}")
     strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
     if strange:
         raise ValueError(f"{folder}: expected scans named by their time, 1326652795280148.bin, found {strange}")
-    return tuple(paths)
+    return paths
 
 
 def _truth_path(root: Path, name: str) -> Path:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.bev import Grid, ImageKind
+from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.tuples import TuplePool
@@ -78,7 +79,7 @@ def read_batch(
     def read(recording: Recording, frame: int) -> Place:
         record = _read(recording, frame, images=images, labels=has_labels)
         classes = record.classes(categories) if has_labels else None
-        return picture(record, classes) if pictures else (record.points, classes)
+        return picture(record, classes) if pictures else (record.upright_points, classes)
 
     found = [read(*place) for place in places]
     labelled = np.array([classes is not None for _, classes in found])
@@ -121,7 +122,10 @@ def _read(recording: Recording, frame: int, *, images: bool, labels: bool) -> Re
     if recording.has_images != images:
         expected, found = ("images", "scans") if images else ("scans", "images")
         raise ValueError(f"expected all recordings of a batch to be {expected}, found {found} in {recording.name}")
-    return recording.record(frame, labels=labels)
+    record = recording.record(frame, labels=labels)
+    if record.points is not None:
+        check_cloud(record.points, name=record.name)
+    return record
 
 
 def _stacked(pictures: list[Place]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,103 @@
+"""Points from .npy, .npz and .las files, and folders in which such files are something else."""
+
+import laspy
+import numpy as np
+import pytest
+
+from sglpr_jax.data.formats.arrays import read_npy, read_npz
+from sglpr_jax.data.formats.las import read_las
+from sglpr_jax.data.readers.scan_folder import open_recording
+
+CLOUD = np.arange(12, dtype=np.float32).reshape(4, 3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16])
+@pytest.mark.parametrize("more", [0, 1, 5])
+def test_rows_of_numbers(tmp_path, dtype, more):
+    np.save(tmp_path / "a.npy", np.column_stack([CLOUD, np.ones((4, more))]).astype(dtype))
+    points = read_npy(tmp_path / "a.npy")
+    np.testing.assert_array_equal(points, CLOUD)
+    assert points.dtype == np.float32 and points.flags.c_contiguous
+
+
+def test_records_with_names(tmp_path):
+    records = np.zeros((2, 2), [("ring", "u1"), ("z", "f4"), ("x", "f8"), ("y", "f4")])
+    for axis, column in zip("xyz", CLOUD.T, strict=True):
+        records[axis] = column.reshape(2, 2)
+    np.save(tmp_path / "a.npy", records)
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), CLOUD)
+
+
+@pytest.mark.parametrize("names", [("cloud",), ("whatever",), ("labels", "points"), ("pose", "xyz")])
+def test_archives(tmp_path, names):
+    np.savez(tmp_path / "a.npz", **{name: CLOUD if name == names[-1] else np.zeros(4) for name in names})
+    np.testing.assert_array_equal(read_npz(tmp_path / "a.npz"), CLOUD)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [np.zeros(9), np.zeros((0, 3)), np.zeros((4, 2)), np.zeros((2, 2, 3)), np.zeros((3, 4000)), np.array(["x"])],
+)
+def test_other_arrays_are_refused(tmp_path, array):
+    np.save(tmp_path / "a.npy", array)
+    np.savez(tmp_path / "a.npz", array)
+    for read, name in ((read_npy, "a.npy"), (read_npz, "a.npz")):
+        with pytest.raises(ValueError, match=rf"{name}: expected points as rows \(n, 3\) or more of numbers, found"):
+            read(tmp_path / name)
+
+
+def test_several_arrays_broken_files_and_objects_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", ids=np.zeros(3), descriptors=np.zeros((3, 256)))
+    with pytest.raises(
+        ValueError, match=r"a\.npz: expected one array, or one called points, .* found ids, descriptors"
+    ):
+        read_npz(tmp_path / "a.npz")
+    np.save(tmp_path / "o.npy", np.array([{}]), allow_pickle=True)
+    (tmp_path / "b.npy").write_bytes(b"\x93NUMPY\x01\x00cut")
+    np.savez(tmp_path / "c.npz", points=CLOUD)
+    (tmp_path / "c.npz").write_bytes((tmp_path / "c.npz").read_bytes()[:60])
+    for name, read in (("o.npy", read_npy), ("b.npy", read_npy), ("c.npz", read_npz)):
+        with pytest.raises(ValueError, match=rf"{name}: expected an array"):
+            read(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match=r"d\.npy: no such file"):
+        read_npy(tmp_path / "d.npy")
+
+
+def write_las(path, points):
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = [0.001] * 3, [100.0, 0, 0]
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    las.write(path)
+    return path
+
+
+def test_las_is_scaled_and_moved_as_its_header_says(tmp_path):
+    path = write_las(tmp_path / "a.las", CLOUD.astype(np.float64))
+    np.testing.assert_allclose(read_las(path), CLOUD, atol=1e-3)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match=r"a\.las: expected a \.las file, found none that can be read"):
+        read_las(path)
+    with pytest.raises(ValueError, match=r"e\.las: expected at least one point"):
+        read_las(write_las(tmp_path / "e.las", np.zeros((0, 3))))
+    with pytest.raises(FileNotFoundError, match=r"d\.las: no such file"):
+        read_las(tmp_path / "d.las")
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz", "las"])
+def test_a_folder_of_them_is_a_recording(tmp_path, ending):
+    for i in range(2):
+        if ending == "las":
+            write_las(tmp_path / f"{i}.las", CLOUD.astype(np.float64))
+        else:
+            {"npy": np.save, "npz": np.savez}[ending](tmp_path / f"{i}.{ending}", CLOUD)
+    recording = open_recording(tmp_path)
+    assert recording.ids == ("0", "1") and recording.found == (f"format: {ending}",)
+    np.testing.assert_allclose(recording.points(1), CLOUD, atol=1e-3)
+
+
+def test_beside_other_scans_arrays_are_none(tmp_path):
+    CLOUD.tofile(tmp_path / "0.bin")
+    np.savez(tmp_path / "mine.npz", about=np.zeros(3))
+    recording = open_recording(tmp_path)
+    assert recording.ids == ("0",) and recording.found[-1] == "left aside: 1 .npz"

@@ -1,0 +1,125 @@
+"""Clouds that show no place are refused on every road to an image, in one line that says what was found."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from recordings import of_images, of_scans
+
+import sglpr_jax
+from sglpr_jax.bev import Grid
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.batch import read_batch
+from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.views import view
+from sglpr_jax.methods.registry import handcrafted
+from sglpr_jax.models.presets import model_preset
+
+GOOD = np.random.default_rng(0).uniform(-15, 15, (400, 3)).astype(np.float32)
+BAD = {
+    "NaN": (np.full_like(GOOD, np.nan), "expected finite points, found none among 400"),
+    "infinite": (np.full_like(GOOD, np.inf), "expected finite points, found none among 400"),
+    "zeros": (np.zeros_like(GOOD), r"found all 400 of them at \(0, 0, 0\)"),
+    "millimetres": (GOOD * 5000, "expected metres, .*found half of the points beyond .*millimetres"),
+    "1e30": (np.full_like(GOOD, 1e30), "the farthest at 1e[+]30"),
+    "random bytes": (
+        np.frombuffer(np.random.default_rng(0).bytes(4800), "<f4").reshape(-1, 3),
+        "expected (metres|finite points)",
+    ),
+    "none": (GOOD[:0], "expected finite points, found none among 0"),
+}
+OUTSIDE = {"far": GOOD + np.float32([200, 0, 0]), "one point": GOOD[:1]}
+CONFIG = model_preset("tiny")
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_no_place_is_refused(kind):
+    points, found = BAD[kind]
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=f"^scan 7: .*{found}"):
+        check_cloud(points, name="scan 7")
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=found):
+        view(Record(points=points), Grid())
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=found):
+        sglpr_jax.scan_image(points, CONFIG)
+
+
+def test_a_scan_with_some_strange_points_is_one():
+    points = GOOD.copy()
+    points[:50], points[50:90], points[90:120] = np.nan, 0, 1e30
+    check_cloud(points)
+    assert sglpr_jax.scan_image(points, CONFIG).sum() > 0
+
+
+@pytest.mark.parametrize("kind", OUTSIDE)
+def test_nothing_in_the_window_is_refused(kind):
+    with pytest.raises(ValueError, match=r"the scan: expected points in at least 2 cells of the window"):
+        sglpr_jax.scan_image(OUTSIDE[kind], CONFIG)
+
+
+def recording(*clouds):
+    return of_scans({Path(f"{i}.bin"): cloud for i, cloud in enumerate(clouds)}, positions=np.zeros((len(clouds), 3)))
+
+
+@pytest.mark.parametrize("method", ["thumbnail", "scan-context"])
+@pytest.mark.parametrize("kind", ["NaN", "zeros", "millimetres"])
+def test_embedding_refuses_or_skips_them(kind, method):
+    scans = recording(GOOD, BAD[kind][0], GOOD + 1)
+    method = handcrafted(method, scans, CONFIG.grid)
+    with pytest.raises(ValueError, match=f"scan 1 of sequence 08: .*{BAD[kind][1]}"):
+        sglpr_jax.embed(method, scans)
+    skipped = []
+    file = sglpr_jax.embed(method, scans, on_bad_scan=lambda scan, error: skipped.append(scan))
+    assert file.ids == ("0", "2") and skipped == ["1"]
+
+
+def test_embedding_refuses_an_empty_window_and_an_empty_image(random_params):
+    scans = recording(GOOD, OUTSIDE["far"])
+    params = random_params(CONFIG)
+    with pytest.raises(ValueError, match="scan 1 of sequence 08: expected points in at least 2 cells"):
+        sglpr_jax.embed(params, scans)
+    blank = np.zeros((CONFIG.grid.height, CONFIG.grid.width), np.float32)
+    with pytest.raises(ValueError, match=r"scan 0 of sequence 08: expected points in at least 2 cells .* in 0"):
+        sglpr_jax.embed(params, of_images({Path("0.png"): blank}))
+
+
+def test_training_refuses_them():
+    pool = TuplePool([np.zeros((2, 3))], TupleConfig(negatives=0))
+    with pytest.raises(ValueError, match="scan 1 of sequence 08: expected finite points"):
+        read_batch([recording(GOOD, BAD["NaN"][0])], pool, np.array([[0, 1]]), max_points=8, share_negatives=False)
+
+
+def test_the_flag_beside_the_descriptor(random_params):
+    config = dataclasses.replace(CONFIG, blind_m=2.0)
+    params, (height, width) = random_params(config), (config.grid.height, config.grid.width)
+    empty, good, near, broken = np.zeros((4, height, width), np.float32)
+    good[3, 4:6] = 1
+    near[height // 2, width // 2 - 1 : width // 2 + 1] = 9  # under the vehicle, where the model does not look
+    broken[3, 4:6], broken[0, 0] = 1, np.nan
+    images = jnp.stack([empty, good, near, broken])
+    expected = [False, True, False, False]
+    np.testing.assert_array_equal(sglpr_jax.is_describable(params, images), expected)
+    one_by_one = jax.jit(jax.vmap(sglpr_jax.is_describable, in_axes=(None, 0)))(params, images.astype(jnp.int32))
+    np.testing.assert_array_equal(one_by_one, [False, True, False, True])  # integers know no NaN
+
+
+def test_integers_are_no_density_image_but_its_bytes_are(random_params):
+    config = dataclasses.replace(CONFIG, grid=Grid(0.4, CONFIG.grid.height, CONFIG.grid.width), image="density")
+    params = random_params(config)
+    grey = np.random.default_rng(0).integers(0, 256, (config.grid.height, config.grid.width)).astype(np.uint8)
+    counts = grey * np.float32(10 / 255)
+    np.testing.assert_array_equal(sglpr_jax.describe(params, grey), sglpr_jax.describe(params, counts))
+    for other in (np.int32, np.int16, np.uint16):
+        with pytest.raises(ValueError, match=f"expected counts 0 to 10 as floats, .* found {other.__name__}"):
+            sglpr_jax.describe(params, counts.astype(other))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8, np.uint16])
+def test_counts_of_points_may_be_any_number(random_params, dtype):
+    params = random_params(CONFIG)
+    counts = np.random.default_rng(0).integers(0, 99, (CONFIG.grid.height, CONFIG.grid.width)).astype(dtype)
+    expected = sglpr_jax.describe(params, counts.astype(np.float32))
+    np.testing.assert_array_equal(sglpr_jax.describe(params, counts), expected)

@@ -1,0 +1,176 @@
+"""The sensor's height and tilt: found from the ground, said by the user, and undone before a model looks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from recordings import of_images
+
+import sglpr_jax
+from sglpr_jax.bev import Grid
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.density_image import density_bev
+from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.batch import read_batch
+from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.views import view
+from sglpr_jax.methods.registry import handcrafted
+from sglpr_jax.models.presets import model_preset
+
+
+def street(seed: int, *, height: float = MODEL_HEIGHT_M, n: int = 6000) -> np.ndarray:
+    """A road, kerbs, two rows of houses, boxes for cars: seen by an upright sensor so high above the road."""
+    rng = np.random.default_rng(seed)
+    road = rng.uniform(-20, 20, (n, 2)) * rng.uniform(0.1, 1, (n, 1))
+    ground = np.column_stack([road, np.where(np.abs(road[:, 1]) > 5, 0.12, 0.0) + rng.normal(scale=0.02, size=n)])
+    walls = np.column_stack([rng.uniform(-25, 25, n // 2), rng.choice([-9.0, 8.0], n // 2), rng.uniform(0, 9, n // 2)])
+    cars = np.column_stack([rng.uniform(5, 9, n // 4), rng.uniform(-4, -2, n // 4), rng.uniform(0.2, 1.5, n // 4)])
+    points = np.concatenate([ground, walls, cars]) - [0, 0, height]
+    return points[rng.permutation(len(points))].astype(np.float32)
+
+
+def turned(points: np.ndarray, *, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
+    """The points in the frame of a sensor that is pitched and rolled (degrees)."""
+    p, r = np.radians([pitch, roll])
+    about_y = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
+    return (points @ (about_y @ about_x)).astype(np.float32)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.3, 0.5, 1.0, 1.73, 2.5, 4.0])
+@pytest.mark.parametrize("tilt", [{}, {"pitch": 12.0}, {"roll": -25.0}, {"pitch": 10.0, "roll": 10.0}], ids=str)
+def test_height_and_tilt_are_found(height, tilt):
+    found = estimate_mounting(turned(street(1, height=height), **tilt))
+    assert found is not None and abs(found.height_m - height) < 0.1
+    angle = np.degrees(np.arccos(np.prod(np.cos(np.radians([*tilt.values(), 0])))))
+    assert abs(found.tilt_deg - angle) < 1
+
+
+@pytest.mark.parametrize("height", [0.5, 1.0, 2.5])
+def test_a_sensor_that_hangs_upside_down(height):
+    points = street(2, height=height)
+    found = estimate_mounting(points * np.float32([1, -1, -1]))
+    assert found is not None and abs(found.height_m - height) < 0.1 and found.tilt_deg > 178
+    assert "upside down" in str(found)
+    np.testing.assert_allclose(
+        Mounting(height, (0.0, 0.0, -1.0)).level(points * np.float32([1, -1, -1])),
+        points + np.array([0, 0, height - MODEL_HEIGHT_M]),
+        atol=1e-5,
+    )
+
+
+def test_a_room_has_a_floor_and_a_ceiling():
+    rng = np.random.default_rng(0)
+    inside = rng.uniform([-6, -4, -0.8], [6, 4, 1.7], (9000, 3))
+    face = rng.integers(6, size=9000)
+    for axis, (low, high) in enumerate(((-6, 6), (-4, 4), (-0.8, 1.7))):
+        inside[face == 2 * axis, axis], inside[face == 2 * axis + 1, axis] = low, high
+    found = estimate_mounting(inside.astype(np.float32))
+    assert found is not None and found.up[2] > 0.99 and abs(found.height_m - 0.8) < 0.05
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((0, 3), np.float32),
+        np.zeros((500, 3), np.float32),
+        np.full((500, 3), np.nan, np.float32),
+        np.full((500, 3), 1e30, np.float32),
+        np.random.default_rng(0).normal(scale=12, size=(4000, 3)).astype(np.float32),
+        street(0)[:10],
+    ],
+    ids=["none", "zeros", "NaN", "1e30", "a ball", "ten"],
+)
+def test_no_ground(points):
+    assert estimate_mounting(points) is None
+
+
+def test_a_recording_takes_the_median_and_no_slope():
+    each = [Mounting(1.0), Mounting(1.1, (0.02, 0.0, 0.9998)), Mounting(3.0), None, None]
+    assert common_mounting(each) == Mounting(1.1)
+    assert common_mounting([*each, None, None]) is None
+    assert common_mounting([]) is None
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda up: np.linalg.norm(up) > 0.1), st.floats(0, 4))
+def test_levelling_is_rigid_and_turns_up_to_z(up, height):
+    unit = np.array(up) / np.linalg.norm(up)
+    mounting = Mounting(height, tuple(unit.tolist()))
+    rotation = mounting.upright_from_lidar
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_allclose(rotation @ unit, [0, 0, 1], atol=1e-6)
+    ground = (-height * unit).astype(np.float32)[None]
+    np.testing.assert_allclose(mounting.level(ground), [[0, 0, -MODEL_HEIGHT_M]], atol=1e-5)
+
+
+def test_a_strange_height_is_refused():
+    for height in (np.nan, np.inf, 1730.0, -5.0):
+        with pytest.raises(ValueError, match="expected the sensor's height over the ground in metres, found"):
+            Mounting(height)
+
+
+@pytest.fixture
+def low_robot(tmp_path):
+    """A plain folder of a sensor half a metre above the road, as float32x4, and the same scans from 1.73 m."""
+    for i in range(4):
+        np.column_stack([street(i, height=0.5), np.zeros(10500)]).astype("<f4").tofile(tmp_path / f"{i}.bin")
+    return tmp_path, [street(i) for i in range(4)]
+
+
+def test_a_plain_folder_is_levelled_before_a_model_sees_it(low_robot):
+    folder, expected = low_robot
+    recording = open_recording(folder)
+    assert recording.mounting is not None and abs(recording.mounting.height_m - 0.5) < 0.1
+    assert "estimated from the ground in 4 of 4 scans" in recording.description[-2]
+    np.testing.assert_array_equal(recording.points(0), street(0, height=0.5))  # what lies in the file
+    said = open_recording(folder, sensor_height=0.5)
+    assert said.mounting == Mounting(0.5) and said.found[-1] == "sensor: 0.50 m above the ground, as said"
+    grid = Grid(0.4, 128, 128)
+    wanted = view(Record(points=expected[0]), grid, image="density").image
+    seen = view(said.record(0), grid, image="density").image
+    unlevelled = view(Record(points=street(0, height=0.5)), grid, image="density").image
+    assert np.abs(seen - wanted).mean() < 0.05 * np.abs(unlevelled - wanted).mean()
+
+
+def test_every_road_levels(low_robot):
+    folder, _ = low_robot
+    recording = open_recording(folder, sensor_height=0.5)
+    config = dataclasses.replace(model_preset("tiny"), grid=Grid(0.4, 32, 32), image="density")
+    lifted = street(0, height=0.5) + np.float32([0, 0, 0.5 - MODEL_HEIGHT_M])
+    image = sglpr_jax.scan_image(street(0, height=0.5), config, mounting=Mounting(0.5))
+    np.testing.assert_array_equal(image, sglpr_jax.scan_image(lifted, config))
+    pool = TuplePool([np.zeros((4, 3))], TupleConfig(negatives=0))
+    frames, options = np.array([[0, 1]]), {"max_points": 20000, "share_negatives": False, "categories": 0}
+    batch = read_batch([recording], pool, frames, image="density", **options)
+    np.testing.assert_array_equal(batch.images[0], density_bev(lifted))
+    batch = read_batch([recording], pool, frames, **options)
+    np.testing.assert_array_equal(batch.points[0, : len(lifted)], lifted)
+    mean = handcrafted("m2dp", recording, config.grid)
+    mean = dataclasses.replace(mean, describe=lambda points, classes: points.mean(axis=0))
+    file = sglpr_jax.embed(mean, recording)
+    np.testing.assert_allclose(file.descriptors[0], lifted.mean(axis=0), atol=1e-5)
+    assert file.config["sensor"] == "0.50 m above the ground"
+
+
+def test_layouts_that_know_their_sensor_are_left_alone_unless_asked(kitti_root, bev_root):
+    assert open_recording(kitti_root, "08").mounting is None
+    assert open_recording(kitti_root, "08", sensor_height=1.2).mounting == Mounting(1.2)
+    asked = open_recording(kitti_root, "08", sensor_height="estimate")
+    assert asked.mounting is None and "no ground found but in 0 of 3 scans" in asked.found[-1]
+    assert open_recording(bev_root, "06", sensor_height=1.2).mounting is None
+    assert mounted(of_images({}), "estimate", known=False).mounting is None
+
+
+def test_real_scans(shared):
+    """KITTI's sensor is 1.73 m above the road, nuScenes' 1.84 m above the one of its first scene."""
+    data = shared / "data"
+    kitti = [open_recording(data / "kitti_odometry", seq, sensor_height="estimate").mounting for seq in ("00", "08")]
+    assert [round(found.height_m, 1) for found in kitti if found] == [1.8, 1.8]
+    nuscenes = sglpr_jax.read_scan(data / "samples/nuscenes_32_beams.pcd.bin")
+    assert abs(estimate_mounting(nuscenes).height_m - 1.84) < 0.15

@@ -1,0 +1,102 @@
+"""Vertices of .ply files: text and both byte orders, any properties around x, y and z, elements in front."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.formats.ply import read_ply
+from sglpr_jax.data.readers.scan_folder import open_recording
+
+CLOUD = np.array([[1, 2, 3], [np.nan, np.nan, np.nan], [-4, 5.5, 6]], np.float32)
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+HEADER = """ply
+format {format} 1.0
+comment made by a test
+{before}element vertex {count}
+property uchar ring
+property float x
+property float y
+property double z
+property float32 intensity
+{after}end_header
+"""
+
+
+def write(path, *, format="ascii", before="", after="", front=b"", count=3):
+    header = HEADER.format(format=format, before=before, after=after, count=count).encode()
+    if format == "ascii":
+        body = "\n".join(f"7 {x} {y} {z} 0.5" for x, y, z in CLOUD).encode() + b"\n"
+    else:
+        order = ORDERS[format]
+        kinds = [("ring", "u1"), *((axis, f"{order}f4") for axis in "xy"), ("z", f"{order}f8"), ("i", f"{order}f4")]
+        records = np.zeros(3, kinds)
+        for axis, column in zip("xyz", CLOUD.T, strict=True):
+            records[axis] = column
+        body = records.tobytes()
+    path.write_bytes(header + front + body)
+    return path
+
+
+@pytest.mark.parametrize("format", ["ascii", *ORDERS])
+def test_every_encoding(tmp_path, format):
+    points = read_ply(write(tmp_path / "a.ply", format=format))
+    np.testing.assert_array_equal(points, CLOUD)
+    assert points.dtype == np.float32
+
+
+@pytest.mark.parametrize("format", ["ascii", *ORDERS])
+def test_elements_in_front_and_behind(tmp_path, format):
+    before = "element camera 2\nproperty int id\nproperty short kind\n"
+    after = "element face 1\nproperty list uchar int vertex_indices\n"
+    front = b"1 2\n3 4\n" if format == "ascii" else bytes(12)
+    path = write(tmp_path / "a.ply", format=format, before=before, after=after, front=front)
+    np.testing.assert_array_equal(read_ply(path), CLOUD)
+
+
+def test_carriage_returns(tmp_path):
+    path = write(tmp_path / "a.ply")
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    np.testing.assert_array_equal(read_ply(path), CLOUD)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace(b"ply", b"obj", 1), "expected a header"),
+        (lambda text: text.partition(b"end_header")[0], "expected a header"),
+        (lambda text: b"", "expected a header"),
+        (lambda text: text.replace(b"ascii", b"utf9"), "expected format ascii"),
+        (lambda text: text.replace(b"vertex 3", b"point 3"), "expected an element vertex, found point"),
+        (lambda text: text.replace(b"vertex 3", b"vertex 0"), "expected at least one vertex"),
+        (lambda text: text.replace(b"vertex 3", b"vertex 4"), "expected 4 lines of 5 numbers, found 3"),
+        (lambda text: text.replace(b"vertex 3", b"vertex three"), "invalid literal"),
+        (lambda text: text.replace(b"float y", b"float v"), "expected vertices with x, y and z, found ring x v"),
+        (lambda text: text[:-12], "expected 3 lines of 5 numbers"),
+        (lambda text: text.replace(b"5.5", b"east"), "could not convert"),
+    ],
+)
+def test_what_is_no_ply_is_named(tmp_path, change, message):
+    path = write(tmp_path / "a.ply")
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(ValueError, match=rf"a\.ply: not a readable \.ply file: .*{message}"):
+        read_ply(path)
+
+
+def test_a_cut_off_binary_and_a_list_among_the_coordinates(tmp_path):
+    path = write(tmp_path / "a.ply", format="binary_little_endian")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"expected 3 points of 21 bytes, found 62 bytes"):
+        read_ply(path)
+    path = write(tmp_path / "b.ply", format="binary_little_endian")
+    path.write_bytes(path.read_bytes().replace(b"property float32 i", b"property list uchar int i"))
+    with pytest.raises(ValueError, match=r"expected numbers for intensity of vertex, found a list"):
+        read_ply(path)
+    with pytest.raises(FileNotFoundError, match=r"c\.ply: no such file"):
+        read_ply(tmp_path / "c.ply")
+
+
+def test_a_folder_of_them_is_a_recording(tmp_path):
+    for i in (10, 9):
+        write(tmp_path / f"full{i}.ply")
+    recording = open_recording(tmp_path)
+    assert recording.ids == ("full9", "full10") and recording.found == ("format: ply",)
+    np.testing.assert_array_equal(recording.points(0), CLOUD)

@@ -1,0 +1,148 @@
+"""What each point of a headerless scan is, found from the files: all layouts, and files that do not tell."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.formats import record_size
+from sglpr_jax.data.formats.record_size import find_record
+from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.readers.scan_folder import open_recording
+
+BEAMS = np.radians(np.linspace(-15, 15, 16))
+FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)
+"""Low and high beams in turn, as a VLP-16 fires."""
+
+
+def scan(seed: int, *, steps: int = 180) -> np.ndarray:
+    """A turn of 16 beams in a street: the ground 1.8 m below, houses on both sides; beam by beam in firing order."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.repeat(np.linspace(0, 2 * np.pi, steps, endpoint=False), 16)
+    elevation = np.tile(BEAMS[FIRING], steps)
+    wall = (7 + 3 * rng.random()) / np.maximum(np.abs(np.sin(azimuth)), 0.1)
+    ground = 1.8 / np.maximum(-np.tan(elevation), 1e-3)
+    reach = np.minimum(wall, ground) + rng.normal(scale=0.02, size=len(azimuth))
+    return np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), reach * np.tan(elevation)], axis=1)
+
+
+def columns(points: np.ndarray, more: str) -> np.ndarray:
+    """The points with further columns: i intensity, r ring, t time, 0 padding, n a part of a normal."""
+    rng, n = np.random.default_rng(9), len(points)
+    made = {
+        "i": np.floor(rng.random(n) * 256),
+        "r": np.tile(np.arange(16.0), n // 16 + 1)[:n],
+        "t": np.linspace(0, 0.1, n),
+        "0": np.zeros(n),
+        "n": rng.normal(size=n) / 3,
+    }
+    return np.column_stack([points, *(made[name] for name in more)])
+
+
+LAYOUTS = {
+    "float32x3": "",
+    "kitti": "i",
+    "float32x5": "ir",
+    "float32x6": "irt",
+    "float32x7": "innn",
+    "float32x8": "0i0000"[:5],
+    "float64x3": "",
+    "float64x4": "i",
+    "float64x5": "it",
+    "float64x6": "irt",
+}
+
+
+@pytest.mark.parametrize("order", ["fired", "shuffled", "with gaps"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_is_found(tmp_path, layout, order):
+    written = []
+    for i in range(3):
+        points = scan(i)[:2880]  # a multiple of 16 points: every size can be divided by 16
+        if order == "shuffled":
+            points = points[np.random.default_rng(i).permutation(len(points))]
+        if order == "with gaps":
+            points[np.random.default_rng(i).random(len(points)) < 0.3] = np.nan
+        records = columns(points, LAYOUTS[layout]).astype("<f8" if layout.startswith("float64") else "<f4")
+        records.tofile(tmp_path / f"{i}.bin")
+        assert records.nbytes % 16 == 0
+        written.append(points.astype(np.float32))
+    recording = open_recording(tmp_path)
+    assert recording.found[0].startswith(f"format: {layout} (") and "found from 3 of 3 scans" in recording.found[0]
+    np.testing.assert_array_equal(recording.points(1), written[1])
+
+
+def test_a_broken_file_among_others_does_not_hide_it(tmp_path):
+    for i in range(5):
+        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
+    (tmp_path / "2.bin").write_bytes(b"cut")
+    (tmp_path / "4.bin").write_bytes(np.random.default_rng(0).bytes(48000))
+    assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
+
+
+@pytest.mark.parametrize(
+    ("points", "why"),
+    [
+        (scan(0) * 1000, "of the points beyond 300 m"),
+        (np.full((2880, 3), 1e30), "100% of the points beyond 300 m"),
+        (np.full((2880, 3), np.nan), "all points NaN or 0"),
+        (np.zeros((2880, 3)), "all points NaN or 0"),
+        (np.full((2880, 3), 4.0), "all points have one x"),
+    ],
+    ids=["millimetres", "1e30", "NaN", "zeros", "one point"],
+)
+def test_what_fits_nothing_is_refused_with_what_was_tried(tmp_path, points, why):
+    for i in range(3):
+        columns(points, "0").astype("<f4").tofile(tmp_path / f"{i}.bin")
+    with pytest.raises(ValueError, match=r"expected scans of which one reading fits, found 0; say --format") as error:
+        open_recording(tmp_path)
+    assert why in str(error.value) and "kitti (16 bytes a point)" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_random_bytes_are_refused(tmp_path):
+    for i in range(3):
+        (tmp_path / f"{i}.bin").write_bytes(np.random.default_rng(i).bytes(48000))
+    with pytest.raises(ValueError, match="found 0; say --format"):
+        open_recording(tmp_path)
+
+
+def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
+    noise = np.random.default_rng(0).normal(scale=10, size=(4000, 4)).astype("<f4")  # all columns alike
+    noise.tofile(tmp_path / "0.bin")
+    with pytest.raises(ValueError, match=r"found 2; say --format kitti or float32x5, .*float32x8.*: fits"):
+        open_recording(tmp_path)
+    np.testing.assert_array_equal(open_recording(tmp_path, format="float32x4").points(0), noise[:, :3])
+    assert open_recording(tmp_path, format="float32x5").points(0).shape == (3200, 3)
+
+
+def test_names_that_say_it_are_believed(tmp_path):
+    noise = np.random.default_rng(0).normal(scale=10, size=(4000, 5)).astype("<f4")
+    noise.tofile(tmp_path / "sweep.pcd.bin")
+    assert open_recording(tmp_path).found == ("format: nuscenes (20 bytes a point)",)
+
+
+def test_the_share_that_differs_from_turn_to_turn():
+    a, b = np.arange(100.0), np.arange(100.0) + 25
+    assert record_size._apart(a, b) == pytest.approx(0.25)
+    assert record_size._apart(a, a) == 0
+
+
+@pytest.mark.parametrize("format", ["float32x3", "float64x5"])
+def test_a_record_can_be_named_for_one_scan(tmp_path, format):
+    points = columns(scan(0), LAYOUTS[format])
+    points.astype("<f4" if format == "float32x3" else "<f8").tofile(tmp_path / "0.bin")
+    np.testing.assert_array_equal(read_scan(tmp_path / "0.bin", format=format), points[:, :3].astype(np.float32))
+
+
+def test_real_scans(shared, tmp_path):
+    """Real scans of four sensors in every layout."""
+    samples = shared / "data/samples"
+    clouds = [
+        np.nan_to_num(read_scan(samples / "16_beams.pcd")),
+        read_scan(samples / "nuscenes_32_beams.pcd.bin"),
+        read_scan(samples / "nclt/velodyne_sync/1326652795280148.bin"),
+        read_scan(next(iter(sorted((shared / "data/kitti_odometry/sequences/00/velodyne").glob("*.bin"))))),
+    ]
+    for cloud in clouds:
+        for layout, more in LAYOUTS.items():
+            records = columns(cloud[: len(cloud) // 16 * 16], more)
+            records.astype("<f8" if layout.startswith("float64") else "<f4").tofile(tmp_path / "0.bin")
+            assert find_record([tmp_path / "0.bin"])[0] == layout
