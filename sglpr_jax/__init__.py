@@ -6,7 +6,7 @@
 
 - describe a place: `load`, `scan_image`, `describe`; `segment`, `forward`; under jit, vmap and grad
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
-- find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
+- find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index`; score that: `evaluate`
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
@@ -32,6 +32,7 @@ from sglpr_jax.models.weights import for_places
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed, scan_image
+from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.nearest import Nearest, nearest
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ __all__ = [
     "Evaluation",
     "Grid",
     "HeadConfig",
+    "Index",
     "ModelConfig",
     "Nearest",
     "Outputs",
