@@ -21,6 +21,7 @@ def pose_of(found) -> np.ndarray:
     return np.array([found.x, found.y, found.yaw])
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=15)
 @given(yaw=YAWS, x=SHIFTS, y=SHIFTS, seed=st.integers(0, 5))
 def test_the_pose_of_the_images_is_found(yaw, x, y, seed):
@@ -76,6 +77,7 @@ def test_a_parabola_is_found_exactly():
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_errors_are_not_larger_than_the_covariance_says_nor_far_smaller():
     poses = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     query = jnp.stack([seen_from(place(s), tuple(pose), seed=s) for s, pose in enumerate(poses)])
@@ -105,6 +107,7 @@ def test_other_places_correlate_less_and_another_pose_fits_as_well():
         assert found.correlation < 0.5 < found.second
 
 
+@pytest.mark.slow
 def test_under_jit_and_vmap_and_of_several_matches_the_same():
     query, matches = seen_from(place(0), (0.5, 0.3, 1.0)), np.stack([seen_from(place(s), (0.0,) * 3) for s in (0, 1)])
     together = align_all(query, matches, config=SMALL)
@@ -123,6 +126,7 @@ def test_empty_images_fit_nothing_and_nothing_is_nan():
         assert all(np.isfinite(value).all() for value in found) and abs(found.correlation) < 1e-3
 
 
+@pytest.mark.slow
 def test_images_of_the_whole_window_and_wrong_sizes():
     whole = np.pad(seen_from(place(0), (0.0,) * 3), 44)
     assert whole.shape == (152, 152)
