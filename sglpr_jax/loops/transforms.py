@@ -25,7 +25,7 @@ def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"
 
 def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
     """Where b's x axis points in a's plane, radians."""
-    return np.arctan2(a_from_b[..., 1, 0], a_from_b[..., 0, 0])
+    return np.asarray(np.arctan2(a_from_b[..., 1, 0], a_from_b[..., 0, 0]))
 
 
 def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
