@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, UInt8
 
@@ -159,10 +160,10 @@ def labelled(
 
 def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
     """The middle square of an image on even cells, on the scale of 8 bits."""
-    even = np.asarray(even_cells(np.asarray(image, np.float32)))
+    even = even_cells(jnp.asarray(image, jnp.float32))
     size = min(even.shape)
-    grey = np.round(centre_crop(even, height=size, width=size) * (255 / MAX_COUNT))
-    return grey.clip(0, 255).astype(np.uint8)
+    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / MAX_COUNT)
+    return np.round(grey).clip(0, 255).astype(np.uint8)
 
 
 def square_image(record: Record) -> UInt8[np.ndarray, "n n"]:

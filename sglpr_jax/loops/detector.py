@@ -19,7 +19,7 @@ from sglpr_jax.models.params import Params
 class DetectorConfig:
     """When a pair of scans is called a loop."""
 
-    min_probability: float = 0.9
+    min_probability: float = 0.99
     """Of a loop that is returned."""
     min_neighbour_probability: float = 0.5
     """Of those beside it that speak for it."""
@@ -115,7 +115,7 @@ class LoopDetector:
             for other in self.loops
             if abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
         ]
-        return not about or agree([loop], odometry, about, config=self.config.consistency).mean() >= 0.5
+        return not about or bool(agree([loop], odometry, about, config=self.config.consistency).mean() >= 0.5)
 
 
 def _record(scan: Record | Float[np.ndarray, "..."]) -> Record:

@@ -74,11 +74,24 @@ def find_loops(
             odometry=None if odometry is None else odometry[i],
         )
         on_progress(i + 1)
-    kept, refused = _agreeing(detector.loops, odometry, config)
+    kept, refused = settled(recording, detector.loops, odometry, config, registered=registered)
+    return FoundLoops(recording, len(detector), tuple(kept), tuple(refused), odometry)
+
+
+def settled(
+    recording: Recording,
+    loops: list[Loop],
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    config: DetectorConfig,
+    *,
+    registered: bool,
+) -> tuple[list[Loop], list[Loop]]:
+    """The loops of a whole drive that agree and, where they are registered, overlap; and those that do not."""
+    kept, refused = _agreeing(loops, odometry, config)
     if registered:
         kept, others = _registered(recording, kept)
-        refused += others
-    return FoundLoops(recording, len(detector), tuple(kept), tuple(refused), odometry)
+        refused = refused + others
+    return kept, refused
 
 
 def _agreeing(
