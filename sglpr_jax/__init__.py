@@ -7,7 +7,7 @@
 - describe a place: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`; under jit, vmap and grad
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
   `estimate_mounting`
-- find places again: `embed`, `DescriptorFile`, `nearest`; score that: `evaluate`
+- find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index`; score that: `evaluate`
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
@@ -34,6 +34,7 @@ from sglpr_jax.models.weights import for_places
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed, scan_image
+from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.nearest import Nearest, nearest
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ __all__ = [
     "Evaluation",
     "Grid",
     "HeadConfig",
+    "Index",
     "ModelConfig",
     "Mounting",
     "Nearest",

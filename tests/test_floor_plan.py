@@ -14,6 +14,7 @@ FLOORS = (
     ("models", "sim"),
     ("methods",),
     ("retrieval", "training"),
+    ("loops",),
     ("evaluation",),
     ("reproduce",),
     ("cli",),

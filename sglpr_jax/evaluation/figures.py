@@ -217,3 +217,46 @@ def _add_class_legend(figure: "matplotlib.figure.Figure", labels: Taxonomy, clas
 
     patches = [Patch(facecolor=tuple(labels.colors[c] / 255), edgecolor="0.6", label=labels.names[c]) for c in classes]
     figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 8), frameon=False)
+
+
+def loops(positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]]) -> "matplotlib.figure.Figure":
+    """Draw a trajectory from above and a line between the two frames of each loop."""
+    across, along = np.ptp(positions[:, :2], axis=0)
+    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
+    for query, match in pairs:
+        axes.plot(*positions[[query, match], :2].T, color="#d62728", linewidth=1)
+    seen = positions[[query for query, _ in pairs], :2]
+    axes.scatter(*seen.T, s=9, color="#d62728", linewidths=0, label=f"loops ({len(pairs)})", zorder=3)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    axes.legend(loc="best", framealpha=0.95)
+    return figure
+
+
+def loops_in_time(found: Sequence[tuple[int, int, float]], frames: int) -> "matplotlib.figure.Figure":
+    """Draw which frame comes back to which: (query, match, probability) of each loop, the less sure ones lighter."""
+    figure = _figure(5.0, 4.2)
+    axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))
+    axes.plot([0, frames], [0, frames], color="0.8", linewidth=1)
+    if found:
+        query, match, probability = np.array(found).T
+        dots = axes.scatter(query, match, s=8, c=probability, cmap="viridis", vmin=0.9, vmax=1, linewidths=0)
+        figure.colorbar(dots, label="probability")
+    axes.grid(color="0.92")
+    return figure
+
+
+def overlays(pictures: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
+    """Draw coloured pictures with their titles, three in a row."""
+    rows = -(-len(pictures) // 3)
+    figure = _figure(9.0, 3.2 * rows)
+    panels = figure.subplots(rows, 3, squeeze=False).ravel()
+    for axes in panels:
+        axes.set_axis_off()
+    for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
+        axes.imshow(picture, interpolation="nearest")
+        axes.set_title(title, fontsize=9)
+    return figure

@@ -1,0 +1,84 @@
+"""bin/loops: find where a recording comes back to, and write it for a pose graph."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sglpr_jax.cli.runtime import progress_bar, run, stop_on_signal
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.evaluation.page.of_loops import write_loops_page
+from sglpr_jax.loops.detector import DetectorConfig
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.folder import write_found
+from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
+from sglpr_jax.models.weights_file import load
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopsCommand:
+    """Find the loops of a recording: pairs of scans of one place, how they lie to each other, and how sure that is.
+
+    Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti.
+    Ctrl-C keeps what was found.
+
+    Examples:
+      bin/loops my_scans --out found
+      bin/loops my_scans --poses odometry.tum --out found
+      bin/loops KITTI --seq 08 --poses KITTI/poses/08.txt --pose-format kitti --out found --register
+    """
+
+    recording: Annotated[Path, tyro.conf.Positional]
+    """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    out: Path
+    """The folder to write into."""
+    poses: Path | None = None
+    """Odometry: a pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
+    pose_format: OdometryFormat = "auto"
+    """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
+    weights: str = "simulated"
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    seq: str | None = None
+    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
+    pose_source: PoseChoice = "auto"
+    """Which positions of KITTI's layout are drawn where there is no odometry."""
+    format: ScanFormat = "auto"
+    """What the scans of a plain folder are, where their names do not tell."""
+    register: bool = False
+    """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
+    min_probability: float = DetectorConfig().min_probability
+    """Of a loop."""
+
+
+def loops_of_recording(command: LoopsCommand) -> int:
+    """Do what the command says; returns the exit status."""
+    odometry = None if command.poses is None else read_odometry(command.poses, format=command.pose_format)
+    recording = open_recording(command.recording, command.seq, pose_source=command.pose_source, format=command.format)
+    params = load(command.weights)
+    with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
+        found = find_loops(
+            recording,
+            params,
+            odometry=odometry,
+            config=DetectorConfig(min_probability=command.min_probability),
+            registered=command.register,
+            should_stop=stop,
+            on_progress=show,
+        )
+    paths = [*write_found(found, command.out), write_loops_page(found, command.out)]
+    print(found)
+    print(f"{command.out}: {', '.join(path.name for path in paths)}")
+    return stop.exit_status if stop() else 0
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: sys.exit(loops_of_recording(tyro.cli(LoopsCommand, prog="loops"))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""The page of the loops of a recording: where they are, what they look like, and how sure each is."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing
+from sglpr_jax.files import write_text
+from sglpr_jax.loops.candidates import square_image
+from sglpr_jax.loops.find import FoundLoops
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.overlay import overlaid
+
+PAGE = "index.html"
+SHOWN_PAIRS = 9
+SHOWN_ROWS = 40
+
+
+def write_loops_page(found: FoundLoops, folder: Path) -> Path:
+    """Write the page into `folder`, whole or not at all; without matplotlib (extra `viz`) it has no pictures."""
+    write_text(folder / PAGE, loops_page(found))
+    return folder / PAGE
+
+
+def loops_page(found: FoundLoops) -> str:
+    """The page as HTML that stands alone."""
+    about = "with odometry" if found.odometry is not None else "without odometry"
+    sections = [Section("Where", _where(found)), Section("Pairs", _pairs(found)), Section("Loops", _table(found))]
+    return document(f"Loops of {found.recording.name}", f"{found}; {about}.", sections)
+
+
+def _where(found: FoundLoops) -> str:
+    if not figures.can_draw():
+        return missing("The drawing needs matplotlib: pip install 'sglpr-jax[viz]'.")
+    if not found.frames:
+        return missing("No scan was looked at.")
+    positions = found.recording.positions if found.odometry is None else found.odometry[:, :3, 3]
+    parts = []
+    if positions is not None:
+        what = "as the odometry has it" if found.odometry is not None else f"by {found.recording.pose_source}"
+        caption = (
+            f"The trajectory {what}; a line joins the two frames of each loop. Lines across are drift, or mistakes."
+        )
+        drawn = figures.loops(positions[: found.frames], [(one.query, one.match) for one in found.loops])
+        parts.append(figure_html(drawn, "The loops on the trajectory", caption=caption))
+    order = figures.loops_in_time([(one.query, one.match, one.probability) for one in found.loops], found.frames)
+    parts.append(figure_html(order, "The loops in time", caption="Which frame comes back to which."))
+    return "\n".join(parts)
+
+
+def _pairs(found: FoundLoops) -> str:
+    if not found.loops:
+        return missing("No loops.")
+    if not figures.can_draw():
+        return missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
+    rows = np.unique(np.linspace(0, len(found.loops) - 1, SHOWN_PAIRS).astype(int))
+    pictures = {_title(found.loops[row]): _overlay(found, found.loops[row]) for row in rows}
+    caption = "The match in red, the query laid over it in cyan; white where both have points. Spread over the drive."
+    return figure_html(figures.overlays(pictures), "Pairs of images", caption=caption)
+
+
+def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
+    images = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
+    return overlaid(*images, loop.match_from_query)
+
+
+def _title(loop: Loop) -> str:
+    return f"{loop.query} on {loop.match}"
+
+
+def _table(found: FoundLoops) -> str:
+    """The least sure loops, which are those to look at."""
+    if not found.loops:
+        return missing("No loops.")
+    header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
+    least_sure = sorted(found.loops, key=lambda loop: loop.probability)[:SHOWN_ROWS]
+    ids = found.recording.ids
+    rows = [
+        (
+            ids[loop.query],
+            ids[loop.match],
+            f"{loop.match_from_query[0, 3]:.2f}",
+            f"{loop.match_from_query[1, 3]:.2f}",
+            f"{np.degrees(loop.yaw):.1f}",
+            f"{loop.probability:.4f}",
+            "" if loop.overlap is None else f"{loop.overlap:.2f}",
+        )
+        for loop in least_sure
+    ]
+    return html_table(header, rows, numbers=header[2:])

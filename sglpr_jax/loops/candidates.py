@@ -1,0 +1,171 @@
+"""From a scan to the earlier scans that may show its place: described, looked up, and laid over each other."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Num, UInt8
+
+from sglpr_jax.bev import centre_crop, even_cells
+from sglpr_jax.data.readers.bev_images import MAX_COUNT
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.views import image_view, picture, view
+from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.poses import NEGATIVE_M
+from sglpr_jax.retrieval.index import Index
+from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
+
+
+@dataclasses.dataclass(frozen=True)
+class CandidateConfig:
+    """Which earlier scans are looked at."""
+
+    candidates: int = 3
+    """How many of the nearest are laid over each scan."""
+    exclude_s: float = EXCLUDED_S
+    exclude_frames: int = EXCLUDED_FRAMES
+    """Scans younger than this are neighbours and no loop: seconds, or frames where there are no times."""
+    other_place_frames: int = 50
+    """Without odometry, scans so many frames apart are taken for other places."""
+    gate_m: float = 20.0
+    gate_share: float = 0.05
+    """With odometry, a candidate is no farther than `gate_m`, and this share of the way since, from where it says."""
+
+
+class Candidate(NamedTuple):
+    """Two scans that may show one place."""
+
+    query: int
+    match: int
+    """Frames, counted from 0; the match is the earlier one."""
+    alignment: Alignment
+    """How their images lie."""
+    evidence: Evidence
+
+
+class CandidateFinder:
+    """Takes scans as they come, and remembers descriptor and image of each."""
+
+    def __init__(
+        self,
+        params: Params,
+        *,
+        config: CandidateConfig = CandidateConfig(),
+        verification: VerificationConfig = VerificationConfig(),
+    ):
+        if params.config.categories_read:
+            raise ValueError("expected a model that describes images alone, found one that reads labels too")
+        self.params, self.config, self.verification = params, config, verification
+        self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
+        self.images: list[UInt8[np.ndarray, "n n"]] = []
+        self.odometry: list[Float[np.ndarray, "4 4"]] = []
+
+    def add(
+        self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
+    ) -> list[Candidate]:
+        """Describe a scan or image, and return its candidates, those of the nearest descriptor first.
+
+        `odometry` is its pose, LiDAR frame in any fixed frame. Raises ValueError where some frames have a time or a
+        pose and others have none, and where times run backwards.
+        """
+        descriptor, image = self._seen(record)
+        self._check(time, odometry)
+        query = len(self.index)
+        position = None if odometry is None else np.asarray(odometry, np.float64)[:3, 3]
+        excluded = self._excluded(time, position)
+        rows, distances = self.index.query(descriptor, self.config.candidates, exclude=excluded)
+        others = [self._other_place(descriptor, int(row), excluded) for row in rows if row >= 0]
+        self.index.add(descriptor, times=time, positions=position)
+        self.images.append(image)
+        if odometry is not None:
+            self.odometry.append(np.asarray(odometry, np.float64))
+        rows, distances = rows[rows >= 0], distances[rows >= 0]
+        if not len(rows):
+            return []
+        padded = np.resize(rows, self.config.candidates)  # always as many, so that it compiles once
+        matches = np.stack([self.images[row] for row in padded])
+        found = jax.device_get(align_all(image, matches, config=self.verification))
+        return [
+            Candidate(
+                query,
+                int(row),
+                alignment := Alignment(*(value[k] for value in found)),
+                Evidence(distance, other - distance, alignment.correlation, alignment.second),
+            )
+            for k, (row, distance, other) in enumerate(zip(rows, distances, others, strict=True))
+        ]
+
+    def _seen(self, record: Record) -> tuple[Float32[np.ndarray, " d"], UInt8[np.ndarray, "n n"]]:
+        """The descriptor, and the density image as 8 bits."""
+        model = self.params.config
+        whole, _ = picture(record, None)
+        if record.points is None or model.image == "density":
+            bev = image_view(whole, None, model.grid).image
+        else:
+            bev = view(record, model.grid, image=model.image).image
+        return np.asarray(describe(self.params, bev)), _kept(whole)
+
+    def _check(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
+        if not len(self.index):
+            return
+        for name, given, known in (
+            ("a time", time is not None, self.index.times is not None),
+            ("odometry", odometry is not None, bool(self.odometry)),
+        ):
+            if given != known:
+                raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self.index)})")
+        if time is not None and self.index.times is not None and time < self.index.times[-1]:
+            raise ValueError(f"expected times that do not go back, found {time} after {self.index.times[-1]}")
+
+    def _excluded(self, time: float | None, position: Float[np.ndarray, " 3"] | None) -> Bool[np.ndarray, " n"]:
+        """Which frames are no candidates of the next one: too young, or too far off by odometry."""
+        config, known = self.config, self.index.positions
+        excluded = self.index.recent(time, seconds=config.exclude_s, frames=config.exclude_frames)
+        if position is not None and known is not None and len(known):
+            steps = np.linalg.norm(np.diff(known, axis=0, append=position[None]), axis=1)
+            way = np.cumsum(steps[::-1])[::-1]  # from each frame to the next one's position
+            apart = np.linalg.norm(known - position, axis=1)
+            excluded = excluded | (apart > config.gate_m + config.gate_share * way)
+        return excluded
+
+    def _other_place(self, descriptor: Float32[np.ndarray, " d"], row: int, excluded: Bool[np.ndarray, " n"]) -> float:
+        """The distance of the nearest descriptor of a place that is not that of `row`; NaN where there is none."""
+        if self.index.positions is not None:
+            near = np.linalg.norm(self.index.positions - self.index.positions[row], axis=1) <= NEGATIVE_M
+        else:
+            near = np.abs(np.arange(len(self.index)) - row) <= self.config.other_place_frames
+        distance = float(self.index.query(descriptor, exclude=excluded | near).distances[0])
+        return distance if np.isfinite(distance) else np.nan
+
+
+def labelled(
+    candidates: Sequence[Candidate], positions: Float[np.ndarray, "n 3"], *, loop_m: float = 10.0
+) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
+    """The evidence of candidates whose true positions are known, and which of them are loops: up to `loop_m` apart.
+
+    Those between that and 20 m are left out.
+    """
+    apart = np.array([np.linalg.norm(positions[one.query] - positions[one.match]) for one in candidates])
+    clear = (apart <= loop_m) | (apart > NEGATIVE_M)
+    chosen = [one.evidence for one, kept in zip(candidates, clear, strict=True) if kept]
+    return Evidence.stack(chosen), apart[clear] <= loop_m
+
+
+def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
+    """The middle square of an image on even cells, on the scale of 8 bits."""
+    even = even_cells(jnp.asarray(image, jnp.float32))
+    size = min(even.shape)
+    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / MAX_COUNT)
+    return np.round(grey).clip(0, 255).astype(np.uint8)
+
+
+def square_image(record: Record) -> UInt8[np.ndarray, "n n"]:
+    """The image of a scan that loops are verified on: its density image, or the ready-made one, as 8 bits."""
+    return _kept(picture(record, None)[0])

@@ -1,0 +1,137 @@
+"""Loop closures of a stream: each scan as it comes, and the loops that it closes."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.record import Record
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder
+from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
+from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
+from sglpr_jax.loops.verification import VerificationConfig
+from sglpr_jax.models.params import Params
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectorConfig:
+    """When a pair of scans is called a loop."""
+
+    min_probability: float = 0.99
+    """Of a loop that is returned."""
+    min_neighbour_probability: float = 0.5
+    """Of those beside it that speak for it."""
+    near_m: float = 200.0
+    """With odometry, a loop has to agree with most of those that lie within so many metres of way."""
+    candidates: CandidateConfig = CandidateConfig()
+    verification: VerificationConfig = VerificationConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+
+
+class LoopDetector:
+    """Takes scans or images in order, with or without times and odometry.
+
+    A loop is probable by its descriptors and images (`LoopModel`); of `neighbours` frames in a row `support` show the
+    same place; and where there is odometry it agrees with the loops found about it. So the first loop of a revisit is
+    returned one frame late, together with the second.
+
+    Example:
+      detector = LoopDetector(sglpr_jax.load("simulated"))
+      for i in range(len(recording)):
+          for loop in detector.add(recording.points(i), time=recording.times[i]):
+              print(loop.query, loop.match, loop.match_from_query, loop.probability)
+    """
+
+    def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
+        """`model` says how probable pairs are (None: that which ships for these weights)."""
+        self.finder = CandidateFinder(params, config=config.candidates, verification=config.verification)
+        self.model = default_model(self.finder.index.weights_hash) if model is None else model
+        self.config = config
+        self.candidates: list[Candidate] = []
+        """All pairs that were looked at."""
+        self.loops: list[Loop] = []
+        """All that were returned."""
+        self._waiting: list[Loop] = []
+
+    def __len__(self) -> int:
+        """How many frames were added."""
+        return len(self.finder.index)
+
+    def add(
+        self,
+        scan: Record | Float[np.ndarray, "..."],
+        *,
+        time: float | None = None,
+        odometry: Float[np.ndarray, "4 4"] | None = None,
+    ) -> list[Loop]:
+        """Add the next frame; return the loops that it closes or confirms, of this and of the last few frames.
+
+        `scan` is a record, points (n, 3) in metres or an image (h, w) as `density_bev` makes them; `time` seconds;
+        `odometry` the pose of the sensor in a frame that stays, drifting as it may. Raises ValueError for values of
+        another shape, for times that go back, and where some frames have a time or odometry and others not.
+        """
+        candidates = self.finder.add(_record(scan), time=time, odometry=_pose(odometry))
+        self.candidates += candidates
+        if candidates:
+            probabilities = self.model.probability(Evidence.stack([one.evidence for one in candidates]))
+            best = int(np.argmax(probabilities))
+            if probabilities[best] >= self.config.min_neighbour_probability:
+                one = candidates[best]
+                loop = planar_loop(one.query, one.match, one.alignment, probability=float(probabilities[best]))
+                self._waiting.append(loop)
+        new = [loop for loop in self._confirmed() if self._agrees(loop)]
+        self.loops += new
+        return new
+
+    def _confirmed(self) -> list[Loop]:
+        """Probable loops of the last frames that enough of their neighbours speak for, each once."""
+        rules, first = self.config.consistency, len(self) - self.config.consistency.neighbours
+        self._waiting = [loop for loop in self._waiting if loop.query >= first]
+        pairs = self._agreeing(self._waiting)
+        done = {loop.query for loop in self.loops[-rules.neighbours :]}
+        supported = pairs.sum(axis=1) >= rules.support
+        return [
+            loop
+            for loop, enough in zip(self._waiting, supported, strict=True)
+            if enough and loop.query not in done and loop.probability >= self.config.min_probability
+        ]
+
+    def _agreeing(self, loops: list[Loop]) -> Any:
+        if not self.finder.odometry or not loops:
+            return agree_in_order(loops, config=self.config.consistency)
+        return agree(loops, np.stack(self.finder.odometry), config=self.config.consistency)
+
+    def _agrees(self, loop: Loop) -> bool:
+        """Whether it agrees with most of the loops about it; without odometry nobody can tell."""
+        if not self.finder.odometry or not self.loops:
+            return True
+        odometry = np.stack(self.finder.odometry)
+        steps = np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1)
+        way = np.concatenate([[0.0], np.cumsum(steps)])
+        about = [
+            other
+            for other in self.loops
+            if abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
+        ]
+        return not about or bool(agree([loop], odometry, about, config=self.config.consistency).mean() >= 0.5)
+
+
+def _record(scan: Record | Float[np.ndarray, "..."]) -> Record:
+    if isinstance(scan, Record):
+        return scan
+    values = np.asarray(scan, np.float32)
+    if values.ndim != 2:
+        raise ValueError(f"expected points (n, 3) or an image (h, w), found an array of shape {values.shape}")
+    return Record(points=values) if values.shape[1] == 3 else Record(image=values)
+
+
+def _pose(odometry: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "4 4"] | None:
+    if odometry is None:
+        return None
+    pose = np.asarray(odometry, np.float64)
+    turned = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
+    if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-3):
+        raise ValueError(f"expected odometry as a 4 x 4 pose with a rotation, found {pose.tolist()}")
+    return pose

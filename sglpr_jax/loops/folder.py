@@ -1,0 +1,32 @@
+"""What was found in a recording, as a folder of files for other programs."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sglpr_jax.loops.find import FoundLoops
+from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
+
+GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
+TRAJECTORY_TUM, TRAJECTORY_KITTI = "trajectory.tum", "trajectory.kitti"
+
+
+def write_found(found: FoundLoops, folder: Path | str) -> list[Path]:
+    """Write loops as g2o, JSON lines and csv and, where there is odometry, the trajectory as TUM and KITTI.
+
+    The trajectory is the odometry as it was given, of the frames that were looked at. Its times are the recording's,
+    or the numbers of the frames. Returns the paths written. Raises WriteError where one cannot be written.
+    """
+    folder = Path(folder)
+    odometry = None if found.odometry is None else found.odometry[: found.frames]
+    write_g2o(folder / GRAPH, found.loops, odometry)
+    write_loops_jsonl(folder / LINES, found.loops, found.recording.ids)
+    write_loops_csv(folder / TABLE, found.loops)
+    names = [GRAPH, LINES, TABLE]
+    if odometry is not None:
+        times = found.recording.times
+        clock = np.arange(found.frames, dtype=np.float64) if times is None else times[: found.frames]
+        write_tum(folder / TRAJECTORY_TUM, odometry, clock)
+        write_kitti(folder / TRAJECTORY_KITTI, odometry)
+        names += [TRAJECTORY_TUM, TRAJECTORY_KITTI]
+    return [folder / name for name in names]

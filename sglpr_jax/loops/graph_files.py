@@ -1,0 +1,191 @@
+"""Loops and trajectories in the files that pose-graph programs read: g2o, TUM, KITTI, JSON lines, csv.
+
+Every file is written whole or not at all. Poses are of the LiDAR (x forward, y left, z up) in a frame that stays.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.formats.pose_files import check_times, numbers_of, read_poses, read_rows
+from sglpr_jax.files import write_text
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
+
+VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
+UPPER = np.triu_indices(6)
+"""The 21 numbers of an information matrix, row by row: translation first, then rotation."""
+ODOMETRY_M, ODOMETRY_DEG = 0.05, 0.1
+"""Standard deviations of a step of the odometry in a graph, where none are given."""
+CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""KITTI's axes of poses: x right, y down, z forward."""
+COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
+
+
+class Graph(NamedTuple):
+    """What a g2o file holds."""
+
+    poses: dict[int, Float[np.ndarray, "4 4"]]
+    edges: list[tuple[int, int, Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]]
+    """From frame, to frame, from_from_to, and the information matrix, translation first."""
+
+
+def write_g2o(path: Path | str, loops: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"] | None = None) -> None:
+    """Write a pose graph: a vertex for each pose, an edge for each step of the odometry, an edge for each loop.
+
+    Without odometry the loops' edges stand alone, to be added to a graph of one's own.
+    """
+    lines = []
+    if odometry is not None:
+        lines += [f"{VERTEX} {i} {row}" for i, row in enumerate(_pose_rows(odometry))]
+        steps = inverse(odometry[:-1]) @ odometry[1:]
+        spread = np.repeat([ODOMETRY_M, np.radians(ODOMETRY_DEG)], 3) ** 2
+        information = _numbers(np.diag(1 / spread)[UPPER])
+        lines += [f"{EDGE} {i} {i + 1} {row} {information}" for i, row in enumerate(_pose_rows(steps))]
+    for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
+        lines.append(f"{EDGE} {loop.match} {loop.query} {row} {_numbers(loop.information[UPPER])}")
+    write_text(Path(path), "".join(f"{line}\n" for line in lines))
+
+
+def read_g2o(path: Path | str) -> Graph:
+    """Read vertices and edges of the kinds that `write_g2o` writes; lines of other kinds are left out.
+
+    Raises FileNotFoundError, and ValueError naming the first line without the numbers that it needs.
+    """
+    path, graph = Path(path), Graph({}, [])
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a g2o file, found none")
+    for i, line in enumerate(path.read_text(errors="replace").splitlines()):
+        words, where = line.split(), f"{path}, line {i + 1}"
+        if words and words[0] == VERTEX:
+            values = numbers_of(words[1:], columns=8, where=where)
+            graph.poses[int(values[0])] = _pose(values[1:])
+        elif words and words[0] == EDGE:
+            values = numbers_of(words[1:], columns=30, where=where)
+            information = np.zeros((6, 6))
+            information[UPPER] = values[9:]
+            information = np.triu(information, 1).T + information
+            graph.edges.append((int(values[0]), int(values[1]), _pose(values[2:9]), information))
+    return graph
+
+
+def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:
+    """Write `time x y z qx qy qz qw`, a line for each pose, seconds and metres."""
+    lines = (f"{time:.6f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
+    write_text(Path(path), "".join(lines))
+
+
+def read_tum(path: Path | str) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"]]:
+    """Read poses and times of a TUM file. Raises FileNotFoundError, and ValueError naming the first wrong line."""
+    path = Path(path)
+    rows = read_rows(path, columns=8)
+    check_times(path, rows[:, 0])
+    return from_quaternions(rows[:, 1:4], _quaternions(rows[:, 4:], path)), rows[:, 0]
+
+
+def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
+    """Write 12 numbers a line, in KITTI's axes (x right, y down, z forward)."""
+    camera = CAMERA_FROM_LIDAR @ poses @ CAMERA_FROM_LIDAR.T
+    write_text(Path(path), "".join(f"{_numbers(pose[:3].reshape(-1))}\n" for pose in camera))
+
+
+def read_kitti(path: Path | str, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
+    """Read 12 numbers a line, in KITTI's axes, or, without `camera`, with z up. Errors are those of `read_tum`."""
+    rows = read_poses(Path(path))
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows
+    return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
+
+
+def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Sequence[str] | None = None) -> None:
+    """Write a JSON object a line, with the frames' `ids` beside their numbers where they are given."""
+    write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids))}\n" for loop in loops))
+
+
+def read_loops_jsonl(path: Path | str) -> list[Loop]:
+    """Read what `write_loops_jsonl` wrote. Raises FileNotFoundError, and ValueError naming the first wrong line."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
+    return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(path.read_text().splitlines())]
+
+
+def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
+    """Write a table: frames, match_from_query as x y z and quaternion, probability, overlap (empty where not known)."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
+        overlap = "" if loop.overlap is None else f"{loop.overlap:.4f}"
+        table.writerow([loop.query, loop.match, *row.split(), f"{loop.probability:.6f}", overlap])
+    write_text(Path(path), text.getvalue())
+
+
+def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "4 4"], float]]:
+    """Read query, match, match_from_query and probability of each line of a table that `write_loops_csv` wrote."""
+    path, found = Path(path), []
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a table of loops, found no file")
+    lines = path.read_text().splitlines()
+    if not lines or tuple(lines[0].split(",")) != COLUMNS:
+        raise ValueError(f"{path}, line 1: expected {','.join(COLUMNS)}, found {lines[0] if lines else 'nothing'}")
+    for i, line in enumerate(lines[1:]):
+        values = numbers_of(line.split(",")[:10], columns=10, where=f"{path}, line {i + 2}")
+        found.append((int(values[0]), int(values[1]), _pose(values[2:9]), float(values[9])))
+    return found
+
+
+def _poses_of(loops: Sequence[Loop]) -> Float[np.ndarray, "n 4 4"]:
+    return np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
+
+
+def _pose_rows(poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
+    """x y z qx qy qz qw of each pose."""
+    if not len(poses):
+        return []
+    return [_numbers(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
+
+
+def _pose(values: Float[np.ndarray, " 7"]) -> Float[np.ndarray, "4 4"]:
+    return from_quaternions(values[None, :3], values[None, 3:])[0]
+
+
+def _quaternions(values: Float[np.ndarray, "n 4"], path: Path) -> Float[np.ndarray, "n 4"]:
+    wrong = np.flatnonzero(np.abs(np.linalg.norm(values, axis=1) - 1) > 0.01)
+    if wrong.size:
+        raise ValueError(f"{path}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
+    return values
+
+
+def _numbers(values: Float[np.ndarray, " n"]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def _as_json(loop: Loop, ids: Sequence[str] | None) -> dict:
+    named = {} if ids is None else {"query_id": ids[loop.query], "match_id": ids[loop.match]}
+    return {
+        "query": loop.query,
+        "match": loop.match,
+        **named,
+        "match_from_query": loop.match_from_query.tolist(),
+        "covariance": loop.covariance.tolist(),
+        "probability": loop.probability,
+        "overlap": loop.overlap,
+    }
+
+
+def _from_json(line: str, where: str) -> Loop:
+    try:
+        value = json.loads(line)
+        pose, covariance = np.array(value["match_from_query"], float), np.array(value["covariance"], float)
+        if pose.shape != (4, 4) or covariance.shape != (6, 6):
+            raise ValueError(f"shapes {pose.shape} and {covariance.shape}")
+        return Loop(value["query"], value["match"], pose, covariance, value["probability"], value["overlap"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{where}: expected a loop as JSON, found another line ({error})") from error

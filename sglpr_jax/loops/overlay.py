@@ -1,0 +1,31 @@
+"""Two images laid over each other, to look at."""
+
+import numpy as np
+from jaxtyping import Float, Num
+from scipy.ndimage import map_coordinates
+
+from sglpr_jax.data.readers.bev_images import RESOLUTION_M
+from sglpr_jax.loops.transforms import inverse
+
+
+def overlaid(
+    query: Num[np.ndarray, "n n"],
+    match: Num[np.ndarray, "n n"],
+    match_from_query: Float[np.ndarray, "4 4"],
+    *,
+    resolution_m: float = RESOLUTION_M,
+) -> Float[np.ndarray, "n n 3"]:
+    """Colours from 0 to 1: the match red, the query, moved into the match's frame, cyan, white where both are."""
+    size = len(match)
+    down, right = np.mgrid[:size, :size] - (size - 1) / 2
+    query_from_match = inverse(match_from_query)
+    x, y = right * resolution_m, -down * resolution_m
+    at_x = query_from_match[0, 0] * x + query_from_match[0, 1] * y + query_from_match[0, 3]
+    at_y = query_from_match[1, 0] * x + query_from_match[1, 1] * y + query_from_match[1, 3]
+    cells = [-at_y / resolution_m + (size - 1) / 2, at_x / resolution_m + (size - 1) / 2]
+    moved = map_coordinates(np.asarray(query, np.float64), cells, order=1, cval=0)
+    return np.stack([_bright(match), _bright(moved), _bright(moved)], axis=-1)
+
+
+def _bright(image: Num[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    return np.sqrt(np.asarray(image, np.float64) / max(float(image.max()), 1e-9))

@@ -1,0 +1,144 @@
+"""The pose between two scans in 6 degrees of freedom: KISS-Matcher finds it, GICP refines it (extra `slam`).
+
+Neither knows whether the scans show one place: started 3 m off along a road, GICP converges 3 m off. What tells is
+the share of the space of one scan that the other one fills too, the overlap.
+"""
+
+import importlib
+from dataclasses import dataclass
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from sglpr_jax.loops.transforms import transformed
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """How two scans are laid over each other."""
+
+    voxel_m: float = 1.0
+    """The edge of KISS-Matcher's voxels."""
+    fine_voxel_m: float = 0.25
+    """The edge of GICP's."""
+    max_apart_m: float = 1.0
+    """Points of GICP farther from each other do not correspond."""
+    iterations: int = 40
+    overlap_voxel_m: float = 1.0
+    overlap_reach_m: float = 40.0
+    """Points farther from both sensors do not count in the overlap."""
+    min_position_m: float = 0.02
+    min_rotation_deg: float = 0.1
+    """Standard deviations that no covariance goes below: GICP's are those of noise alone."""
+
+
+class Registration(NamedTuple):
+    """How a query lies in the frame of a match."""
+
+    match_from_query: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    """Of a small motion of the query in its own frame: x, y, z in metres, then about x, y, z in radians."""
+    overlap: float
+    """The share of the space near both sensors that both scans fill, from 0 to 1."""
+
+
+def register(
+    query: Float32[np.ndarray, "n 3"],
+    match: Float32[np.ndarray, "m 3"],
+    *,
+    initial: Float[np.ndarray, "4 4"] | None = None,
+    config: RegistrationConfig = RegistrationConfig(),
+) -> Registration:
+    """Lay the scan of a query over that of a match, both in metres in the LiDAR frame.
+
+    `initial` is a first `match_from_query`, right to a metre and some degrees; without it KISS-Matcher finds one from
+    nothing, which takes half a second. Raises ImportError where the extra `slam` is not installed, ValueError for scans
+    of fewer than 100 finite points.
+
+    Example:
+      found = register(recording.points(52), recording.points(4501))
+      found.overlap > 0.5  # it is a loop
+    """
+    gicp = _library("small_gicp")
+    query, match = _finite(query, "query"), _finite(match, "match")
+    initial = coarse_pose(query, match, voxel_m=config.voxel_m) if initial is None else initial
+    target, tree = gicp.preprocess_points(match.astype(np.float64), downsampling_resolution=config.fine_voxel_m)
+    source, _ = gicp.preprocess_points(query.astype(np.float64), downsampling_resolution=config.fine_voxel_m)
+    found = gicp.align(
+        target,
+        source,
+        tree,
+        init_T_target_source=np.asarray(initial, np.float64),
+        registration_type="GICP",
+        max_correspondence_distance=config.max_apart_m,
+        max_iterations=config.iterations,
+    )
+    pose = np.asarray(found.T_target_source)
+    spread = found.error / max(found.num_inliers, 1)  # per point, in units of GICP's own covariances
+    return Registration(pose, _covariance(found.H, spread, config), overlap(query, match, pose, config=config))
+
+
+def coarse_pose(
+    query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m 3"], *, voxel_m: float = 1.0
+) -> Float[np.ndarray, "4 4"]:
+    """`match_from_query` by KISS-Matcher, without a first guess. Raises ImportError without the extra `slam`."""
+    matcher = _library("kiss_matcher")
+    found = matcher.KISSMatcher(matcher.KISSMatcherConfig(voxel_m)).estimate(query, match)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = found.rotation, found.translation
+    return pose
+
+
+def overlap(
+    query: Float[np.ndarray, "n 3"],
+    match: Float[np.ndarray, "m 3"],
+    match_from_query: Float[np.ndarray, "4 4"],
+    *,
+    config: RegistrationConfig = RegistrationConfig(),
+) -> float:
+    """The number of voxels that both scans fill over that of the scan that fills fewer, near both sensors."""
+    moved = transformed(match_from_query, query)
+    sensors = np.stack([np.zeros(3), match_from_query[:3, 3]])
+    ours, theirs = (_voxels(cloud[_near(cloud, sensors, config)], config) for cloud in (moved, match))
+    fewer = min(len(ours), len(theirs))
+    return len(np.intersect1d(ours, theirs, assume_unique=True)) / fewer if fewer else 0.0
+
+
+def _near(
+    cloud: Float[np.ndarray, "n 3"], sensors: Float[np.ndarray, "2 3"], config: RegistrationConfig
+) -> Bool[np.ndarray, " n"]:
+    return np.all([np.linalg.norm(cloud - sensor, axis=1) < config.overlap_reach_m for sensor in sensors], axis=0)
+
+
+def _voxels(cloud: Float[np.ndarray, "n 3"], config: RegistrationConfig) -> Int[np.ndarray, " v"]:
+    """The voxels that hold points, a number each."""
+    side = 2 * int(config.overlap_reach_m / config.overlap_voxel_m) + 4
+    x, y, z = np.floor(cloud / config.overlap_voxel_m).astype(np.int64).T + side // 2
+    return np.unique((z * side + y) * side + x)
+
+
+def _covariance(
+    information: Float[np.ndarray, "6 6"], spread: float, config: RegistrationConfig
+) -> Float[np.ndarray, "6 6"]:
+    """From GICP's information matrix, rotation first."""
+    order = np.array([3, 4, 5, 0, 1, 2])
+    least = np.repeat([config.min_position_m, np.radians(config.min_rotation_deg)], 3) ** 2
+    return np.linalg.pinv(information)[order][:, order] * spread + np.diag(least)
+
+
+def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray, "n 3"]:
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 100:
+        raise ValueError(f"expected a {name} of 100 finite points or more to register, found {len(points)}")
+    return points
+
+
+def _library(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"registration of scans needs {name.replace('_', '-')}: pip install 'sglpr-jax[slam]'"
+        ) from error

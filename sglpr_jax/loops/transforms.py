@@ -1,0 +1,54 @@
+"""Rigid transforms as 4 x 4 matrices, `a_from_b @ b_from_c == a_from_c`, and what they are in the plane."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+
+def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
+    """A motion in the plane: metres, and radians counter-clockwise."""
+    found = np.eye(4)
+    found[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    found[:2, 3] = x, y
+    return found
+
+
+def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
+    """b_from_a."""
+    turned = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    found = np.zeros_like(a_from_b)
+    found[..., :3, :3] = turned
+    found[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, a_from_b[..., :3, 3])
+    found[..., 3, 3] = 1
+    return found
+
+
+def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
+    """Where b's x axis points in a's plane, radians."""
+    return np.asarray(np.arctan2(a_from_b[..., 1, 0], a_from_b[..., 0, 0]))
+
+
+def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Points of frame b in frame a."""
+    return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+
+
+def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
+    """The rotations as x, y, z, w, with w not negative."""
+    return Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+
+
+def from_quaternions(
+    translations: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses of translations and quaternions (x, y, z, w)."""
+    poses = np.tile(np.eye(4), (len(translations), 1, 1))
+    poses[:, :3, 3] = translations
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
+    return poses
+
+
+def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
+    """How far the sensor had come at every pose, metres."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])

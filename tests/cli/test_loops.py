@@ -1,0 +1,93 @@
+import json
+
+import numpy as np
+import pytest
+
+from sglpr_jax.cli import loops as command_file
+from sglpr_jax.data import open_recording
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, read_tum, write_kitti, write_tum
+from sglpr_jax.models.weights_file import load
+
+from .conftest import SCANS, assert_one_line_error
+
+FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "index.html"}
+TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
+
+
+@pytest.fixture
+def odometry(town, tmp_path) -> np.ndarray:
+    """Poses of the sensor of 08, standing upright, at its true positions."""
+    poses = np.tile(np.eye(4), (SCANS, 1, 1))
+    poses[:, :3, 3] = open_recording(town, "08").positions
+    return poses
+
+
+@pytest.mark.slow
+def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_path):
+    write_kitti(tmp_path / "odometry.txt", odometry)
+    out = tmp_path / "found"
+    options = ("--poses", tmp_path / "odometry.txt", "--pose-format", "kitti", "--out", out)
+    ended = command("loops", town, "--seq", "08", *options)
+    assert ended.status == 0, ended.error
+    assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES
+    expected = find_loops(open_recording(town, "08"), load("simulated"), odometry=odometry)
+    found = read_loops_jsonl(out / "loops.jsonl")
+    assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
+    assert ended.out.splitlines()[0] == str(expected)
+    graph = read_g2o(out / "loops.g2o")
+    assert len(graph.poses) == SCANS and len(graph.edges) == SCANS - 1 + len(found)
+    np.testing.assert_allclose(read_tum(out / "trajectory.tum")[0], odometry, atol=1e-5)
+    page = (out / "index.html").read_text()
+    assert "<h2>Where</h2>" in page and page.count("data:image/png;base64,") >= 2
+
+
+@pytest.mark.slow
+def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, town, tmp_path, monkeypatch):
+    def stopped(recording, params, *, should_stop, on_progress, **options):
+        done = []
+        return find_loops(
+            recording,
+            params,
+            **options,
+            should_stop=lambda: bool(should_stop() or len(done) >= 5 and _interrupt(should_stop)),
+            on_progress=done.append,
+        )
+
+    def _interrupt(should_stop):
+        should_stop.signal = 2
+        return True
+
+    monkeypatch.setattr(command_file, "find_loops", stopped)
+    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
+    assert ended.status == 130
+    assert ended.out.startswith("0 loops in 5 of 40 frames of 08")
+    assert {path.name for path in (tmp_path / "found").iterdir()} == FILES
+
+
+def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
+    short, flat = tmp_path / "short.tum", tmp_path / "flat.txt"
+    write_tum(short, odometry[:7], np.arange(7.0))
+    np.savetxt(flat, np.zeros((SCANS, 12)))
+    run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--poses")
+    assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
+    assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line with --pose-format kitti")
+    assert_one_line_error(command(*run, flat, "--pose-format", "lidar"), "flat.txt, pose 0: expected a rotation")
+    assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
+    assert_one_line_error(command("loops", tmp_path, "--out", tmp_path / "found"), tmp_path)
+    assert not (tmp_path / "found").exists()
+
+
+@pytest.mark.slow
+def test_images_cannot_be_registered(command, images, tmp_path):
+    ended = command("loops", images, "--seq", "06", "--out", tmp_path / "found", "--register")
+    assert_one_line_error(ended, "expected scans to register, found ready-made images")
+
+
+@pytest.mark.slow
+def test_an_index_of_frames_stands_in_the_lines(command, town, tmp_path):
+    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--min-probability", "0.5")
+    assert ended.status == 0, ended.error
+    for line in (tmp_path / "found" / "loops.jsonl").read_text().splitlines():
+        value = json.loads(line)
+        assert value["query_id"] == f"{value['query']:06d}" and value["probability"] >= 0.5

@@ -1,0 +1,117 @@
+"""Right loops agree with each other whatever the odometry has drifted, wrong ones do not; the largest set is found."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sglpr_jax.loops.consistency import agree, agree_in_order, largest_consistent_set
+from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.verification import Alignment
+
+
+def square_drive(laps: int = 2, side: int = 50) -> np.ndarray:
+    """Poses (n, 4, 4) of laps about a square, one each metre."""
+    poses = []
+    for _, edge, step in itertools.product(range(laps), range(4), range(side)):
+        corner = np.array([(0, 0), (side, 0), (side, side), (0, side)])[edge]
+        yaw = edge * np.pi / 2
+        poses.append(transform(*(corner + step * np.array([np.cos(yaw), np.sin(yaw)])), yaw))
+    return np.stack(poses)
+
+
+def drifted(
+    poses: np.ndarray, rng: np.random.Generator, *, share: float = 0.01, deg_per_m: float = 0.005
+) -> np.ndarray:
+    """Odometry of the drive, its scale and heading off by so much."""
+    scale, turn = 1 + rng.normal(scale=share), rng.normal(scale=np.radians(deg_per_m))
+    steps = inverse(poses[:-1]) @ poses[1:]
+    found = [np.eye(4)]
+    for step in steps:
+        step = step.copy()
+        step[:3, 3] *= scale
+        found.append(found[-1] @ step @ transform(0.0, 0.0, turn))
+    return np.stack(found)
+
+
+def loop_of(poses: np.ndarray, query: int, match: int, error: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Loop:
+    relative = inverse(poses[match]) @ poses[query] @ transform(*error)
+    yaw = np.arctan2(relative[1, 0], relative[0, 0])
+    covariance = np.diag([0.05, 0.05, np.radians(0.3)]) ** 2
+    return planar_loop(query, match, Alignment(*relative[:2, 3], yaw, covariance, 0.8, 0.3), probability=0.99)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 10**6))
+def test_right_loops_agree_and_wrong_ones_do_not(seed):
+    rng = np.random.default_rng(seed)
+    poses = square_drive()
+    odometry = drifted(poses, rng)
+    right = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[0.1, 0.1, 0.005]))) for i in range(210, 290, 4)]
+    wrong = [loop_of(poses, i, i - 200, (15.0 * (-1) ** i, 5.0, 0.0)) for i in range(212, 290, 13)]
+    pairs = agree(right + wrong, odometry)
+    assert pairs[:20, :20].mean() > 0.98
+    near = np.abs(np.subtract.outer([one.query for one in right], [one.query for one in wrong])) < 20
+    assert not pairs[:20, 20:][near].any()
+    kept = largest_consistent_set(pairs)
+    assert len(kept) >= 19 and kept.max() < 20
+
+
+def test_a_loop_in_the_other_direction_agrees_with_one_in_the_same():
+    poses = square_drive()
+    back = poses.copy()
+    back[200:] = poses[200:] @ transform(0.0, 0.0, np.pi)
+    assert agree([loop_of(back, 230, 30), loop_of(back, 240, 40)], back).all()
+    turned = [loop_of(back, 230, 30), loop_of(back, 240, 40, (0.0, 0.0, np.pi))]
+    assert not agree(turned, back)[0, 1]
+
+
+def test_agreement_goes_both_ways_and_with_itself():
+    poses = square_drive()
+    rng = np.random.default_rng(0)
+    loops = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[2, 2, 0.1]))) for i in range(205, 285, 5)]
+    pairs = agree(loops, drifted(poses, rng))
+    assert pairs.diagonal().all()
+    assert (pairs == pairs.T).mean() > 0.95  # the lever is that of one of the two
+    np.testing.assert_array_equal(agree(loops, poses, loops[:3]), agree(loops, poses)[:, :3])
+
+
+def test_in_order_a_match_goes_on_as_the_query_does():
+    poses = square_drive()
+    loops = [loop_of(poses, q, m) for q, m in ((250, 50), (251, 52), (252, 10), (253, 49))]
+    pairs = agree_in_order(loops)
+    assert pairs[0].tolist() == [True, True, False, True]
+    assert agree_in_order([]).shape == (0, 0) and agree([], poses).shape == (0, 0)
+
+
+@settings(deadline=None, max_examples=40)
+@given(n=st.integers(1, 9), seed=st.integers(0, 10**6))
+def test_the_set_is_consistent_and_nearly_the_largest(n, seed):
+    half = np.triu(np.random.default_rng(seed).random((n, n)) < 0.6, 1)
+    pairs = half | half.T | np.eye(n, dtype=bool)
+    found = largest_consistent_set(pairs)
+    assert pairs[np.ix_(found, found)].all()
+    sizes = range(n, 0, -1)
+    best = next(k for k in sizes if any(pairs[np.ix_(s, s)].all() for s in itertools.combinations(range(n), k)))
+    assert len(found) >= best - 1
+
+
+def test_nothing_to_choose_from():
+    assert len(largest_consistent_set(np.zeros((0, 0), bool))) == 0
+    assert largest_consistent_set(np.ones((1, 1), bool)).tolist() == [0]
+
+
+def test_the_covariance_of_a_loop_is_that_of_a_motion_in_the_querys_frame():
+    """Unsure along the match's x; the query is turned by 90 degrees, so along its own y."""
+    covariance = np.diag([4.0, 0.01, 0.001])
+    loop = planar_loop(9, 1, Alignment(1.0, 2.0, np.pi / 2, covariance, 0.8, 0.3), probability=0.9)
+    np.testing.assert_allclose(loop.covariance.diagonal()[[0, 1, 5]], [0.01, 4.0, 0.001], atol=1e-9)
+    np.testing.assert_allclose(loop.information @ loop.covariance, np.eye(6), atol=1e-9)
+    assert loop.yaw == pytest.approx(np.pi / 2)
+    rng = np.random.default_rng(0)
+    motions = rng.multivariate_normal(np.zeros(2), loop.covariance[:2, :2], 4000)
+    moved = np.stack([(loop.match_from_query @ transform(*motion, 0.0))[:2, 3] for motion in motions])
+    np.testing.assert_allclose(np.cov(moved.T), covariance[:2, :2], atol=0.3)

@@ -1,0 +1,148 @@
+"""A stream of scans: its loops are true, their poses right; what cannot be handed in is refused."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.data.record import Record
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, labelled, square_image
+from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+
+NOW = CandidateConfig(exclude_frames=0)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return sglpr_jax.load("simulated")
+
+
+@pytest.fixture(scope="module")
+def streamed(drive, params):
+    """The detector after the whole drive, with odometry, and what it returned frame by frame."""
+    detector = LoopDetector(params)
+    poses = drive.poses.world_from_lidar
+    returned = [detector.add(drive.points(i), time=drive.times[i], odometry=poses[i]) for i in range(len(drive))]
+    return detector, returned
+
+
+def apart(drive, loop) -> float:
+    return float(np.linalg.norm(drive.positions[loop.query] - drive.positions[loop.match]))
+
+
+@pytest.mark.slow
+def test_the_loops_of_a_drive_are_true_and_nearly_all(drive, streamed):
+    detector, returned = streamed
+    loops = [loop for frame in returned for loop in frame]
+    assert loops == detector.loops and len({loop.query for loop in loops}) == len(loops)
+    assert max(apart(drive, loop) for loop in loops) < 12
+    old = drive.times[:, None] - drive.times[None] >= 30
+    near = np.linalg.norm(drive.positions[:, None] - drive.positions[None], axis=2) < 5
+    revisits = set(np.flatnonzero((near & old).any(axis=1)).tolist())
+    assert len(revisits) > 30 and len(revisits & {loop.query for loop in loops}) >= 0.8 * len(revisits)
+    for frame, found in enumerate(returned):
+        assert all(frame - 2 <= loop.query <= frame and loop.match < loop.query for loop in found)
+
+
+@pytest.mark.slow
+def test_poses_of_the_loops_are_those_of_the_drive(drive, streamed):
+    poses = drive.poses.world_from_lidar
+    errors = []
+    for loop in streamed[0].loops:
+        error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
+        errors.append((np.linalg.norm(error[:2, 3]), np.degrees(abs(yaw_of(error)))))
+        assert loop.probability >= 0.99 and (np.linalg.eigvalsh(loop.covariance) > 0).all()
+    metres, degrees = np.median(errors, axis=0)
+    assert metres < 0.25 and degrees < 0.3
+
+
+@pytest.mark.slow
+def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, streamed):
+    poses = drive.poses.world_from_lidar
+    done = []
+    found = find_loops(drive, params, odometry=poses, registered=True, on_progress=done.append)
+    assert done == list(range(1, len(drive) + 1)) and found.frames == len(drive)
+    assert len(found.loops) + len(found.refused) == len(streamed[0].loops)
+    assert str(found).startswith(f"{len(found.loops)} loops in 240 of 240 frames of 08")
+    for loop in found.loops:
+        error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
+        assert loop.overlap >= 0.5 and np.linalg.norm(error[:3, 3]) < 0.5
+    stopped = find_loops(drive, params, should_stop=lambda: True)
+    assert stopped.frames == 0 and stopped.loops == ()
+
+
+def test_images_and_scans_are_the_same_to_it(drive, params, revisit):
+    points = drive.points(revisit[1])
+    scans, images = CandidateFinder(params, config=NOW), CandidateFinder(params, config=NOW)
+    for cloud in (points, drive.points(revisit[0])):
+        found = scans.add(Record(points=cloud))
+        same = images.add(Record(image=sglpr_jax.density_bev(cloud)))
+    assert (found[0].query, found[0].match) == (1, 0)
+    for one, other in zip(found[0].alignment, same[0].alignment, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5)
+    assert found[0].alignment.correlation > 0.4 and np.isnan(found[0].evidence.margin)
+    np.testing.assert_array_equal(scans.images[0], square_image(Record(points=points)))
+    assert scans.images[0].shape == (152, 152)
+
+
+def test_odometry_far_off_leaves_a_candidate_out_and_margins_are_of_other_places(drive, params, revisit):
+    query, match = (drive.points(frame) for frame in revisit)
+    for metres, there in ((5.0, 1), (90.0, 0)):
+        finder = CandidateFinder(params, config=NOW)
+        finder.add(Record(points=match), odometry=np.eye(4))
+        assert len(finder.add(Record(points=query), odometry=transform(metres, 0.0, 0.0))) == there
+    finder = CandidateFinder(params, config=NOW)
+    for k, cloud in enumerate((match, drive.points(0), query)):
+        found = finder.add(Record(points=cloud), odometry=transform((0.0, 30.0, 2.0)[k], 0.0, 0.0))
+    distances = np.linalg.norm(finder.index.descriptors[:2] - finder.index.descriptors[2], axis=1)
+    assert found[0].match == 0
+    assert found[0].evidence.margin == pytest.approx(distances[1] - distances[0], rel=1e-4)
+
+
+def test_candidates_with_true_positions_are_labelled():
+    finder_gave = [_candidate(5, 0), _candidate(6, 1), _candidate(7, 2)]
+    positions = np.zeros((8, 3))
+    positions[5:, 0] = 3, 15, 40
+    evidence, is_loop = labelled(finder_gave, positions)
+    assert is_loop.tolist() == [True, False] and evidence.distance.tolist() == [5, 7]
+
+
+def _candidate(query: int, match: int):
+    return Candidate(query, match, None, Evidence(float(query), 0.0, 0.0, 0.0))
+
+
+def test_one_probable_frame_is_no_loop_two_in_a_row_are(drive, params, revisit):
+    """A model that calls everything a loop, so that what counts is the order of frames."""
+    always = LoopModel({}, {}, {}, 10.0, "everything")
+    config = DetectorConfig(candidates=NOW)
+    detector = LoopDetector(params, model=always, config=config)
+    places = (revisit[1], revisit[1] + 1, revisit[0] - 1, revisit[0])
+    returned = [detector.add(drive.points(frame)) for frame in places]
+    assert [len(found) for found in returned[:2]] == [0, 0]
+    assert detector.loops and all(loop.probability > 0.99 for loop in detector.loops)
+
+
+def test_what_does_not_fit_is_one_clear_error(drive, params, random_params):
+    detector = LoopDetector(params)
+    cloud = drive.points(0)
+    detector.add(cloud, time=5.0)
+    for scan, given, message in (
+        (cloud, {}, "expected a time for every frame or for none"),
+        (cloud, {"time": 4.0}, "times that do not go back, found 4.0 after 5.0"),
+        (cloud, {"time": 6.0, "odometry": np.eye(4)}, "expected odometry for every frame or for none"),
+        (cloud, {"time": 6.0, "odometry": 2 * np.eye(4)}, "4 x 4 pose with a rotation"),
+        (np.zeros(7), {"time": 6.0}, r"points \(n, 3\) or an image"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            detector.add(scan, **given)
+    assert len(detector) == 1
+    with pytest.raises(ValueError, match="expected odometry of 240 poses, one for each scan of 08, found 3"):
+        find_loops(drive, params, odometry=np.stack([np.eye(4)] * 3))
+    head = dataclasses.replace(params.config.head, input="counts+labels")
+    reads = dataclasses.replace(params.config, categories=20, head=head)
+    with pytest.raises(ValueError, match="describes images alone"):
+        CandidateFinder(dataclasses.replace(params, config=reads))

@@ -1,0 +1,122 @@
+"""What is written is read back; g2o's numbers stand where g2o looks for them."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.loops.graph_files import (
+    read_g2o,
+    read_kitti,
+    read_loops_csv,
+    read_loops_jsonl,
+    read_tum,
+    write_g2o,
+    write_kitti,
+    write_loops_csv,
+    write_loops_jsonl,
+    write_tum,
+)
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import inverse
+
+
+@pytest.fixture
+def poses() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    found = np.tile(np.eye(4), (6, 1, 1))
+    found[:, :3, :3] = Rotation.random(6, rng=rng).as_matrix()
+    found[:, :3, 3] = rng.normal(scale=100, size=(6, 3))
+    return found
+
+
+@pytest.fixture
+def loops(poses) -> list[Loop]:
+    rng = np.random.default_rng(1)
+    spread = [a @ a.T + np.eye(6) for a in rng.normal(size=(2, 6, 6))]
+    relative = [inverse(poses[m]) @ poses[q] for q, m in ((5, 0), (4, 1))]
+    return [Loop(5, 0, relative[0], spread[0], 0.99), Loop(4, 1, relative[1], spread[1], 0.95, overlap=0.7)]
+
+
+def test_a_graph_comes_back_from_g2o(tmp_path, poses, loops):
+    write_g2o(tmp_path / "loops.g2o", loops, poses)
+    graph = read_g2o(tmp_path / "loops.g2o")
+    np.testing.assert_allclose(np.stack([graph.poses[i] for i in range(6)]), poses, atol=1e-6)
+    assert [(i, j) for i, j, *_ in graph.edges] == [(i, i + 1) for i in range(5)] + [(0, 5), (1, 4)]
+    for i, j, relative, information in graph.edges:
+        np.testing.assert_allclose(poses[i] @ relative, poses[j], atol=1e-5)
+        np.testing.assert_allclose(information, information.T)
+        assert (np.linalg.eigvalsh(information) > 0).all()
+    for loop, (_, _, _, information) in zip(loops, graph.edges[5:], strict=True):
+        np.testing.assert_allclose(np.linalg.inv(information), loop.covariance, rtol=1e-5, atol=1e-6)
+
+
+def test_the_numbers_of_an_edge_by_hand(tmp_path):
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    write_g2o(tmp_path / "a.g2o", [Loop(7, 3, pose, np.diag([1, 0.25, 0.2, 0.1, 0.05, 0.04]), 0.9)])
+    (line,) = (tmp_path / "a.g2o").read_text().splitlines()
+    assert line == "EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1 " + "1 0 0 0 0 0 4 0 0 0 0 5 0 0 0 10 0 0 20 0 25"
+
+
+def test_trajectories_come_back_and_are_those_the_readers_see(tmp_path, poses):
+    times = np.arange(6) / 10 + 1_300_000_000
+    write_tum(tmp_path / "t.tum", poses, times)
+    write_kitti(tmp_path / "t.kitti", poses)
+    again, clock = read_tum(tmp_path / "t.tum")
+    np.testing.assert_allclose(again, poses, atol=1e-6)
+    np.testing.assert_allclose(clock, times, atol=1e-6)
+    np.testing.assert_allclose(read_kitti(tmp_path / "t.kitti"), poses, atol=1e-6)
+    for name, format in (("t.tum", "tum"), ("t.kitti", "kitti")):
+        positions = read_trajectory(tmp_path / name, format=format).positions
+        np.testing.assert_allclose(positions, poses[:, :3, 3], atol=1e-6)
+    np.savetxt(tmp_path / "z_up.txt", poses[:, :3].reshape(6, 12))
+    np.testing.assert_allclose(read_kitti(tmp_path / "z_up.txt", camera=False), poses)
+
+
+def test_loops_come_back_from_json_lines_and_csv(tmp_path, loops):
+    write_loops_jsonl(tmp_path / "loops.jsonl", loops, ids=[f"frame{i}" for i in range(6)])
+    write_loops_csv(tmp_path / "loops.csv", loops)
+    first = json.loads((tmp_path / "loops.jsonl").read_text().splitlines()[0])
+    assert (first["query_id"], first["match_id"]) == ("frame5", "frame0")
+    for loop, again, row in zip(
+        loops, read_loops_jsonl(tmp_path / "loops.jsonl"), read_loops_csv(tmp_path / "loops.csv"), strict=True
+    ):
+        assert (again.query, again.match, again.probability, again.overlap) == (
+            loop.query, loop.match, loop.probability, loop.overlap,
+        )  # fmt: skip
+        np.testing.assert_array_equal(again.match_from_query, loop.match_from_query)
+        np.testing.assert_array_equal(again.covariance, loop.covariance)
+        assert row[:2] == (loop.query, loop.match) and row[3] == pytest.approx(loop.probability)
+        np.testing.assert_allclose(row[2], loop.match_from_query, atol=1e-6)
+
+
+def test_no_loops_are_files_too(tmp_path, poses):
+    write_loops_jsonl(tmp_path / "a.jsonl", [])
+    write_loops_csv(tmp_path / "a.csv", [])
+    write_g2o(tmp_path / "a.g2o", [])
+    assert read_loops_jsonl(tmp_path / "a.jsonl") == [] and read_loops_csv(tmp_path / "a.csv") == []
+    assert read_g2o(tmp_path / "a.g2o") == ({}, [])
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "message"),
+    [
+        (read_g2o, "EDGE_SE3:QUAT 1 2 3\n", "line 1: expected 30 numbers, found 3"),
+        (read_g2o, "FIX 0\nVERTEX_SE3:QUAT 1 2 3 4 5 6 7 x\n", "line 2: expected numbers"),
+        (read_loops_jsonl, '{"query": 1}\n', "line 1: expected a loop as JSON"),
+        (read_loops_csv, "a,b\n", "line 1: expected query,match"),
+        (read_tum, "0 1 2 3 0 0 0 2\n", "expected a quaternion of length 1"),
+        (read_tum, "1 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "line 2: expected a time >= 1"),
+        (read_kitti, "1 2 3\n", "line 1: expected 12 numbers, found 3"),
+    ],
+)
+def test_wrong_files_are_one_clear_error(tmp_path, read, text, message):
+    path = tmp_path / "file"
+    with pytest.raises(FileNotFoundError, match="file: "):
+        read(path)
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"file.*{message}"):
+        read(path)

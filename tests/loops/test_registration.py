@@ -1,0 +1,76 @@
+"""Poses between full scans: those that the scans were simulated from; and what tells a loop from none."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.loops.registration import coarse_pose, overlap, register
+from sglpr_jax.loops.transforms import inverse, transform, transformed
+
+
+def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    apart = inverse(expected) @ found
+    return float(np.linalg.norm(apart[:3, 3])), float(np.degrees(Rotation.from_matrix(apart[:3, :3]).magnitude()))
+
+
+@pytest.fixture(scope="module")
+def pair(drive, revisit):
+    """The scans of a revisit, query and match, and the true match_from_query."""
+    query, match = revisit
+    poses = drive.poses.world_from_lidar
+    return drive.points(query), drive.points(match), inverse(poses[match]) @ poses[query]
+
+
+@pytest.mark.slow
+def test_a_revisit_is_found_from_nothing(pair):
+    query, match, expected = pair
+    first = error_of(coarse_pose(query, match), expected)
+    found = register(query, match)
+    metres, degrees = error_of(found.match_from_query, expected)
+    assert first[0] < 1 and metres < 0.1 and degrees < 0.3
+    assert found.overlap > 0.5
+    assert overlap(query, match, found.match_from_query) == found.overlap
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all() and found.covariance.shape == (6, 6)
+    assert found.covariance[0, 0] < 0.3**2
+
+
+def test_a_first_guess_is_refined(pair):
+    query, match, expected = pair
+    found = register(query, match, initial=expected @ transform(0.3, -0.2, np.radians(2)))
+    metres, degrees = error_of(found.match_from_query, expected)
+    assert metres < 0.1 and degrees < 0.3
+
+
+@pytest.mark.slow
+def test_other_places_do_not_overlap(drive, revisit):
+    query = drive.points(revisit[0])
+    far = np.argsort(-np.linalg.norm(drive.positions - drive.positions[revisit[0]], axis=1))[:2]
+    assert all(register(query, drive.points(int(other))).overlap < 0.5 for other in far)
+
+
+def test_the_overlap_of_a_scan_with_itself_is_whole_and_counts_voxels():
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(-20, 20, (3000, 3)).astype(np.float32)
+    moved = transform(0.0, 0.0, 1.0)
+    assert overlap(transformed(inverse(moved), cloud), cloud, moved) == 1
+    grid = np.stack(np.meshgrid(*[np.arange(-5, 5) + 0.5] * 3), -1).reshape(-1, 3)
+    assert overlap(grid, grid, transform(2.0, 0.0, 0.0)) == pytest.approx(0.8)
+    assert overlap(grid, grid + np.array([200, 0, 0]), np.eye(4)) == 0
+
+
+def test_scans_of_next_to_no_points_are_refused():
+    cloud = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    broken = np.full_like(cloud, np.nan)
+    with pytest.raises(ValueError, match="expected a match of 100 finite points or more to register, found 0"):
+        register(cloud, broken)
+
+
+@pytest.mark.parametrize("name", ["small_gicp", "kiss_matcher"])
+def test_a_missing_extra_is_one_clear_error(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    cloud = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    with pytest.raises(ImportError, match=rf"{name.replace('_', '-')}: pip install 'sglpr-jax\[slam\]'"):
+        register(cloud, cloud)

@@ -1,0 +1,170 @@
+"""The index answers as numpy does over all pairs, grows, and comes back from its file or says why not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sglpr_jax import Index
+from sglpr_jax.files import WriteError
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
+WIDTH = 8
+
+
+def draw(n: int, seed: int = 0) -> np.ndarray:
+    rows = np.random.default_rng(seed).normal(size=(n, WIDTH)).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def index_of(n: int, **about) -> Index:
+    index = Index.empty(WIDTH, **about)
+    index.add(draw(n), times=np.arange(n) / 2, positions=np.arange(3.0 * n).reshape(n, 3))
+    return index
+
+
+@settings(deadline=None, max_examples=30)
+@given(n=st.integers(1, 700), parts=st.integers(1, 5), k=st.integers(1, 20), excluded=st.floats(0, 1))
+def test_the_nearest_are_those_of_all_pairs_however_they_were_added(n, parts, k, excluded):
+    rows, queries = draw(n), draw(5, seed=1)
+    index = Index.empty(WIDTH)
+    for part in np.array_split(rows, parts):
+        index.add(part)
+    left_out = np.random.default_rng(n).random(n) < excluded
+    found = index.query(queries, k, exclude=left_out)
+    every = np.linalg.norm(queries[:, None].astype(np.float64) - rows[None], axis=2)
+    every[:, left_out] = np.inf
+    order = np.argsort(every, axis=1, kind="stable")[:, :k]
+    there = min(k, n - left_out.sum())
+    np.testing.assert_array_equal(found.rows[:, :there], order[:, :there])
+    np.testing.assert_allclose(found.distances[:, :there], np.take_along_axis(every, order, axis=1)[:, :there])
+    assert (found.rows[:, there:] == -1).all() and np.isinf(found.distances[:, there:]).all()
+    assert index.ids == [f"{row:06d}" for row in range(n)]
+
+
+def test_equal_places_come_in_their_order_and_one_descriptor_gives_one_answer():
+    index = Index.empty(WIDTH)
+    index.add(np.repeat(draw(2), 20, axis=0))
+    found = index.query(draw(2)[1], 3)
+    assert found.rows.tolist() == [20, 21, 22] and found.distances.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("distance", ["cosine", "l2"])
+def test_another_distance_is_that_of_its_name(distance):
+    index, queries = Index.empty(WIDTH, distance=distance), 3 * draw(4, seed=2)
+    index.add(draw(50))
+    rows = index.query(queries, 2).rows
+    np.testing.assert_array_equal(rows, np.argsort(-queries @ draw(50).T, axis=1)[:, :2])
+
+
+def test_recent_places_are_left_out_by_time_or_by_number():
+    index = index_of(100)  # a place each half second
+    assert np.flatnonzero(index.recent(50.0)).tolist() == list(range(41, 100))
+    assert np.flatnonzero(index.recent(frames=3)).tolist() == [97, 98, 99]
+    without_times = Index.empty(WIDTH)
+    without_times.add(draw(10))
+    assert without_times.recent(50.0, frames=4).sum() == 4
+    assert index.query(draw(100)[99], 1, exclude=index.recent(50.0)).rows[0] <= 40
+
+
+def test_it_comes_back_from_its_file_and_goes_on_growing(tmp_path):
+    index = index_of(300, weights_hash="abc")
+    index.save(tmp_path / "places.safetensors")
+    again = Index.load(tmp_path / "places.safetensors", weights_hash="abc")
+    assert again.ids == index.ids and (again.width, again.distance) == (WIDTH, "l2")
+    for name in ("descriptors", "times", "positions"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(index, name))
+    again.add(draw(1, seed=9)[0], ids="new", times=151.0, positions=np.zeros(3))
+    assert again.query(draw(1, seed=9)[0]).rows.tolist() == [300] and again.ids[-1] == "new" and len(index) == 300
+
+
+def test_an_empty_index_has_no_answers_and_can_be_kept(tmp_path):
+    index = Index.empty(WIDTH)
+    assert index.query(draw(1)[0], 2).rows.tolist() == [-1, -1]
+    index.save(tmp_path / "empty.safetensors")
+    again = Index.load(tmp_path / "empty.safetensors")
+    again.add(draw(3))
+    assert again.query(draw(3)[1]).rows.tolist() == [1]
+
+
+def test_a_flipped_byte_anywhere_is_noticed(tmp_path):
+    path = tmp_path / "places.safetensors"
+    index_of(20).save(path)
+    whole = path.read_bytes()
+    for place in np.linspace(0, len(whole) - 1, 60).astype(int):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(ValueError, match=r"places\.safetensors: expected an index"):
+            Index.load(path)
+    path.write_bytes(whole[:-10])
+    with pytest.raises(ValueError, match="no whole safetensors file"):
+        Index.load(path)
+    with pytest.raises(FileNotFoundError, match="expected an index, found none"):
+        Index.load(tmp_path / "elsewhere")
+
+
+def test_a_full_disk_leaves_the_index_that_was_there(tmp_path, small_files):
+    path = tmp_path / "places.safetensors"
+    index_of(20).save(path)
+    small_files(4000)
+    with pytest.raises(WriteError, match=r"places\.safetensors"):
+        index_of(2000).save(path)
+    assert len(Index.load(path)) == 20 and list(tmp_path.iterdir()) == [path]
+
+
+def test_descriptors_of_another_model_are_refused(tmp_path):
+    index = index_of(5, weights_hash="abc")
+    index.save(tmp_path / "places.safetensors")
+    for refused in (
+        lambda: index.add(draw(1), weights_hash="xyz"),
+        lambda: index.query(draw(1), weights_hash="xyz"),
+        lambda: Index.load(tmp_path / "places.safetensors", weights_hash="xyz"),
+        lambda: index.add_file(file_of(3, weights_hash="xyz")),
+    ):
+        with pytest.raises(ValueError, match="expected descriptors of the weights abc, found those of xyz"):
+            refused()
+    with pytest.raises(ValueError, match="compared by l2, found cosine"):
+        index.add_file(dataclasses.replace(file_of(3, weights_hash="abc"), distance="cosine"))
+    with pytest.raises(ValueError, match=r"shape \(1, 8\), found \(1, 9\)"):
+        index.query(np.zeros((1, 9), np.float32))
+
+
+def test_a_descriptor_file_becomes_an_index():
+    index = Index.of(file_of(7))
+    assert index.ids == list(file_of(7).ids) and index.weights_hash == "abc" and index.positions is None
+    np.testing.assert_array_equal(index.times, file_of(7).times)
+
+
+def test_what_does_not_fit_is_refused_and_changes_nothing():
+    index = index_of(5)
+    for wrong, message in (
+        ({"times": np.zeros(1)}, "expected places with descriptors, times, positions"),
+        ({"times": np.zeros(2), "positions": np.zeros((1, 3))}, "times of shape"),
+        ({"times": np.array([np.nan]), "positions": np.zeros((1, 3))}, "finite times"),
+        ({"ids": ("a", "b")}, "expected 1 ids"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            index.add(draw(1), **wrong)
+    with pytest.raises(ValueError, match="finite descriptors"):
+        index.query(np.full(WIDTH, np.nan, np.float32))
+    with pytest.raises(ValueError, match="k of 1 or more"):
+        index.query(draw(1), 0)
+    with pytest.raises(ValueError, match="one flag for each of 5"):
+        index.query(draw(1), exclude=np.zeros(4, bool))
+    with pytest.raises(ValueError, match="expected a distance among"):
+        Index.empty(WIDTH, distance="nearness")
+    assert len(index) == 5
+
+
+def file_of(n: int, *, weights_hash: str = "abc") -> DescriptorFile:
+    return DescriptorFile(
+        sequence="00",
+        ids=tuple(f"frame{i}" for i in range(n)),
+        positions=None,
+        times=np.arange(n) / 2,
+        descriptors=draw(n),
+        pose_source=None,
+        config={},
+        weights_hash=weights_hash,
+    )
