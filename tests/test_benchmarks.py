@@ -48,6 +48,14 @@ def test_rasterize_agrees_with_numpy_and_prints_ratios():
     assert "--points 2000" in output
 
 
+def test_allocator_prints_ratios_and_what_each_setting_costs(tmp_path):
+    (tmp_path / "preset.py").write_text(PRESET)
+    options = ("--preset", str(tmp_path / "preset.py"), "--repeats", "2", "--steps", "1", "--points", "50")
+    output = printed("allocator.py", *options, "--threads", "1")
+    assert "as it comes: " in output and "kept: " in output and output.count("page faults a step") == 2
+    assert "Below 1 kept is faster" in output
+
+
 def test_simulate_prints_its_rate_and_where_the_time_goes():
     output = printed("simulate.py", "--sensor", "vlp16", "--azimuth-steps", "90", "--scans", "2", "--repeats", "1")
     for words in ("cull", "cast", "returns", "copy", "2 thread(s):", "scans per second", "Shapes in range", "vlp16"):
