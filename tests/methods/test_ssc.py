@@ -193,3 +193,9 @@ def test_scans_without_landmarks_can_be_compared(classes):
     row = ssc(points, classes.astype(np.int32))[None]
     # Classes that move or have no label leave nothing to compare; road is compared without being aligned.
     np.testing.assert_array_equal(ssc_distance(row, row), [[0.0 if classes[0] == 9 else 1.0]])
+
+
+def test_rows_of_other_rings_are_refused():
+    rows = np.zeros((2, NEWEST.numbers), np.float32)
+    with pytest.raises(ValueError, match="expected rows of 31680 numbers .50 rings., found 17280"):
+        ssc_distance(rows, rows)

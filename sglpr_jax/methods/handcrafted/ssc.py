@@ -121,6 +121,8 @@ def ssc_distance(
 
 
 def _prepare(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Scans:
+    if rows.shape[1] != grid.numbers:
+        raise ValueError(f"expected rows of {grid.numbers} numbers ({grid.rings} rings), found {rows.shape[1]}")
     packed, outlines = rows[:, : -2 * SECTORS].astype(np.int32), rows[:, -2 * SECTORS :].reshape(-1, 2, SECTORS)
     fine = (packed[..., None] >> RANK_BITS * np.arange(PACKED)) % (1 << RANK_BITS)
     fine = fine.reshape(-1, grid.fine_rings, FINE_SECTORS)
