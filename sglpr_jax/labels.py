@@ -190,14 +190,6 @@ def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32
     return classes
 
 
-def check_raw_ids(raw: Int[np.ndarray, "*shape"], *, source: object) -> None:
-    """Raise ValueError, which names `source`, where raw SemanticKITTI ids do not exist."""
-    try:
-        to_classes(raw)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
-
-
 def to_raw(classes: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
     """Return a raw SemanticKITTI id of each class; `to_classes` with the same categories gives the classes back."""
     return taxonomy(categories).raw_of[classes]

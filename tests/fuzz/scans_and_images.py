@@ -6,13 +6,16 @@ import struct
 import zlib
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from sglpr_jax.data.formats.grey_png import read_grey_png
 from sglpr_jax.data.formats.label_images import read_label_image
-from sglpr_jax.data.formats.scan_files import read_labels, read_scan
+from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.record import scan_record
+from sglpr_jax.labels import to_classes
 
 from .damage import (
     BYTES,
@@ -64,7 +67,9 @@ def odd_size(content: bytes, draw: Random) -> Damaged:
 
 
 def _same_labels(found: np.ndarray, content: bytes) -> bool:
-    return len(content) == 4 * N and np.array_equal(found, np.frombuffer(content, "<u4") & 0xFFFF)
+    return len(content) == 4 * N and np.array_equal(
+        found, to_classes((np.frombuffer(content, "<u4") & 0xFFFF).astype(np.int32))
+    )
 
 
 def _same_points(found: np.ndarray, content: bytes) -> bool:
@@ -126,6 +131,10 @@ def _same_pcd(found: np.ndarray, content: bytes) -> bool:
     return np.array_equal(found, POINTS[:, :3])
 
 
+def _read_classes(path: Path) -> Any:
+    return scan_record(path.with_suffix(".bin"), path).classes(20)
+
+
 def _read_image(path: Path) -> np.ndarray:
     return read_grey_png(path, bits=8)
 
@@ -149,9 +158,10 @@ ROADS = (
         "labels",
         "1.label",
         LABELS.tobytes(),
-        lambda path: read_labels(path, points=N),
+        _read_classes,
         _same_labels,
         {**BYTES, "ids": other_labels},
+        {"1.bin": POINTS.tobytes()},
     ),
     Road("scan .bin", "1.bin", POINTS.tobytes(), read_scan, _same_points, {**BYTES, "size": odd_size}),
     Road("scan .pcd, binary", "1.pcd", PCD_BINARY, read_scan, _same_pcd, PCD),

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int, Int32, UInt16
 
 from sglpr_jax.data.formats.grey_png import read_grey_png
-from sglpr_jax.labels import check_raw_ids
+from sglpr_jax.labels import to_classes
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
@@ -25,7 +25,10 @@ def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray,
     if raw.shape != shape:
         expected, found = (f"{rows} rows of {columns} pixels" for columns, rows in (shape, raw.shape))
         raise ValueError(f"{path}: expected {expected}, as the image has, found {found}")
-    check_raw_ids(raw, source=path)
+    try:
+        to_classes(raw)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return raw
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.formats.pcd import read_pcd
-from sglpr_jax.labels import check_raw_ids
 
 ScanFormat = Literal["auto", "kitti", "nuscenes", "nclt", "pcd"]
 
@@ -96,15 +95,12 @@ def _read_records(path: Path, format: str) -> np.ndarray:
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:
     """Return the raw SemanticKITTI ids (n,) of a .label file; the instance number in the upper 16 bits is dropped.
 
-    Raises FileNotFoundError, and ValueError where the file has not 4 bytes for each of the scan's `points`, or holds
-    ids that do not exist.
+    Raises FileNotFoundError, and ValueError where the file has not 4 bytes for each of the scan's `points`.
     """
     size = _size(path)
     if size != 4 * points:
         raise ValueError(f"{path}: expected {points} labels of 4 bytes, one per point of its scan, found {size} bytes")
-    raw = (np.fromfile(path, dtype="<u4") & 0xFFFF).astype(np.int32)
-    check_raw_ids(raw, source=path)
-    return raw
+    return (np.fromfile(path, dtype="<u4") & 0xFFFF).astype(np.int32)
 
 
 def _size(path: Path) -> int:
