@@ -63,7 +63,7 @@ def parse_json(text: str | bytes, *, source: Path | str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_without_doubles)
     except (ValueError, RecursionError) as error:  # not JSON, not even text, or brackets without end
-        raise ValueError(f"{source}: expected JSON, found none that is whole ({error})") from error
+        raise ValueError(f"{source}: expected JSON, found none that is whole ({in_short(error)})") from error
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -85,11 +85,21 @@ def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
         raise ValueError(f"{expected}, found {path.stat().st_size} bytes that are no whole .npz archive")
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
     except MemoryError as error:  # a header that promises more than there is
         raise ValueError(f"{expected}, found a broken one: an array larger than the memory") from error
     except Exception as error:  # zip, zlib, numpy's header parser: each has kinds of its own
-        raise ValueError(f"{expected}, found a broken one: {error}") from error
+        raise ValueError(f"{expected}, found a broken one: {in_short(error)}") from error
+    strange = next((name for name, array in arrays.items() if not isinstance(array, np.ndarray)), None)
+    if strange is not None:  # numpy gives what is no array as bytes
+        raise ValueError(f"{expected}, found a file {strange!r} that is no array")
+    return arrays
+
+
+def in_short(error: Exception) -> str:
+    """What an error of another library says, on one line of at most 100 characters."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 @contextlib.contextmanager

@@ -5,12 +5,10 @@ import shutil
 import sys
 from pathlib import Path
 
-import tyro
-
 from sglpr_jax.cli.datasets import simulate
 from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
-from sglpr_jax.cli.runtime import run
+from sglpr_jax.cli.runtime import own_names, parse_command, run
 from sglpr_jax.cli.train import TrainCommand, train_and_test
 from sglpr_jax.evaluation.page.writing import PAGE
 from sglpr_jax.training.presets import load_preset
@@ -44,7 +42,7 @@ def demo(command: DemoCommand) -> Path:
     config = load_preset("demo")
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
     train_and_test(TrainCommand(seq=TESTED, data=town, preset="demo", out=trained, config=config))
-    print("\nthe same by hand: bin/embed, then bin/evaluate", file=sys.stderr)
+    print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
     descriptors = embed_recording(
         EmbedCommand(data=town, seq=TESTED, weights=str(trained), out=command.out / f"{TESTED}.npz")
     )
@@ -57,7 +55,7 @@ def demo(command: DemoCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: demo(tyro.cli(DemoCommand, prog="demo")))
+    run(lambda: demo(parse_command(DemoCommand, "demo")))
 
 
 if __name__ == "__main__":

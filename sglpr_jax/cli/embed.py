@@ -4,10 +4,8 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import tyro
-
 from sglpr_jax.cli.datasets import open_recording
-from sglpr_jax.cli.runtime import progress_bar, run
+from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat
 from sglpr_jax.data.reader import PoseChoice, SensorHeight
@@ -97,7 +95,7 @@ def _report(scan: str, error: Exception) -> None:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: embed_recording(tyro.cli(EmbedCommand, prog="embed")))
+    run(lambda: embed_recording(parse_command(EmbedCommand, "embed")))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.runtime import console, run
+from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat, read_trajectory
@@ -145,7 +145,7 @@ def _folder(file: Path) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: evaluate_file(tyro.cli(EvaluateCommand, prog="evaluate")))
+    run(lambda: evaluate_file(parse_command(EvaluateCommand, "evaluate")))
 
 
 if __name__ == "__main__":

@@ -4,10 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
 from sglpr_jax.bev import ImageKind
-from sglpr_jax.cli.runtime import progress_bar, run
+from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.program import ProgramFormat, save_program
@@ -36,7 +34,7 @@ class ExportCommand:
     half: bool = False
     """Store float16 numbers, in half the room; they are read as float32."""
     keep_segmentation: bool = False
-    """Keep the segmentation head, for bin/segment."""
+    """Keep the segmentation head, for semantic maps."""
     image: ImageKind | None = None
     """What raw scans are made into, where config.json says something else: `density` for weights that were trained on
     ready-made density images."""
@@ -73,7 +71,7 @@ def export(command: ExportCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: export(tyro.cli(ExportCommand, prog="export")))
+    run(lambda: export(parse_command(ExportCommand, "export")))
 
 
 if __name__ == "__main__":

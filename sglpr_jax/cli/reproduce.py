@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.datasets import cached_sessions, dataset_root
-from sglpr_jax.cli.runtime import console, preset_asked_for, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import console, parse_command, preset_asked_for, progress_bar, run, stop_on_signal
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data import recording_names
 from sglpr_jax.data.readers.kitti import PoseChoice
@@ -70,7 +70,7 @@ def parse(arguments: list[str] | None = None) -> ReproduceCommand:
     """Defaults, overridden by the preset, overridden by the flags."""
     preset = preset_asked_for(arguments, default=ReproduceCommand.preset)
     default = ReproduceCommand(what=(), preset=preset, config=load_preset(preset))
-    return tyro.cli(ReproduceCommand, args=arguments, default=default, prog="reproduce")
+    return parse_command(ReproduceCommand, "reproduce", arguments, default=default)
 
 
 def reproduce(command: ReproduceCommand) -> Path:

@@ -3,21 +3,26 @@
 import argparse
 import contextlib
 import dataclasses
+import inspect
 import logging
 import os
+import re
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
 import jax
+import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.data.warning import DataWarning
 
 _TABLE_WIDTH = 140
+T = TypeVar("T")
 
 
 def cache_folder() -> Path:
@@ -30,6 +35,18 @@ def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
     chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     chooser.add_argument("--preset", default=default)
     return chooser.parse_known_args(arguments)[0].preset
+
+
+def own_names(text: str) -> str:
+    """`text` with the commands as whoever started this one knows them: sglpr-embed, where bin/embed is not there."""
+    installed = Path(sys.argv[0]).name.startswith("sglpr-")
+    return re.sub(r"\bbin/(\w+)", r"sglpr-\1", text) if installed else text
+
+
+def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:
+    """What the flags say; the help speaks of the commands by their own names. `options` are those of `tyro.cli`."""
+    about = {"prog": own_names(f"bin/{name}"), "description": own_names(inspect.getdoc(command) or ""), **options}
+    return tyro.cli(command, args=arguments, **about)
 
 
 def run(command: Callable[[], object]) -> None:
@@ -47,7 +64,7 @@ def run(command: Callable[[], object]) -> None:
     try:
         command()
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
-        sys.exit(f"error: {' '.join(str(error).split())}")
+        sys.exit(own_names(f"error: {' '.join(str(error).split())}"))
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -4,10 +4,9 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from sglpr_jax.cli.datasets import open_recording
-from sglpr_jax.cli.runtime import console, progress_bar, run
+from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.reader import SensorHeight
 from sglpr_jax.evaluation.segmentation import map_confusion
@@ -77,7 +76,7 @@ def segment_recording(command: SegmentCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: segment_recording(tyro.cli(SegmentCommand, prog="segment")))
+    run(lambda: segment_recording(parse_command(SegmentCommand, "segment")))
 
 
 if __name__ == "__main__":

@@ -3,10 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-import tyro
-
 from sglpr_jax.cli.datasets import simulate
-from sglpr_jax.cli.runtime import run
+from sglpr_jax.cli.runtime import parse_command, run
 from sglpr_jax.sim.drive import RATE_HZ
 from sglpr_jax.sim.simulation import SCANS
 
@@ -53,7 +51,7 @@ def write_simulation(command: SimulateCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: write_simulation(tyro.cli(SimulateCommand, prog="simulate")))
+    run(lambda: write_simulation(parse_command(SimulateCommand, "simulate")))
 
 
 if __name__ == "__main__":

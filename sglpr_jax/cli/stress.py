@@ -4,10 +4,8 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import tyro
-
 from sglpr_jax.cli.datasets import open_recording
-from sglpr_jax.cli.runtime import console, progress_bar, run
+from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.formats.trajectory import PoseFormat
@@ -37,7 +35,7 @@ class StressCommand:
     weights: str | None = None
     """The name of shipped weights or a training run's folder: the network is among the methods."""
     method: tuple[MethodName, ...] = ()
-    """Methods that need no weights, as in bin/embed."""
+    """Methods that need no weights."""
     protocol: tuple[str, ...] = ()
     """Their names, or `all`. None named: top1-f1max and pairs-f1max."""
     corruption: tuple[str, ...] = ()
@@ -99,7 +97,7 @@ def run_stress_test(command: StressCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: run_stress_test(tyro.cli(StressCommand, prog="stress")))
+    run(lambda: run_stress_test(parse_command(StressCommand, "stress")))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,16 @@ from typing import Annotated
 import tyro
 
 from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out
-from sglpr_jax.cli.runtime import StopRequest, console, preset_asked_for, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import (
+    StopRequest,
+    console,
+    own_names,
+    parse_command,
+    preset_asked_for,
+    progress_bar,
+    run,
+    stop_on_signal,
+)
 from sglpr_jax.data import Recording
 from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 from sglpr_jax.data.readers.kitti import PoseChoice
@@ -49,7 +58,7 @@ class TrainCommand:
     """Further datasets, all of whose recordings are trained on, with --also-tuples of a step's tuples: simulated scans
     or images with labels, say, beside real images without."""
     pseudo_labels: Path | None = None
-    """Label images NN/<id>.png that bin/segment made of the images of --data, for its recordings without labels of
+    """Label images NN/<id>.png that a model made of the images of --data, for its recordings without labels of
     their own; never for the one tested."""
     preset: str = "small"
     """A file of configs/ by name, or a path to one of your own."""
@@ -86,7 +95,7 @@ def parse(arguments: list[str] | None = None) -> TrainCommand:
     preset = preset_asked_for(arguments, default=TrainCommand.preset)
     description = f"{TrainCommand.__doc__}\nPresets: {', '.join(preset_names())}"
     default = TrainCommand(preset=preset, config=load_preset(preset))
-    command = tyro.cli(TrainCommand, args=arguments, default=default, prog="train", description=description)
+    command = parse_command(TrainCommand, "train", arguments, default=default, description=own_names(description))
     return dataclasses.replace(command, config=without_untrained_head(command.config))
 
 

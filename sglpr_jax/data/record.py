@@ -24,6 +24,8 @@ class Record:
     """In the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
     labels: Int32[np.ndarray, "..."] | None = None
     """Raw SemanticKITTI ids, one per point or pixel; 0 is a point or pixel whose class is not known."""
+    labels_file: Path | None = None
+    """Where they were read from, for messages."""
     lasers: Int32[np.ndarray, " n"] | None = None
     """The number of the laser that each point is from, where the file says so."""
     name: str = ""
@@ -48,8 +50,16 @@ class Record:
         return () if seen is None else seen.shape
 
     def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
-        """The class of every point or pixel among so many (docs/reference/labels.md), or None without labels."""
-        return None if self.labels is None else to_classes(self.labels, categories=categories)
+        """The class of every point or pixel among so many (docs/reference/labels.md), or None without labels.
+
+        Raises ValueError, naming the file of the labels where it is known, for ids that do not exist.
+        """
+        if self.labels is None:
+            return None
+        try:
+            return to_classes(self.labels, categories=categories)
+        except ValueError as error:
+            raise ValueError(f"{self.labels_file or self.name}: {error}") from error
 
 
 ReadRecord = Callable[[Path, Path | None, bool], Record]
@@ -70,7 +80,7 @@ def scan_record(
     """
     points, laser_of_point = read_points_and_lasers(path, format=format, records=records)
     raw = None if labels is None else read_labels(labels, points=len(points))
-    return Record(points=points, labels=raw, lasers=laser_of_point if lasers else None)
+    return Record(points=points, labels=raw, labels_file=labels, lasers=laser_of_point if lasers else None)
 
 
 def image_record(

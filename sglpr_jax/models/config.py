@@ -55,12 +55,12 @@ class HeadConfig:
         check_fields(self)
         if not len(self.channels) == len(self.kernels) == len(self.strides):
             raise ValueError(
-                "the head needs as many kernels and strides as channels, found "
+                "expected as many kernels and strides as channels of the head, found "
                 f"channels {self.channels}, kernels {self.kernels}, strides {self.strides}"
             )
         if self.means and (len(self.means) != len(self.channels) or set(self.kernels) != {3}):
             raise ValueError(
-                "a head that goes around needs a number of sectors for each convolution and 3 x 3 kernels, found "
+                "expected a number of sectors for each convolution and 3 x 3 kernels of a head that goes around, found "
                 f"means {self.means}, kernels {self.kernels}"
             )
 
@@ -125,7 +125,7 @@ class ModelConfig:
                 f"blind_m: expected less than the {reach_m:g} m that the image reaches, found {self.blind_m}"
             )
         if self.head.reads_labels and not self.categories:
-            raise ValueError(f"a head that reads {self.head.input} needs categories of labels, found 0")
+            raise ValueError(f"expected categories of labels for a head that reads {self.head.input}, found 0")
         if self.image == "density":
             check_density_grid(self.grid)
         if self.polar and self.field != "circle":
@@ -140,7 +140,8 @@ class ModelConfig:
         rows_and_columns = zip(self.image_size, self.backbone.multiple, strict=True)
         if any(size % step for size, step in rows_and_columns):
             raise ValueError(
-                f"the backbone's image must be a multiple of {self.backbone.multiple} cells, found {self.image_size}"
+                f"expected an image of a multiple of {self.backbone.multiple} cells, as the backbone needs, "
+                f"found {self.image_size}"
             )
 
     @property

@@ -1,6 +1,7 @@
 """Weights by name: which ones a model has, parts of them, and one number for all of them."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Mapping
 from typing import Any
@@ -24,6 +25,7 @@ def as_tree(named: dict[str, Any]) -> Any:
     return flax.traverse_util.unflatten_dict(named, sep="/")
 
 
+@functools.cache
 def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     """The shape of every weight that the configuration asks for; nothing is computed."""
     fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))

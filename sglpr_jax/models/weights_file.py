@@ -9,7 +9,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from sglpr_jax.files import read_json, replacing
+from sglpr_jax.files import in_short, read_json, replacing
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.config_dict import config_from_dict
 from sglpr_jax.models.params import Params
@@ -78,11 +78,14 @@ def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
                     raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)}, found {part.get_dtype()}")
             values, metadata = {name: file.get_tensor(name) for name in about}, file.metadata() or {}
     except safetensors.SafetensorError as error:
-        raise ValueError(f"{path}: not a whole safetensors file ({error})") from error
+        raise ValueError(
+            f"{path}: expected a whole safetensors file, found a damaged one ({in_short(error)})"
+        ) from error
     for name, leaf in values.items():
         _check_finite(name, leaf, source=path)
-    if metadata.get(CHECKSUM, found := hash_of(values)) != found:
-        raise ValueError(f"{path}: expected weights of SHA-256 {metadata[CHECKSUM]}, found {found}: it is damaged")
+    if metadata and metadata.get(CHECKSUM) != (found := hash_of(values)):  # files handed out before have no metadata
+        said = metadata.get(CHECKSUM, "none")
+        raise ValueError(f"{path}: expected weights of SHA-256 {said}, as its header says, found {found}")
     return values
 
 
@@ -92,7 +95,7 @@ def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, 
     if expected != found:
         name = min(set(expected.items()) ^ set(found.items()))[0]
         raise ValueError(
-            f"{source}: not the weights of its configuration: {name} should have shape "
+            f"{source}: expected the weights of its configuration, {name} of shape "
             f"{expected.get(name, 'none (no such weight)')}, found {found.get(name, 'none (missing)')}"
         )
 

@@ -78,7 +78,7 @@ def test_a_colour_image_is_refused(tmp_path):
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(ValueError, match=r"a\.png: expected an 8-bit grey PNG \(mode L\), found mode RGB"):
         read_image(tmp_path / "a.png")
-    with pytest.raises(FileNotFoundError, match=r"b\.png: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"b\.png: expected an image, found no such file"):
         read_image(tmp_path / "b.png")
 
 

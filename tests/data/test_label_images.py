@@ -64,5 +64,5 @@ def test_a_cut_off_map_is_named(path, kept):
 
 
 def test_a_missing_map_is_named(path):
-    with pytest.raises(FileNotFoundError, match=r"000007\.png: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"000007\.png: expected an image, found no such file"):
         read_label_image(path, shape=(7, 5))

@@ -90,5 +90,5 @@ def test_every_weight_is_trained(params):
 
 
 def test_a_patch_that_the_stem_does_not_divide_is_refused():
-    with pytest.raises(ValueError, match=r"stem of 4 widths makes pixels of 8 cells.*found patch 4"):
+    with pytest.raises(ValueError, match=r"the stem's pixels of 8 cells \(4 widths\), found patch 4"):
         SwinConfig(stem=(8, 8, 8, 8))

@@ -96,7 +96,7 @@ def test_a_folder_that_does_not_exist_is_named(tmp_path):
 def test_damaged_weights_are_named(params, tmp_path, damage):
     folder = save(params, tmp_path / "weights")
     (folder / WEIGHTS_FILE).write_bytes(damage((folder / WEIGHTS_FILE).read_bytes()))
-    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: not a whole safetensors file"):
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected a whole safetensors file, found a damaged one"):
         load(folder)
 
 
@@ -129,7 +129,7 @@ def test_a_damaged_configuration_is_named(params, tmp_path, text, expected):
 def test_the_weights_of_another_preset_are_refused(params, tmp_path):
     folder = save(params, tmp_path / "weights")
     (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("demo"))))
-    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: not the weights of its configuration: \S+ should have"):
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected the weights of its configuration, \S+ of shape"):
         load(folder)
 
 
@@ -137,13 +137,11 @@ def test_a_weight_too_many_or_too_few_is_named(params, tmp_path):
     folder = save(params, tmp_path / "weights")
     flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
     safetensors.numpy.save_file({**flat, "extra": np.zeros(3, np.float32)}, folder / WEIGHTS_FILE)
-    with pytest.raises(ValueError, match=r"extra should have shape none \(no such weight\), found \(3,\)"):
+    with pytest.raises(ValueError, match=r"extra of shape none \(no such weight\), found \(3,\)"):
         load(folder)
     kernel = flat.pop("segmentation_head/kernel")
     safetensors.numpy.save_file(flat, folder / WEIGHTS_FILE)
-    with pytest.raises(
-        ValueError, match=rf"segmentation_head/kernel should have shape \({kernel.shape[0]}, 20\), found none"
-    ):
+    with pytest.raises(ValueError, match=rf"segmentation_head/kernel of shape \({kernel.shape[0]}, 20\), found none"):
         load(folder)
 
 
@@ -194,7 +192,7 @@ def test_weights_of_other_names_or_shapes_are_not_written(params, tmp_path):
     kernel = params.weights["segmentation_head"]["kernel"]
     for head in ({}, {"kernel": kernel, "bias": kernel}, {"kernel": kernel[:-1]}):
         with pytest.raises(
-            ValueError, match=r"new: not the weights of its configuration: segmentation_head/\w+ should"
+            ValueError, match=r"new: expected the weights of its configuration, segmentation_head/\w+ of shape"
         ):
             save(Params({**params.weights, "segmentation_head": head}, params.config), tmp_path / "new")
     assert not any(tmp_path.iterdir())
@@ -206,5 +204,5 @@ def test_one_flipped_bit_of_the_weights_is_found(params, tmp_path, half):
     content = bytearray((folder / WEIGHTS_FILE).read_bytes())
     content[-1000] ^= 1
     (folder / WEIGHTS_FILE).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected weights of SHA-256 \w+, found \w+: it is damaged"):
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected weights of SHA-256 .*, found "):
         load(folder)

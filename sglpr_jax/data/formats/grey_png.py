@@ -1,12 +1,20 @@
 """Grey PNGs of BEVPlace's layout. Their rows run backwards; eq. 1 has x (forward) to the right and y (left) up."""
 
+import io
+import struct
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt
 from PIL import Image
 
+from sglpr_jax.files import in_short
+
 _MODES = {8: "L", 16: "I;16"}
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+LARGEST_SIDE = 1 << 14
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
@@ -15,13 +23,49 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
     Raises FileNotFoundError, and ValueError where the file is no whole grey image of so many `bits` (8 or 16) a pixel.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: expected an image, found no such file")
     expected = f"{'an 8' if bits == 8 else 'a 16'}-bit grey PNG"
     try:
-        with Image.open(path) as image:
+        content = path.read_bytes()
+        _check_whole(content)
+        with Image.open(io.BytesIO(content)) as image:
             mode, grey = image.mode, np.asarray(image)
-    except (OSError, SyntaxError) as error:  # what Pillow raises for a cut-off or broken PNG
-        raise ValueError(f"{path}: expected {expected}, found no such image ({error})") from error
+    except (ValueError, OSError, SyntaxError, struct.error, zlib.error) as error:
+        raise ValueError(f"{path}: expected {expected}, found no such image ({in_short(error)})") from error
     if mode != _MODES[bits]:
         raise ValueError(f"{path}: expected {expected} (mode {_MODES[bits]}), found mode {mode}")
     return np.rot90(grey, -1)
+
+
+def _check_whole(content: bytes) -> None:
+    """Raise ValueError where a checksum is wrong or pixels are missing: Pillow passes over both, and over these alone.
+
+    Interlaced images, which nothing here writes, have their checksums looked at and not their pixels counted.
+    """
+    if not content.startswith(_SIGNATURE):
+        raise ValueError("it does not begin as a PNG")
+    chunks = list(_chunks(content))
+    if not chunks or chunks[0][0] != b"IHDR" or chunks[-1][0] != b"IEND":
+        raise ValueError("its header or its end is missing")
+    width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", chunks[0][1])
+    if max(width, height) > LARGEST_SIDE:
+        raise ValueError(f"it promises {width} x {height} pixels")
+    pixels = zlib.decompress(b"".join(data for kind, data in chunks if kind == b"IDAT"))
+    channels = {2: 3, 4: 2, 6: 4}.get(colour, 1)
+    if not interlaced and len(pixels) != height * (1 + (width * channels * depth + 7) // 8):
+        raise ValueError(f"it promises {width} x {height} pixels and has others")
+
+
+def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """The kind and the data of each part of a PNG."""
+    at = len(_SIGNATURE)
+    while at < len(content):
+        (size,) = struct.unpack_from(">I", content, at)
+        kind, data = content[at + 4 : at + 8], content[at + 8 : at + 8 + size]
+        (checksum,) = struct.unpack_from(">I", content, at + 8 + size)
+        if zlib.crc32(kind + data) != checksum:
+            raise ValueError(f"the checksum of its part {kind!r} is wrong")
+        yield kind, data
+        at += 12 + size
+        if kind == b"IEND":
+            return

@@ -21,7 +21,7 @@ def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
     try:
         return _decode(path.read_bytes())
     except (ValueError, TypeError) as error:  # TypeError: numpy knows no such TYPE
-        raise ValueError(f"{path}: not a readable .pcd file: {error}") from error
+        raise ValueError(f"{path}: expected a .pcd file that can be read, found: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,11 @@ def _parse_header(text: str) -> _Header:
         raise ValueError(f"expected one SIZE, TYPE and COUNT for each of {len(fields)} FIELDS, found others")
     if int(words["POINTS"][0]) < 1:
         raise ValueError(f"expected at least one point, found POINTS {words['POINTS'][0]}")
+    width, height = (words.get(side) or ["1"] for side in ("WIDTH", "HEIGHT"))
+    if "WIDTH" in words and int(width[0]) * int(height[0]) != int(words["POINTS"][0]):
+        raise ValueError(f"expected POINTS of WIDTH x HEIGHT, {width[0]} x {height[0]}, found {words['POINTS'][0]}")
+    if any(int(count) < 1 for count in counts):
+        raise ValueError(f"expected a COUNT of 1 or more for each field, found {' '.join(counts)}")
     return _Header(
         points=int(words["POINTS"][0]),
         fields=tuple(fields),

@@ -107,10 +107,13 @@ def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.nd
     """Return words as numbers; ValueError, which begins with `where`, unless there are `columns` finite ones."""
     if len(words) != columns:
         raise ValueError(f"{where}: expected {columns} numbers, found {len(words)}")
+    text = " ".join(words)
     try:
         values = np.array(words, dtype=np.float64)
     except ValueError as error:
-        raise ValueError(f"{where}: expected numbers, found {' '.join(words)!r}") from error
+        raise ValueError(f"{where}: expected numbers, found {text!r:.200}") from error
+    if "_" in text or not text.isascii():  # Python takes 1_0 for 10
+        raise ValueError(f"{where}: expected numbers, found {text!r:.200}")
     if not np.isfinite(values).all():
-        raise ValueError(f"{where}: expected finite numbers, found {' '.join(words)!r}")
+        raise ValueError(f"{where}: expected finite numbers, found {text!r:.200}")
     return values

@@ -25,6 +25,9 @@ from sglpr_jax.data.recording import Recording
 MAX_GAP_S = 0.5
 """A scan without a pose this near in time is left out. A Segway goes half a metre in it."""
 
+LATEST_US = 1e17
+"""Times beyond the year 5000 are none."""
+
 _DATE = "[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]"
 _COLUMNS = ("utime", "x", "y", "z", "roll", "pitch", "yaw")
 
@@ -74,6 +77,9 @@ def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.nda
     known = np.isfinite(rows).all(axis=1)
     if not known.any():
         raise ValueError(f"{path}: expected poses, found NaN in all {len(rows)} rows")
+    late = np.flatnonzero(known & (np.abs(rows[:, 0]) > LATEST_US))
+    if late.size:
+        raise ValueError(f"{path}: expected times in microseconds, found {rows[late[0], 0]:g} in row {late[0] + 1}")
     stamps = rows[known, 0].astype(np.int64)
     backwards = np.flatnonzero(np.diff(stamps) < 0)
     if backwards.size:

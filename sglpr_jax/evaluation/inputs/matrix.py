@@ -8,6 +8,7 @@ from jaxtyping import Num
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors
 from sglpr_jax.evaluation.inputs.positions import needed
+from sglpr_jax.files import in_short
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
@@ -30,8 +31,10 @@ def _load(path: Path) -> Num[np.ndarray, "n d"]:
     try:
         with path.open("rb") as stream:
             rows = np.lib.format.read_array(stream, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{expected}, found no such .npy ({error})") from error
+    except MemoryError as error:
+        raise ValueError(f"{expected}, found an array larger than the memory") from error
+    except Exception as error:  # numpy parses the header as Python, with all that this can raise
+        raise ValueError(f"{expected}, found no such .npy ({in_short(error)})") from error
     if rows.ndim != 2 or rows.dtype.kind not in "fiub" or rows.size == 0:
         raise ValueError(f"{expected}, found {rows.dtype} {rows.shape}")
     return rows

@@ -24,7 +24,7 @@ def as_frame(word: str, where: str) -> int:
 def as_score(word: str, where: str) -> float:
     """Return a finite number; ValueError, which begins with `where`, for anything else."""
     try:
-        score = float(word)
+        score = float(word if word.isascii() and "_" not in word else "")  # Python takes 1_0 for 10
     except ValueError as error:
         raise ValueError(f"{where}: expected a score, found {word!r}") from error
     if not np.isfinite(score):

@@ -39,7 +39,7 @@ class RingConfig:
             raise ValueError("widths: expected at least one block, found ()")
         if not len(self.widths) == len(self.strides) == len(self.means):
             raise ValueError(
-                "the ring net needs as many strides and means as widths, found "
+                "expected as many strides and means as widths of the ring net, found "
                 f"widths {self.widths}, strides {self.strides}, means {self.means}"
             )
 

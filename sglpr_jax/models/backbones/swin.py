@@ -37,8 +37,8 @@ class SwinConfig:
         check_stages(self.embed_dim, self.depths, self.heads)
         if self.patch % self._stem_pixel:
             raise ValueError(
-                f"a stem of {len(self.stem)} widths makes pixels of {self._stem_pixel} cells, of which a "
-                f"patch must be made, found patch {self.patch}"
+                f"expected a patch made of the stem's pixels of {self._stem_pixel} cells ({len(self.stem)} widths), "
+                f"found patch {self.patch}"
             )
 
     @property

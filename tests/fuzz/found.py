@@ -1,0 +1,67 @@
+"""What the fuzzer has found, kept: damaged files that once were read wrongly or ended in a traceback."""
+
+import io
+import json
+import zipfile
+import zlib
+
+from .archives import DESCRIPTOR_FILE
+from .damage import Damaged, safetensors_file, safetensors_parts
+from .roads import ROADS
+from .scans_and_images import PCD_BINARY
+
+
+def _replaced(road: str, old: bytes, new: bytes) -> Damaged:
+    whole = ROADS[road].whole
+    assert old in whole, (road, old)
+    return Damaged(whole.replace(old, new, 1))
+
+
+def _member_that_is_no_array() -> Damaged:
+    """numpy gives it as bytes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(DESCRIPTOR_FILE)) as whole, zipfile.ZipFile(stream, "w") as damaged:
+        for name in whole.namelist():
+            damaged.writestr(name, b"no array" if name == "descriptors.npy" else whole.read(name))
+    return Damaged(stream.getvalue())
+
+
+def _picture_that_promises_more(road: str, height: int) -> Damaged:
+    """Pillow filled the missing rows with whatever was in memory."""
+    whole = ROADS[road].whole
+    header = whole[12:20] + height.to_bytes(4, "big") + whole[24:29]
+    return Damaged(whole[:12] + header + zlib.crc32(header).to_bytes(4, "big") + whole[33:])
+
+
+def _checksum_without_its_name() -> Damaged:
+    header, body = safetensors_parts(ROADS["weights"].whole)
+    header["__metadata__"] = {"shA256": header["__metadata__"]["sha256"]}
+    return Damaged(safetensors_file(header, bytes([body[0] ^ 1]) + body[1:]))
+
+
+def _configuration(**changes: object) -> Damaged:
+    return Damaged(json.dumps({**json.loads(ROADS["configuration"].whole), **changes}).encode())
+
+
+FOUND = (
+    ("matrix", _replaced("matrix", b"(5, 4)", b"(5, 4+")),
+    ("matrix", _replaced("matrix", b"(5, 4)", b"(55555555555555, 4)")),
+    ("descriptor file", _member_that_is_no_array()),
+    ("scored pairs", _replaced("scored pairs", b"0.5", b"1_0")),
+    ("KITTI poses", _replaced("KITTI poses", b"1 0 0", "１ 0 0".encode())),
+    ("csv poses", _replaced("csv poses", b"0.5", b"1_0")),
+    ("NCLT ground truth", _replaced("NCLT ground truth", b"1326652795280148", b"1e30")),
+    ("metrics", _replaced("metrics", b'{"step": 2', b'"step": 2')),
+    ("configuration", _configuration(backbone={"kind": ["swin"]})),
+    ("configuration", _configuration(image="Density")),
+    ("configuration", _configuration(blind_m=float("nan"))),
+    ("configuration", Damaged(b"[" * 100_000)),
+    ("weights", _checksum_without_its_name()),
+    ("image", _picture_that_promises_more("image", 6000)),
+    ("image", _picture_that_promises_more("image", 2**31 - 1)),
+    ("label image", _picture_that_promises_more("label image", 7)),
+    ("labels", Damaged(b"\x4d\0\0\0" * 5)),
+    ("scan .pcd, binary", Damaged(PCD_BINARY.replace(b"COUNT 1", b"COUNT 0", 1))),
+    ("scan .pcd, binary", Damaged(PCD_BINARY.replace(b"POINTS 5", b"POINTS 1", 1))),
+)
+"""The road, and the file."""

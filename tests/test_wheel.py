@@ -1,0 +1,69 @@
+"""What `pip install` gives works without the checkout, and speaks of its commands by the names that it installs."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = ("train", "embed", "evaluate", "segment", "simulate")
+TIMEOUT_S = 600
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """Runs the commands of a wheel in an environment of its own, far from the checkout.
+
+    The dependencies are those of this environment: its folder is added to the path, without the link to the checkout,
+    which only the environment's own start would follow.
+    """
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", folder, ROOT]
+    subprocess.run(build, check=True, timeout=TIMEOUT_S)
+    (wheel,) = folder.glob("*.whl")
+    venv.create(folder / "venv", with_pip=False)
+    paths = sysconfig.get_paths(vars={"base": str(folder / "venv"), "platbase": str(folder / "venv")}, scheme="venv")
+    install = [sys.executable, "-m", "pip", "--python", folder / "venv", "install", "--quiet", "--no-deps", wheel]
+    subprocess.run(install, check=True, timeout=TIMEOUT_S)
+    (Path(paths["purelib"]) / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
+    work = tmp_path_factory.mktemp("work")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    environment |= {"JAX_PLATFORMS": "cpu", "XDG_CACHE_HOME": str(work / "cache")}
+
+    def run(program: str, *arguments: object) -> subprocess.CompletedProcess:
+        command = [Path(paths["scripts"]) / program, *map(str, arguments)]
+        return subprocess.run(command, cwd=work, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+    return run
+
+
+def test_the_package_is_the_wheel_s(installed):
+    ended = installed("python", "-c", "import sglpr_jax; print(sglpr_jax.__file__, sglpr_jax.shipped_weights())")
+    assert str(ROOT) not in ended.stdout and "site-packages" in ended.stdout, ended.stdout + ended.stderr
+    assert "'sglpr', 'simulated'" in ended.stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_speaks_of_what_is_installed(installed, name):
+    ended = installed(f"sglpr-{name}", "--help")
+    assert ended.returncode == 0, ended.stderr
+    assert f"sglpr-{name}" in ended.stdout and "bin/" not in ended.stdout
+
+
+def test_the_whole_job_without_the_checkout(installed):
+    """Simulate, embed, evaluate, segment."""
+    for command in (
+        ("sglpr-simulate", "--out", "town", "--seq", "08", "--scans", 12, "--azimuth-steps", 60),
+        ("sglpr-embed", "--weights", "simulated", "--data", "town", "--seq", "08", "--out", "08.npz"),
+        ("sglpr-evaluate", "08.npz", "--protocol", "pairs-f1max"),
+        ("sglpr-segment", "--weights", "sglpr", "--data", "town", "--seq", "08", "--out", "maps"),
+    ):
+        ended = installed(*command)
+        assert ended.returncode == 0, ended.stderr
+    refused = installed("sglpr-evaluate", "08.npz", "--database", "08.npy")
+    assert refused.returncode == 1 and "expected descriptor files of sglpr-embed (.npz)" in refused.stderr
