@@ -35,11 +35,9 @@ def open_recording(root: Path, name: str) -> Recording:
     if not len(recorded):
         raise ValueError(f"{root}: expected point clouds on {topic}, found no message")
     ids = tuple(f"{i:06d}" for i in range(len(recorded)))
-    first = np.searchsorted(recorded, recorded)  # messages of one nanosecond are told apart by their order
-    where = {
-        scan: (int(time), i - int(start))
-        for i, (scan, time, start) in enumerate(zip(ids, recorded, first, strict=True))
-    }
+    first = np.searchsorted(recorded, recorded)  # messages of one nanosecond differ in their order
+    nth = np.arange(len(recorded)) - first
+    where = dict(zip(ids, zip(recorded.tolist(), nth.tolist(), strict=True), strict=True))
     return Recording(
         name=name,
         ids=ids,
