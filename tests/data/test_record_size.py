@@ -6,6 +6,7 @@ import pytest
 from sglpr_jax.data.formats import record_size
 from sglpr_jax.data.formats.record_size import find_record
 from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.readers import kitti
 from sglpr_jax.data.readers.scan_folder import open_recording
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
@@ -56,7 +57,7 @@ LAYOUTS = {
 def test_every_layout_is_found(tmp_path, layout, order):
     written = []
     for i in range(3):
-        points = scan(i)[:2880]  # a multiple of 16 points: every size can be divided by 16
+        points = scan(i)[: 2880 - 160 * i]  # a multiple of 16 points: every size can be divided by 16
         if order == "shuffled":
             points = points[np.random.default_rng(i).permutation(len(points))]
         if order == "with gaps":
@@ -117,6 +118,20 @@ def test_names_that_say_it_are_believed(tmp_path):
     noise = np.random.default_rng(0).normal(scale=10, size=(4000, 5)).astype("<f4")
     noise.tofile(tmp_path / "sweep.pcd.bin")
     assert open_recording(tmp_path).found == ("format: nuscenes (20 bytes a point)",)
+
+
+def test_own_scans_in_the_layout_of_kitti(kitti_root):
+    """Read as what they are; a fixture of a few points, and scans that are KITTI's, as KITTI's."""
+    folder = kitti_root / "sequences" / "08" / "velodyne"
+    assert kitti.open_recording(kitti_root, "08").found == ("format: kitti (16 bytes a point)",)
+    for layout in ("float32x6", "float32x3", "kitti"):
+        for i, path in enumerate(sorted(folder.iterdir())):
+            columns(scan(i), LAYOUTS[layout]).astype("<f4").tofile(path)
+        recording = kitti.open_recording(kitti_root, "08")
+        said = "kitti (16 bytes a point)" if layout == "kitti" else f"{layout}, not KITTI's"
+        assert recording.found == (f"format: {said}",)
+        np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
+    assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as said",)
 
 
 def test_the_share_that_differs_from_turn_to_turn():

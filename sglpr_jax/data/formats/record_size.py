@@ -48,7 +48,7 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     A few of the files are looked at, all over the recording. Some may be broken, most not. Raises ValueError, with all
     that was tried, where no reading fits or more than one does.
     """
-    chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int))]
+    chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
         return None, "too few points to find out"
     strange = {name: strangeness(chosen, name) for name in CANDIDATES}
@@ -66,6 +66,24 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
         f"{paths[0].parent}: expected scans of which one reading fits, found {len(simplest)}; say --format {wanted},"
         f" or nuscenes or nclt ({tried})"
     )
+
+
+def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> RecordFormat | None:
+    """Return the format of scans that are not what their layout says; None where they are, or nothing tells.
+
+    For own recordings that were put into the layout of a dataset: a record of another size would read as garbage.
+    """
+    if not strangeness(_some(paths), usual):
+        return None
+    try:
+        return find_record(paths)[0]
+    except ValueError:
+        return None
+
+
+def _some(paths: Sequence[Path]) -> list[Path]:
+    """A few files, all over the recording."""
+    return [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int))]
 
 
 def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
@@ -111,7 +129,7 @@ def _strange_range(points: Float[np.ndarray, "n 3"]) -> str:
     return f"all points have one {flat[0]}" if flat else ""
 
 
-def _strange_turns(clouds: Sequence[Float[np.ndarray, "n 3"]]) -> str:
+def _strange_turns(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> str:
     direction = [np.arctan2(points[:, 1], points[:, 0]) for points in clouds]
     to_axis = [np.arctan2(np.abs(points[:, 1]), np.abs(points[:, 0])) for points in clouds]
     distance = [np.hypot(points[:, 0], points[:, 1]) for points in clouds]
@@ -130,7 +148,7 @@ def _strange_turns(clouds: Sequence[Float[np.ndarray, "n 3"]]) -> str:
     return ""
 
 
-def _each(values: Sequence[Float[np.ndarray, " n"]], start: int, turn: int) -> Float[np.ndarray, " m"]:
+def _each(values: Sequence[Float[np.ndarray, "_"]], start: int, turn: int) -> Float[np.ndarray, "_"]:
     """Every `turn`-th value of all files from `start` on, without NaN."""
     found = np.concatenate([each[start::turn] for each in values])
     return found[~np.isnan(found)]

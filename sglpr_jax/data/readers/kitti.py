@@ -15,7 +15,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.record_size import unusual_record
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import PoseChoice, Reader
@@ -32,11 +34,15 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(
     root: Path, name: str, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
 ) -> Recording:
-    """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses."""
+    """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses.
+
+    Scans that look like another record than KITTI's, and do not look like that, are read so (`unusual_record`).
+    """
     folder = root / "sequences" / name
     scan_paths = files_in(folder / "velodyne", ".bin")
     if not scan_paths:
         raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
+    record, how = (unusual_record(scan_paths) or "auto", ", not KITTI's") if format == "auto" else (format, ", as said")
     ids = tuple(path.stem for path in scan_paths)
     positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
@@ -48,7 +54,8 @@ def open_recording(
         pose_source=pose_file,
         paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
-        read=partial(scan_record, format=format),
+        read=scan_record if record == "auto" else partial(scan_record, format=record),
+        found=("format: " + (described("kitti") if record == "auto" else record + how),),
     )
 
 
