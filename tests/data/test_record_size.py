@@ -8,6 +8,7 @@ from sglpr_jax.data.formats.record_size import find_record
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers import kitti
 from sglpr_jax.data.readers.scan_folder import open_recording
+from sglpr_jax.data.warning import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
 FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)
@@ -112,6 +113,13 @@ def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
         open_recording(tmp_path)
     np.testing.assert_array_equal(open_recording(tmp_path, format="float32x4").points(0), noise[:, :3])
     assert open_recording(tmp_path, format="float32x5").points(0).shape == (3200, 3)
+
+
+def test_a_wrong_format_that_was_said_is_told(tmp_path):
+    for i in range(2):
+        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
+    with pytest.warns(DataWarning, match=r"expected scans of kitti \(16 bytes a point\), found that each .th point"):
+        open_recording(tmp_path, format="kitti")
 
 
 def test_names_that_say_it_are_believed(tmp_path):

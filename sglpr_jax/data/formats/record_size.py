@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.bin_records import RecordFormat, described, read_records, record_type
+from sglpr_jax.data.warning import warn
 
 MOST_M = 300.0
 """Coordinates lie within so many metres, all but a share of `STRANGE`."""
@@ -79,6 +80,15 @@ def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> R
         return find_record(paths)[0]
     except ValueError:
         return None
+
+
+def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
+    """Warn of scans that do not look like scans when they are read as somebody said."""
+    chosen = _some(paths)
+    if sum(path.stat().st_size for path in chosen) < FEWEST * record_type(format).itemsize:
+        return
+    if strange := strangeness(chosen, format):
+        warn(f"{paths[0].parent}: expected scans of {described(format)}, found that {strange}")
 
 
 def _some(paths: Sequence[Path]) -> list[Path]:
