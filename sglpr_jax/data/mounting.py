@@ -32,6 +32,8 @@ MOST_BELOW = 0.1
 LEAST_SHARE = 0.05
 LEAST_POINTS = 40
 """Of the voxels, and how many of them, must be of the ground."""
+MOST_POINTS = 6000
+"""As many of them are enough."""
 TRIALS = 400
 UPSIDE_DOWN = 2.0
 """How many times as much ground must lie above a sensor as below for it to hang upside down: rooms have ceilings."""
@@ -86,6 +88,7 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
       mounting = estimate_mounting(recording.points(0))
     """
     near = _thinned(points)
+    near = near[:: len(near) // MOST_POINTS + 1]
     if len(near) < LEAST_POINTS:
         return None
     normals, heights = _planes(near)

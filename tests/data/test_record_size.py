@@ -136,8 +136,9 @@ def test_own_scans_in_the_layout_of_kitti(kitti_root):
         for i, path in enumerate(sorted(folder.iterdir())):
             columns(scan(i), LAYOUTS[layout]).astype("<f4").tofile(path)
         recording = kitti.open_recording(kitti_root, "08")
-        said = "kitti (16 bytes a point)" if layout == "kitti" else f"{layout}, not KITTI's"
-        assert recording.found == (f"format: {said}",)
+        size = {"float32x6": 24, "float32x3": 12, "kitti": 16}[layout]
+        said = "" if layout == "kitti" else ", not KITTI's"
+        assert recording.found == (f"format: {layout} ({size} bytes a point){said}",)
         np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
     assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as said",)
 

@@ -11,6 +11,7 @@ Both pose files move the left camera, so `calib.txt` is not needed for positions
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -42,7 +43,6 @@ def open_recording(
     scan_paths = files_in(folder / "velodyne", ".bin")
     if not scan_paths:
         raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
-    record, how = (unusual_record(scan_paths) or "auto", ", not KITTI's") if format == "auto" else (format, ", as said")
     ids = tuple(path.stem for path in scan_paths)
     positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
@@ -54,9 +54,18 @@ def open_recording(
         pose_source=pose_file,
         paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
-        read=scan_record if record == "auto" else partial(scan_record, format=record),
-        found=("format: " + (described("kitti") if record == "auto" else record + how),),
+        **_read(scan_paths, format),
     )
+
+
+def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
+    """How the scans are read, and what to say about it: of a recording, `read` and `found`."""
+    if format != "auto":
+        return {"read": partial(scan_record, format=format), "found": (f"format: {format}, as said",)}
+    unusual = unusual_record(paths)
+    if unusual is None:
+        return {"read": scan_record, "found": (f"format: {described('kitti')}",)}
+    return {"read": partial(scan_record, format=unusual), "found": (f"format: {described(unusual)}, not KITTI's",)}
 
 
 def read_trajectory(
