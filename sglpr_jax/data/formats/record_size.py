@@ -52,8 +52,8 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
         return None, "too few points to find out"
-    strange = {name: strangeness(chosen, name) for name in CANDIDATES}
-    fits = [name for name in CANDIDATES if not strange[name]]
+    strange: dict[RecordFormat, str] = {name: strangeness(chosen, name) for name in CANDIDATES}
+    fits: list[RecordFormat] = [name for name in CANDIDATES if not strange[name]]
     simplest = [name for name in fits if not any(_repeats(name, other) for other in fits if other != name)]
     if len(simplest) == 1:
         return simplest[0], f"found from {len(chosen)} of {len(paths)} scans"

@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 
 LIDAR_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
 """Where the Ouster is in the car's frame, by the dataset's calibration."""
-FORWARD_FROM_LIDAR = np.float32([-1, -1, 1])
+FORWARD_FROM_LIDAR = np.array([-1, -1, 1], np.float32)
 POSES = "global_pose.csv"
 
 

@@ -10,12 +10,11 @@ Poses and times have one line for each scan.
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.bin_records import RecordFormat, described
+from sglpr_jax.data.formats.bin_records import RecordFormat, described, is_record
 from sglpr_jax.data.formats.pose_files import columns_of, read_times
 from sglpr_jax.data.formats.record_size import check_record, find_record
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat, guess_format, says_its_format, scan_id
@@ -108,11 +107,11 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
     """What a .bin is whose name does not say it, and the formats of all scans in words."""
     unsaid = [path for path in paths if not says_its_format(path)] if format == "auto" else []
     found, how = find_record(unsaid) if unsaid else (None, "")
-    if format in get_args(RecordFormat):
+    if is_record(format):
         check_record(paths, format)
     records: RecordFormat = found or "kitti"
     counts = Counter(guess_format(path, records=records) if format == "auto" else format for path in paths)
-    said = {name: described(name) if name in get_args(RecordFormat) else name for name in counts}
+    said = {name: described(name) if is_record(name) else name for name in counts}
     kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unsaid else kinds
 
