@@ -166,3 +166,11 @@ def test_different_results_are_not_timed(monkeypatch):
     ratio.check_equal("same", np.array([1.0, 2.0]), np.array([1.0, 2.0]), tolerance=0)
     with pytest.raises(SystemExit, match="do not agree"):
         ratio.check_equal("unlike", np.array([1.0, 2.0]), np.array([1.0, 2.1]), tolerance=1e-3)
+
+
+def test_mounting():
+    options = ("--scans", "24", "--routes", "06", "--sensors", "vlp16", "--heights", "1.0", "--pitches", "10")
+    row = printed("mounting.py", *options, "--azimuth-steps", "180").splitlines()[-1]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[:3] == ["vlp16", "1", "10"] and cells[5] == "0 of 24"
+    assert float(cells[3]) < 0.1 and float(cells[6]) < 0.1

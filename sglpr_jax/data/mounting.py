@@ -32,6 +32,8 @@ MOST_BELOW = 0.1
 LEAST_SHARE = 0.05
 LEAST_POINTS = 40
 """Of the voxels, and how many of them, must be of the ground."""
+MOST_POINTS = 6000
+"""As many of them are enough."""
 TRIALS = 400
 UPSIDE_DOWN = 2.0
 """How many times as much ground must lie above a sensor as below for it to hang upside down: rooms have ceilings."""
@@ -64,7 +66,7 @@ class Mounting:
     def level(self, points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
         """Points (n, 3) as an upright sensor at `MODEL_HEIGHT_M` has them. Those that are not finite stay so."""
         if self.up == (0.0, 0.0, 1.0):
-            return points + np.float32([0, 0, self.height_m - MODEL_HEIGHT_M])
+            return points + np.array([0, 0, self.height_m - MODEL_HEIGHT_M], np.float32)
         with np.errstate(invalid="ignore"):
             turned = points.astype(np.float64) @ self.upright_from_lidar.T
         return (turned + np.array([0, 0, self.height_m - MODEL_HEIGHT_M])).astype(np.float32)
@@ -86,6 +88,7 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
       mounting = estimate_mounting(recording.points(0))
     """
     near = _thinned(points)
+    near = near[:: len(near) // MOST_POINTS + 1]
     if len(near) < LEAST_POINTS:
         return None
     normals, heights = _planes(near)
@@ -150,6 +153,7 @@ def _fitted(
     points: Float[np.ndarray, "n 3"], ground: Bool[np.ndarray, " n"], up: Float[np.ndarray, "3"]
 ) -> Mounting | None:
     """The plane of least squares through the points of the ground, and those that are then of the ground."""
+    normal, centre = up, np.zeros(3)
     for _ in range(4):
         if ground.sum() < LEAST_POINTS or ground.mean() < LEAST_SHARE:
             return None

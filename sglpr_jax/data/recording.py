@@ -56,8 +56,16 @@ class Recording:
         return (
             f"{self.name}: {len(self)} {'images' if self.has_images else 'scans'}",
             *self.found,
-            f"times: {times}; poses: {self.pose_source or 'none'}",
+            f"times: {times}; poses: {self.pose_source or 'none'}{self._extent}",
         )
+
+    @property
+    def _extent(self) -> str:
+        """How far the positions reach, in words: a wrong frame shows in the height."""
+        if self.positions is None or not len(self):
+            return ""
+        x, y, z = np.ptp(self.positions, axis=0)
+        return f", over {x:.0f} x {y:.0f} m and {z:.0f} m of height"
 
     @property
     def has_images(self) -> bool:

@@ -1,5 +1,6 @@
 import json
 import shutil
+import warnings
 from typing import get_args
 
 import numpy as np
@@ -149,7 +150,9 @@ def test_weights_of_another_model_or_damaged_ones_are_named(embed, town, trained
     options = ("--data", town, "--seq", "08", "--weights", folder)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "backbone": {**config["backbone"], "embed_dim": 16}}))
-    assert_one_line_error(embed(*options)[0], folder / "model.safetensors", "expected the weights of its configuration", "found")
+    assert_one_line_error(
+        embed(*options)[0], folder / "model.safetensors", "expected the weights of its configuration", "found"
+    )
     (folder / "config.json").write_text(json.dumps({**config, "unknown": 1}))
     assert_one_line_error(embed(*options)[0], folder / "config.json", "ModelConfig", "unknown")
     (folder / "config.json").write_text(json.dumps(config)[:-20])
@@ -204,3 +207,60 @@ def test_turned_points_have_other_descriptors(embed, town):
     options = ("--method", "scan-context", "--data", town, "--seq", "08")
     raw, turned = (load(embed(*options, *more)[1]) for more in ((), ("--rotate", "--seed", 1)))
     assert (raw.descriptors != turned.descriptors).any(axis=1).all()
+
+
+def test_what_was_found_is_said(embed, scans):
+    ended, _ = embed("--method", "thumbnail", "--data", scans)
+    said = ended.error.splitlines()
+    assert said[0] == "my_scans: 12 scans" and said[-1] == "times: none; poses: none"
+    assert said[1].startswith("format: kitti (16 bytes a point), found from 5 of 12 scans")
+    assert said[2].startswith("sensor: ")
+
+
+def test_other_records_give_the_same_descriptors(embed, scans, tmp_path):
+    """float64x6 for float32x4: found out, or said; a wrong one is told."""
+    whole = load(embed("--method", "thumbnail", "--data", scans)[1])
+    for path in scans.iterdir():
+        records = np.fromfile(path, "<f4").reshape(-1, 4).astype("<f8")
+        np.column_stack([records, records[:, :2]]).tofile(path)
+    for options in ((), ("--format", "float64x6")):
+        ended, out = embed("--method", "thumbnail", "--data", scans, *options, out="other.npz")
+        assert ended.status == 0, ended.error
+        np.testing.assert_array_equal(load(out).descriptors, whole.descriptors)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        ended, _ = embed("--method", "thumbnail", "--data", scans, "--format", "float32x4")
+    assert "warning: " in ended.error and "expected scans of float32x4 (16 bytes a point)" in ended.error
+
+
+def test_scans_that_show_no_place_are_skipped_and_counted(embed, scans):
+    records = np.fromfile(scans / "000003.bin", "<f4").reshape(-1, 4)
+    for name, points in (("000003", np.full_like(records, np.nan)), ("000007", records * 5000)):
+        points.tofile(scans / f"{name}.bin")
+    options = ("--method", "scan-context", "--data", scans)
+    assert_one_line_error(embed(*options)[0], "scan 000003", "expected finite points, found none")
+    ended, out = embed(*options, "--skip-bad")
+    assert ended.status == 0 and "10 descriptors" in ended.out and "2 scans skipped" in ended.out
+    assert "skipped 000003" in ended.error and "skipped 000007" in ended.error and "millimetres" in ended.error
+    assert "000003" not in load(out).ids
+
+
+def test_the_height_of_the_sensor_can_be_said(embed, scans):
+    ended, out = embed("--method", "scan-context", "--data", scans, "--sensor-height", "0.6")
+    assert "sensor: 0.60 m above the ground, as said" in ended.error
+    assert load(out).config["sensor"] == "0.60 m above the ground"
+    ended, _ = embed("--method", "thumbnail", "--data", scans, "--sensor-height", "1730")
+    assert_one_line_error(ended, "expected the sensor's height over the ground in metres, found 1730")
+
+
+def test_consecutive_poses_far_apart_are_told(embed, scans):
+    way = np.arange(12) * 2.0 + 500 * (np.arange(12) > 6)
+    rows = np.tile(np.eye(3, 4), (12, 1, 1))
+    rows[:, 0, 3] = way
+    np.savetxt(scans / "poses.txt", rows.reshape(12, 12))
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        ended, _ = embed("--method", "thumbnail", "--data", scans)
+    assert (
+        ended.status == 0 and "warning: " in ended.error and "are the poses in the order of the scans?" in ended.error
+    )

@@ -12,6 +12,7 @@ from sglpr_jax.data import open_recording, read_scan, recording_names
 from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import Corruption
 from sglpr_jax.data.formats.bin_records import NCLT_RECORD
+from sglpr_jax.data.formats.timed_poses import nearest_rows
 from sglpr_jax.data.readers import nclt
 
 DATE = "2012-01-15"
@@ -69,12 +70,12 @@ def test_the_ground_truth_is_found_in_any_of_three_places(root, place):
 @given(stamps=st.lists(st.integers(0, 200), min_size=1, max_size=30), asked=st.lists(st.integers(-20, 220), min_size=1))
 def test_the_nearest_stamp_is_that_of_a_brute_force_search(stamps, asked):
     ordered, utimes = np.sort(np.array(stamps, np.int64)), np.array(asked, np.int64)
-    found = np.abs(ordered[nclt.nearest_rows(ordered, utimes)] - utimes)
+    found = np.abs(ordered[nearest_rows(ordered, utimes)] - utimes)
     np.testing.assert_array_equal(found, np.abs(ordered[:, None] - utimes).min(axis=0))
 
 
 def test_of_two_equally_near_stamps_the_earlier_one_counts():
-    np.testing.assert_array_equal(nclt.nearest_rows(np.array([0, 10, 20]), np.array([5, 15, 16])), [0, 1, 2])
+    np.testing.assert_array_equal(nearest_rows(np.array([0, 10, 20]), np.array([5, 15, 16])), [0, 1, 2])
 
 
 def test_what_stands_on_the_left_is_on_the_left_of_the_image(root):

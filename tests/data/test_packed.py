@@ -51,7 +51,7 @@ def test_points_and_labels_are_those_of_the_files(recording, tmp_path):
     np.testing.assert_array_equal(found.positions, recording.positions)
     assert not found.points(0).flags.writeable
     shutil.rmtree(recording.paths[0].parents[1])
-    np.testing.assert_array_equal(found.points(1), 200 + np.arange(20, dtype=np.float32).reshape(5, 4)[:, :3])
+    np.testing.assert_array_equal(found.points(1), 100 + np.arange(20, dtype=np.float32).reshape(5, 4)[:, :3])
 
 
 def test_real_scans_are_those_of_the_files(shared, tmp_path):

@@ -6,7 +6,9 @@ import pytest
 from sglpr_jax.data.formats import record_size
 from sglpr_jax.data.formats.record_size import find_record
 from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.readers import kitti
 from sglpr_jax.data.readers.scan_folder import open_recording
+from sglpr_jax.data.warning import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
 FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)
@@ -56,7 +58,7 @@ LAYOUTS = {
 def test_every_layout_is_found(tmp_path, layout, order):
     written = []
     for i in range(3):
-        points = scan(i)[:2880]  # a multiple of 16 points: every size can be divided by 16
+        points = scan(i)[: 2880 - 160 * i]  # a multiple of 16 points: every size can be divided by 16
         if order == "shuffled":
             points = points[np.random.default_rng(i).permutation(len(points))]
         if order == "with gaps":
@@ -113,10 +115,32 @@ def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
     assert open_recording(tmp_path, format="float32x5").points(0).shape == (3200, 3)
 
 
+def test_a_wrong_format_that_was_said_is_told(tmp_path):
+    for i in range(2):
+        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
+    with pytest.warns(DataWarning, match=r"expected scans of kitti \(16 bytes a point\), found that each .th point"):
+        open_recording(tmp_path, format="kitti")
+
+
 def test_names_that_say_it_are_believed(tmp_path):
     noise = np.random.default_rng(0).normal(scale=10, size=(4000, 5)).astype("<f4")
     noise.tofile(tmp_path / "sweep.pcd.bin")
     assert open_recording(tmp_path).found == ("format: nuscenes (20 bytes a point)",)
+
+
+def test_own_scans_in_the_layout_of_kitti(kitti_root):
+    """Read as what they are; a fixture of a few points, and scans that are KITTI's, as KITTI's."""
+    folder = kitti_root / "sequences" / "08" / "velodyne"
+    assert kitti.open_recording(kitti_root, "08").found == ("format: kitti (16 bytes a point)",)
+    for layout in ("float32x6", "float32x3", "kitti"):
+        for i, path in enumerate(sorted(folder.iterdir())):
+            columns(scan(i), LAYOUTS[layout]).astype("<f4").tofile(path)
+        recording = kitti.open_recording(kitti_root, "08")
+        size = {"float32x6": 24, "float32x3": 12, "kitti": 16}[layout]
+        said = "" if layout == "kitti" else ", not KITTI's"
+        assert recording.found == (f"format: {layout} ({size} bytes a point){said}",)
+        np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
+    assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as said",)
 
 
 def test_the_share_that_differs_from_turn_to_turn():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.warning import DataWarning
 
 KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n"
 
@@ -92,3 +93,12 @@ def test_a_missing_file_is_named(tmp_path):
     for name in ("none.txt", "none.csv"):
         with pytest.raises(FileNotFoundError, match=f"{name}: expected a pose file, found none"):
             read_trajectory(tmp_path / name)
+
+
+def test_heights_that_run_as_far_as_a_road_are_told(write, recwarn):
+    way = [(i * 1.0, i * 0.8, 0.01 * i) for i in range(300)]
+    path = write("poses.txt", "".join(f"1 0 0 {x} 0 1 0 {y} 0 0 1 {z}\n" for x, y, z in way))
+    read_trajectory(path, format="lidar")
+    assert not recwarn.list
+    with pytest.warns(DataWarning, match=r"poses\.txt: expected z up, found heights over 239 m and 3 x 299 m"):
+        read_trajectory(path, format="kitti")

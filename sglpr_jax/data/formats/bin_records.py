@@ -4,7 +4,7 @@ A `.bin` does not say what it holds; `record_size.py` finds it out.
 """
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeGuard, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -41,6 +41,11 @@ class Records(NamedTuple):
     """Metres: x forward, y left, z up, where the format says which axes it has."""
     lasers: Int32[np.ndarray, " n"] | None
     """The laser that each point is from, where the format says so."""
+
+
+def is_record(format: str) -> TypeGuard[RecordFormat]:
+    """Whether scans of a format are records without a header."""
+    return format in get_args(RecordFormat)
 
 
 def record_type(format: RecordFormat) -> np.dtype:

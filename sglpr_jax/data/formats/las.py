@@ -19,7 +19,7 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
         raise ImportError(f"{path}: .las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
     try:
         found = laspy.read(path)
-        points = np.stack([found.x, found.y, found.z], axis=1).astype(np.float32)
+        points = np.stack([np.asarray(axis) for axis in (found.x, found.y, found.z)], axis=1).astype(np.float32)
     except (laspy.errors.LaspyException, ValueError, OverflowError, EOFError, OSError) as error:
         raise ValueError(f"{path}: expected a .las file, found none that can be read ({error})") from error
     if not len(points):

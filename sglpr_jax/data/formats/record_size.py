@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.bin_records import RecordFormat, described, read_records, record_type
+from sglpr_jax.data.warning import warn
 
 MOST_M = 300.0
 """Coordinates lie within so many metres, all but a share of `STRANGE`."""
@@ -48,11 +49,11 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     A few of the files are looked at, all over the recording. Some may be broken, most not. Raises ValueError, with all
     that was tried, where no reading fits or more than one does.
     """
-    chosen = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int))]
+    chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
         return None, "too few points to find out"
-    strange = {name: strangeness(chosen, name) for name in CANDIDATES}
-    fits = [name for name in CANDIDATES if not strange[name]]
+    strange: dict[RecordFormat, str] = {name: strangeness(chosen, name) for name in CANDIDATES}
+    fits: list[RecordFormat] = [name for name in CANDIDATES if not strange[name]]
     simplest = [name for name in fits if not any(_repeats(name, other) for other in fits if other != name)]
     if len(simplest) == 1:
         return simplest[0], f"found from {len(chosen)} of {len(paths)} scans"
@@ -66,6 +67,33 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
         f"{paths[0].parent}: expected scans of which one reading fits, found {len(simplest)}; say --format {wanted},"
         f" or nuscenes or nclt ({tried})"
     )
+
+
+def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> RecordFormat | None:
+    """Return the format of scans that are not what their layout says; None where they are, or nothing tells.
+
+    For own recordings that were put into the layout of a dataset: a record of another size would read as garbage.
+    """
+    if not strangeness(_some(paths), usual):
+        return None
+    try:
+        return find_record(paths)[0]
+    except ValueError:
+        return None
+
+
+def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
+    """Warn of scans that do not look like scans when they are read as somebody said."""
+    chosen = _some(paths)
+    if sum(path.stat().st_size for path in chosen) < FEWEST * record_type(format).itemsize:
+        return
+    if strange := strangeness(chosen, format):
+        warn(f"{paths[0].parent}: expected scans of {described(format)}, found that {strange}")
+
+
+def _some(paths: Sequence[Path]) -> list[Path]:
+    """A few files, all over the recording."""
+    return [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int))]
 
 
 def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
@@ -111,7 +139,7 @@ def _strange_range(points: Float[np.ndarray, "n 3"]) -> str:
     return f"all points have one {flat[0]}" if flat else ""
 
 
-def _strange_turns(clouds: Sequence[Float[np.ndarray, "n 3"]]) -> str:
+def _strange_turns(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> str:
     direction = [np.arctan2(points[:, 1], points[:, 0]) for points in clouds]
     to_axis = [np.arctan2(np.abs(points[:, 1]), np.abs(points[:, 0])) for points in clouds]
     distance = [np.hypot(points[:, 0], points[:, 1]) for points in clouds]
@@ -130,7 +158,7 @@ def _strange_turns(clouds: Sequence[Float[np.ndarray, "n 3"]]) -> str:
     return ""
 
 
-def _each(values: Sequence[Float[np.ndarray, " n"]], start: int, turn: int) -> Float[np.ndarray, " m"]:
+def _each(values: Sequence[Float[np.ndarray, "_"]], start: int, turn: int) -> Float[np.ndarray, "_"]:
     """Every `turn`-th value of all files from `start` on, without NaN."""
     found = np.concatenate([each[start::turn] for each in values])
     return found[~np.isnan(found)]

@@ -1,13 +1,14 @@
 """Single-scan files: points of every format that is known, labels from SemanticKITTI's."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.formats.arrays import read_npy, read_npz
-from sglpr_jax.data.formats.bin_records import RecordFormat, read_records
+from sglpr_jax.data.formats.bin_records import RecordFormat, is_record, read_records
 from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.formats.pcd import read_pcd
 from sglpr_jax.data.formats.ply import read_ply
@@ -15,8 +16,14 @@ from sglpr_jax.data.formats.ply import read_ply
 ScanFormat = Literal["auto", "pcd", "ply", "npy", "npz", "las", RecordFormat]
 """What a scan file is; "auto": what its name says."""
 
-READERS = {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".npz": read_npz, ".las": read_las}
-"""The formats with a header, by the ending of their files."""
+READERS: dict[ScanFormat, Callable[[Path], Float32[np.ndarray, "n 3"]]] = {
+    "pcd": read_pcd,
+    "ply": read_ply,
+    "npy": read_npy,
+    "npz": read_npz,
+    "las": read_las,
+}
+"""The formats with a header; each is the ending of its files too."""
 ENDINGS = (".bin", ".pcd", ".ply")
 """Of files that are scans."""
 ARRAY_ENDINGS = (".npy", ".npz", ".las")
@@ -26,7 +33,7 @@ ARRAY_ENDINGS = (".npy", ".npz", ".las")
 def scan_id(path: Path) -> str:
     """Return the name of a scan file without its endings: "000052" for 000052.bin, "sweep" for sweep.pcd.bin."""
     name = path.name.removesuffix(".bin")
-    return name.removesuffix(next((ending for ending in READERS if name.endswith(ending)), ""))
+    return next((name.removesuffix(f".{ending}") for ending in READERS if name.endswith(f".{ending}")), name)
 
 
 def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
@@ -35,8 +42,9 @@ def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
     Files with a header go by their ending, `*.pcd.bin` is nuscenes, a file in a folder `velodyne_sync` is nclt. Any
     other .bin does not say what it holds: it is `records`.
     """
-    if path.suffix in READERS:
-        return path.suffix[1:]
+    for format in READERS:
+        if path.suffix == f".{format}":
+            return format
     if path.name.endswith(".pcd.bin"):
         return "nuscenes"
     return "nclt" if path.parent.name == "velodyne_sync" else records
@@ -75,9 +83,9 @@ def read_points_and_lasers(
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     known = guess_format(path, records=records) if format == "auto" else format
-    if known in get_args(RecordFormat):
+    if is_record(known):
         return read_records(path, known)
-    return READERS[f".{known}"](path), None
+    return READERS[known](path), None
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sglpr_jax.data.formats.pose_files import (
     ROTATION_TOLERANCE,
@@ -106,7 +106,7 @@ def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path
 
 def _nearest(positions: Float[np.ndarray, "n 3"]) -> float:
     """How far the nearest other pose is, in the middle of all."""
-    return float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))
+    return float(np.median(KDTree(positions).query(positions, k=2)[0][:, 1]))
 
 
 def _format_of(path: Path, twelve_numbers: str | None) -> str:

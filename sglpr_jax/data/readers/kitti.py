@@ -11,11 +11,14 @@ Both pose files move the left camera, so `calib.txt` is not needed for positions
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.record_size import unusual_record
 from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import PoseChoice, Reader
@@ -32,7 +35,10 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(
     root: Path, name: str, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
 ) -> Recording:
-    """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses."""
+    """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses.
+
+    Scans that look like another record than KITTI's, and do not look like that, are read so (`unusual_record`).
+    """
     folder = root / "sequences" / name
     scan_paths = files_in(folder / "velodyne", ".bin")
     if not scan_paths:
@@ -48,8 +54,18 @@ def open_recording(
         pose_source=pose_file,
         paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
-        read=partial(scan_record, format=format),
+        **_read(scan_paths, format),
     )
+
+
+def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
+    """How the scans are read, and what to say about it: of a recording, `read` and `found`."""
+    if format != "auto":
+        return {"read": partial(scan_record, format=format), "found": (f"format: {format}, as said",)}
+    unusual = unusual_record(paths)
+    if unusual is None:
+        return {"read": scan_record, "found": (f"format: {described('kitti')}",)}
+    return {"read": partial(scan_record, format=unusual), "found": (f"format: {described(unusual)}, not KITTI's",)}
 
 
 def read_trajectory(

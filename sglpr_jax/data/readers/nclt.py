@@ -14,9 +14,10 @@ y left, z up.
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.formats.timed_poses import match_times
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
@@ -47,21 +48,14 @@ def open_recording(root: Path, name: str, *, max_gap_s: float = MAX_GAP_S) -> Re
     truth = _truth_path(root, name)
     stamps, positions = read_ground_truth(truth)
     utimes = np.array([int(path.stem) for path in paths], dtype=np.int64)
-    rows = nearest_rows(stamps, utimes)
-    gaps_s = np.abs(stamps[rows] - utimes) / 1e6
-    kept = gaps_s <= max_gap_s
-    if not kept.any():
-        raise ValueError(
-            f"{truth}: expected poses within {max_gap_s:g} s of the scans in {paths[0].parent}, found the nearest "
-            f"{gaps_s.min():g} s away"
-        )
-    kept_paths = tuple(path for path, keep in zip(paths, kept, strict=True) if keep)
+    matched = match_times(stamps, utimes, tick_s=1e-6, max_gap_s=max_gap_s, poses=truth, scans=paths[0].parent)
+    kept_paths = tuple(path for path, keep in zip(paths, matched.kept, strict=True) if keep)
     return Recording(
         name=name,
         ids=tuple(path.stem for path in kept_paths),
-        positions=positions[rows[kept]],
-        times=utimes[kept] / 1e6,
-        pose_source=_described(truth.name, kept, max_gap_s),
+        positions=positions[matched.rows],
+        times=utimes[matched.kept] / 1e6,
+        pose_source=matched.described(truth.name, max_gap_s=max_gap_s),
         paths=kept_paths,
         read=scan_record,
     )
@@ -86,13 +80,6 @@ def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.nda
         first = int(backwards[0])
         raise ValueError(f"{path}: expected a time from {stamps[first]} on, found {stamps[first + 1]} in the next row")
     return stamps, rows[known, 1:4] * Z_UP_FROM_Z_DOWN
-
-
-def nearest_rows(stamps: Int64[np.ndarray, " n"], utimes: Int64[np.ndarray, " q"]) -> Int[np.ndarray, " q"]:
-    """Return which of the ordered `stamps` is nearest to each of `utimes`, the earlier one of two equally near."""
-    later = np.searchsorted(stamps, utimes).clip(0, len(stamps) - 1)
-    earlier = (later - 1).clip(0)
-    return np.where(np.abs(utimes - stamps[earlier]) <= np.abs(stamps[later] - utimes), earlier, later)
 
 
 def _scan_paths(folder: Path) -> tuple[Path, ...]:
@@ -125,11 +112,6 @@ def _read_table(path: Path) -> Float[np.ndarray, "n 7"]:
     if rows.shape[1] != len(_COLUMNS):
         raise ValueError(f"{path}: expected {len(_COLUMNS)} columns, {', '.join(_COLUMNS)}, found {rows.shape[1]}")
     return rows
-
-
-def _described(file: str, kept: Bool[np.ndarray, " n"], max_gap_s: float) -> str:
-    left_out = len(kept) - int(kept.sum())
-    return f"{file} ({left_out} of {len(kept)} scans left out: no pose within {max_gap_s:g} s)" if left_out else file
 
 
 READER = Reader(

@@ -8,11 +8,10 @@ my_scans/times.txt     seconds, one number a line
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
-from sglpr_jax.data.formats.bin_records import RecordFormat, described
+from sglpr_jax.data.formats.bin_records import RecordFormat, described, is_record
 from sglpr_jax.data.formats.folder_poses import POSE_FILES, TIMES_FILE, folder_trajectory
-from sglpr_jax.data.formats.record_size import find_record
+from sglpr_jax.data.formats.record_size import check_record, find_record
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat, guess_format, says_its_format, scan_id
 from sglpr_jax.data.formats.trajectory import PoseFormat, check_order
 from sglpr_jax.data.listing import files_in, left_aside
@@ -86,9 +85,11 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
     """What a .bin is whose name does not say it, and the formats of all scans in words."""
     unsaid = [path for path in paths if not says_its_format(path)] if format == "auto" else []
     found, how = find_record(unsaid) if unsaid else (None, "")
+    if is_record(format):
+        check_record(paths, format)
     records: RecordFormat = found or "kitti"
     counts = Counter(guess_format(path, records=records) if format == "auto" else format for path in paths)
-    said = {name: described(name) if name in get_args(RecordFormat) else name for name in counts}
+    said = {name: described(name) if is_record(name) else name for name in counts}
     kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unsaid else kinds
 

@@ -1,0 +1,68 @@
+"""Points of ROS's sensor_msgs/PointCloud2: any fields at any offset, either byte order, rows with padding.
+
+Velodyne, Ouster, Hesai and Livox drivers differ in what lies between x, y, z and the rest; each message says it.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sglpr_jax.data.formats.bin_records import Records
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LASERS = ("ring", "channel", "line", "laser_id", "laser")
+"""What drivers call the number of a point's laser."""
+
+
+def read_point_cloud2(message: Any) -> Records:
+    """Return points (n, 3), as they are in the message, and lasers, where there is such a field.
+
+    `message` has the attributes of sensor_msgs/PointCloud2. Raises ValueError where x, y or z are missing or no
+    numbers, or the data is shorter than width, height and steps say.
+    """
+    records = _records(message)
+    names = records.dtype.names or ()
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    laser = next((name for name in _LASERS if name in names), None)
+    return Records(points, None if laser is None else records[laser].astype(np.int32))
+
+
+def described_fields(message: Any) -> str:
+    """Return the fields of a cloud in words: "x y z intensity ring (22 bytes a point)"."""
+    return f"{' '.join(field.name for field in message.fields)} ({message.point_step} bytes a point)"
+
+
+def _records(message: Any) -> np.ndarray:
+    """The points as numpy's records, one after another."""
+    width, height, step, row = message.width, message.height, message.point_step, message.row_step
+    if width * height == 0:
+        raise ValueError("expected at least one point, found none")
+    row = max(row, width * step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if len(data) < row * (height - 1) + width * step:
+        raise ValueError(f"expected {height} rows of {width} points of {step} bytes, found {len(data)} bytes")
+    rows = [data[start : start + width * step] for start in range(0, row * height, row)]
+    return np.concatenate(rows).view(_record(message))
+
+
+def _record(message: Any) -> np.dtype:
+    order = ">" if message.is_bigendian else "<"
+    fields = {field.name: field for field in message.fields}
+    if not {"x", "y", "z"} <= set(fields):
+        raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
+    wanted = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
+    types = [_TYPES.get(fields[name].datatype) for name in wanted]
+    if None in types:
+        raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")
+    try:
+        return np.dtype(
+            {
+                "names": wanted,
+                "formats": [f"{order}{kind}" for kind in types],
+                "offsets": [fields[name].offset for name in wanted],
+                "itemsize": message.point_step,
+            }
+        )
+    except ValueError as error:
+        raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error

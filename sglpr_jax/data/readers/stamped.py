@@ -1,0 +1,88 @@
+"""What MulRan, HeLiPR and Boreas share: scans named by their time, and a file of poses with times of its own."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.timed_poses import match_times
+from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+
+MAX_GAP_S = 0.1
+"""A scan without a pose this near in time is left out: the time of one turn."""
+
+
+def stamped_recording(
+    folder: Path,
+    name: str,
+    *,
+    stamps: Int64[np.ndarray, " n"],
+    positions: Float[np.ndarray, "n 3"],
+    pose_file: Path,
+    tick_s: float,
+    read_points: Callable[[Path], Records],
+    format: str,
+) -> Recording:
+    """Open the `.bin` files of `folder`, named by their time in ticks of `tick_s` seconds, with poses by time.
+
+    Scans without a pose within `MAX_GAP_S` are left out; `pose_source` says how many. Raises FileNotFoundError without
+    scans, ValueError for a name that is no time and where no pose is near.
+    """
+    paths = files_in(folder, ".bin")
+    if not paths:
+        raise FileNotFoundError(f"{folder}: expected scans (*.bin), found none")
+    strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
+    if strange:
+        raise ValueError(f"{folder}: expected scans named by their time, 1561000444390857630.bin, found {strange}")
+    times = np.array([int(path.stem) for path in paths], np.int64)
+    matched = match_times(stamps, times, tick_s=tick_s, max_gap_s=MAX_GAP_S, poses=pose_file, scans=folder)
+    kept = tuple(path for path, keep in zip(paths, matched.kept, strict=True) if keep)
+    return Recording(
+        name=name,
+        ids=tuple(path.stem for path in kept),
+        positions=positions[matched.rows],
+        times=times[matched.kept] * tick_s,
+        pose_source=matched.described(pose_file.name, max_gap_s=MAX_GAP_S),
+        paths=kept,
+        read=partial(_read, read_points=read_points),
+        found=(f"format: {format}",),
+    )
+
+
+def _read(path: Path, labels: Path | None, lasers: bool, *, read_points: Callable[[Path], Records]) -> Record:
+    found = read_points(path)
+    return Record(points=found.points, lasers=found.lasers if lasers else None)
+
+
+def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
+    """Return the times of a table, whole numbers of up to 19 digits, and its other columns as float64.
+
+    Columns stand apart by commas or white space. Raises FileNotFoundError, and ValueError that names the first line
+    that is not as expected.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a table of poses, found none")
+    times, rows = [], []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines()):
+        words = line.replace(",", " ").split()
+        if number < header_lines or not words:
+            continue
+        where = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
+        if len(words) != columns:
+            raise ValueError(f"{where}, found {len(words)} words")
+        try:
+            whole, _, fraction = words[0].partition(".")
+            times.append(int(whole) if not fraction.strip("0") else round(float(words[0])))
+            rows.append([float(word) for word in words[1:]])
+        except (ValueError, OverflowError) as error:
+            raise ValueError(f"{where}, found {line[:60]!r}") from error
+        if not np.isfinite(rows[-1]).all():
+            raise ValueError(f"{where}, found {line[:60]!r}")
+    if not rows:
+        raise ValueError(f"{path}: expected rows of a time and {columns - 1} numbers, found none")
+    return np.array(times, np.int64), np.array(rows, np.float64)
