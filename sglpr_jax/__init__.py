@@ -7,6 +7,7 @@
 - describe a place: `load`, `scan_image`, `describe`; `segment`, `forward`; under jit, vmap and grad
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`
 - find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index`; score that: `evaluate`
+- close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
@@ -37,6 +38,8 @@ from sglpr_jax.retrieval.nearest import Nearest, nearest
 
 if TYPE_CHECKING:
     from sglpr_jax.evaluation.scoring import Evaluation, evaluate
+    from sglpr_jax.loops.detector import LoopDetector
+    from sglpr_jax.loops.find import find_loops
     from sglpr_jax.sim.simulation import simulate
     from sglpr_jax.training.presets import load_preset as preset
     from sglpr_jax.training.recipe import TrainResult, train
@@ -46,12 +49,14 @@ __version__ = "0.1.0"
 _LATER = {
     "Evaluation": ("evaluation.scoring", "Evaluation"),
     "evaluate": ("evaluation.scoring", "evaluate"),
+    "LoopDetector": ("loops.detector", "LoopDetector"),
+    "find_loops": ("loops.find", "find_loops"),
     "simulate": ("sim.simulation", "simulate"),
     "preset": ("training.presets", "load_preset"),
     "TrainResult": ("training.recipe", "TrainResult"),
     "train": ("training.recipe", "train"),
 }
-"""Imported when they are first asked for: training, scoring and simulating bring as much along as all the rest."""
+"""Imported when they are first asked for: training, scoring, loops and simulating bring as much along as the rest."""
 
 
 def __getattr__(name: str) -> Any:
@@ -74,6 +79,7 @@ __all__ = [
     "Grid",
     "HeadConfig",
     "Index",
+    "LoopDetector",
     "ModelConfig",
     "Nearest",
     "Outputs",
@@ -89,6 +95,7 @@ __all__ = [
     "describe",
     "embed",
     "evaluate",
+    "find_loops",
     "for_places",
     "forward",
     "init",
