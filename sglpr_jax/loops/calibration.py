@@ -132,4 +132,4 @@ class _Places:
         distance = float(np.linalg.norm(index.descriptors[row].astype(np.float64) - descriptor))
         other = float(index.query(descriptor, exclude=self.apart(row) <= NEGATIVE_M).distances[0])
         margin = other - distance if np.isfinite(other) else np.nan
-        return Evidence(distance, margin, found.correlation, found.second)
+        return Evidence.of(distance, margin, found.correlation, found.second)

@@ -115,9 +115,9 @@ class PlaceMap:
         alignments = jax.device_get(align_all(image, self.images[rows], config=VerificationConfig()))
         pairs = []
         for k, (row, distance) in enumerate(zip(rows, distances, strict=True)):
-            alignment = type(alignments)(*(value[k] for value in alignments))
+            alignment = alignments.one(k)
             margin = self._other_place(descriptor, int(row)) - distance
-            evidence = Evidence(float(distance), margin, float(alignment.correlation), float(alignment.second))
+            evidence = Evidence.of(float(distance), margin, alignment.correlation, alignment.second)
             loop = planar_loop(len(self), int(row), alignment, probability=float(model.probability(evidence)))
             pose = self.world_from_place[row] @ loop.match_from_query
             pairs.append(Relocated(self.index.ids[row], pose, loop))
