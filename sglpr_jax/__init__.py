@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from sglpr_jax.evaluation.scoring import Evaluation, evaluate
     from sglpr_jax.loops.detector import LoopDetector
     from sglpr_jax.loops.find import find_loops
+    from sglpr_jax.loops.loop import Loop
     from sglpr_jax.sim.simulation import simulate
     from sglpr_jax.training.presets import load_preset as preset
     from sglpr_jax.training.recipe import TrainResult, train
@@ -49,6 +50,7 @@ __version__ = "0.1.0"
 _LATER = {
     "Evaluation": ("evaluation.scoring", "Evaluation"),
     "evaluate": ("evaluation.scoring", "evaluate"),
+    "Loop": ("loops.loop", "Loop"),
     "LoopDetector": ("loops.detector", "LoopDetector"),
     "find_loops": ("loops.find", "find_loops"),
     "simulate": ("sim.simulation", "simulate"),
@@ -79,6 +81,7 @@ __all__ = [
     "Grid",
     "HeadConfig",
     "Index",
+    "Loop",
     "LoopDetector",
     "ModelConfig",
     "Nearest",
