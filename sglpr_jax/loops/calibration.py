@@ -8,6 +8,7 @@ easier than a revisit: what stands about has not moved meanwhile.
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
@@ -123,8 +124,8 @@ class _Places:
         record = self.recording.record(frame, labels=False)
         if record.points is not None:
             return self.finder.seen(Record(points=rotated(record.points, angle)))
-        whole = even_cells(jax.numpy.asarray(picture(record, None)[0]))
-        return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jax.numpy.float32(angle)))))
+        whole = even_cells(jnp.asarray(picture(record, None)[0]))
+        return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
 
     def evidence(self, descriptor: Float32[np.ndarray, " d"], image: UInt8[np.ndarray, "n n"], row: int) -> Evidence:
         index = self.finder.index
