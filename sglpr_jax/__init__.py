@@ -8,6 +8,7 @@
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
   `estimate_mounting`
 - find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index`; score that: `evaluate`
+- close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
@@ -39,6 +40,9 @@ from sglpr_jax.retrieval.nearest import Nearest, nearest
 
 if TYPE_CHECKING:
     from sglpr_jax.evaluation.scoring import Evaluation, evaluate
+    from sglpr_jax.loops.detector import LoopDetector
+    from sglpr_jax.loops.find import find_loops
+    from sglpr_jax.loops.loop import Loop
     from sglpr_jax.models.program import save_program
     from sglpr_jax.sim.simulation import simulate
     from sglpr_jax.training.presets import load_preset as preset
@@ -50,12 +54,15 @@ _LATER = {
     "Evaluation": ("evaluation.scoring", "Evaluation"),
     "evaluate": ("evaluation.scoring", "evaluate"),
     "save_program": ("models.program", "save_program"),
+    "Loop": ("loops.loop", "Loop"),
+    "LoopDetector": ("loops.detector", "LoopDetector"),
+    "find_loops": ("loops.find", "find_loops"),
     "simulate": ("sim.simulation", "simulate"),
     "preset": ("training.presets", "load_preset"),
     "TrainResult": ("training.recipe", "TrainResult"),
     "train": ("training.recipe", "train"),
 }
-"""Imported when they are first asked for: training, scoring and simulating bring as much along as all the rest."""
+"""Imported when they are first asked for: training, scoring, loops and simulating bring as much along as the rest."""
 
 
 def __getattr__(name: str) -> Any:
@@ -78,6 +85,8 @@ __all__ = [
     "Grid",
     "HeadConfig",
     "Index",
+    "Loop",
+    "LoopDetector",
     "ModelConfig",
     "Mounting",
     "Nearest",
@@ -95,6 +104,7 @@ __all__ = [
     "embed",
     "estimate_mounting",
     "evaluate",
+    "find_loops",
     "for_places",
     "forward",
     "init",

@@ -97,6 +97,27 @@ def test_throughput_is_a_share_of_the_peak(tmp_path):
     assert 0 < low <= row["share_of_peak"] <= high
 
 
+SMALL = ("--scans", "100", "--azimuth-steps", "200", "--towns", "08:3")
+
+
+def test_loops_are_scored_on_simulated_drives():
+    output = printed("loops.py", "simulated", *SMALL)
+    assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output
+
+
+def test_loops_are_scored_on_images(tmp_path):
+    write_dataset(tmp_path, names=("08",), scans=330, sensor=SENSOR, layout="images")
+    output = printed("loops.py", "images", "--data", str(tmp_path), "--seqs", "08", "--odometry")
+    assert "nearest descriptor: top-1 F1max" in output and "most probable of three: top-1 F1max" in output
+
+
+def test_models_of_loops_are_fitted_and_written(tmp_path):
+    output = printed("fit_loops.py", *SMALL, "--out", str(tmp_path / "models.json"))
+    assert "simulated: LoopModel" in output
+    found = json.loads((tmp_path / "models.json").read_text())
+    assert len(found) == 2 and set(found[""]["weights"]) == {"correlation", "second"}
+
+
 def flops(function, *shapes: tuple[int, ...]) -> int:
     """What the counter of the benchmarks says of a function of arrays of these shapes."""
     count = importlib.import_module("flops").count_flops

@@ -75,7 +75,7 @@ class CandidateFinder:
         `odometry` is its pose, LiDAR frame in any fixed frame. Raises ValueError where some frames have a time or a
         pose and others have none, and where times run backwards.
         """
-        descriptor, image = self._seen(record)
+        descriptor, image = self.seen(record)
         self._check(time, odometry)
         query = len(self.index)
         position = None if odometry is None else np.asarray(odometry, np.float64)[:3, 3]
@@ -92,18 +92,15 @@ class CandidateFinder:
         padded = np.resize(rows, self.config.candidates)  # always as many, so that it compiles once
         matches = np.stack([self.images[row] for row in padded])
         found = jax.device_get(align_all(image, matches, config=self.verification))
-        return [
-            Candidate(
-                query,
-                int(row),
-                alignment := Alignment(*(value[k] for value in found)),
-                Evidence(distance, other - distance, alignment.correlation, alignment.second),
-            )
-            for k, (row, distance, other) in enumerate(zip(rows, distances, others, strict=True))
-        ]
+        pairs = []
+        for k, (row, distance, other) in enumerate(zip(rows, distances, others, strict=True)):
+            alignment = found.one(k)
+            evidence = Evidence.of(distance, other - distance, alignment.correlation, alignment.second)
+            pairs.append(Candidate(query, int(row), alignment, evidence))
+        return pairs
 
-    def _seen(self, record: Record) -> tuple[Float32[np.ndarray, " d"], UInt8[np.ndarray, "n n"]]:
-        """The descriptor, and the density image as 8 bits."""
+    def seen(self, record: Record) -> tuple[Float32[np.ndarray, " d"], UInt8[np.ndarray, "n n"]]:
+        """The descriptor of a scan or image, and its density image as 8 bits; nothing is remembered."""
         model = self.params.config
         whole, _ = picture(record, None)
         if record.points is None or model.image == "density":

@@ -1,7 +1,6 @@
 """Loop closures of a stream: each scan as it comes, and the loops that it closes."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +10,7 @@ from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFind
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
+from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import VerificationConfig
 from sglpr_jax.models.params import Params
 
@@ -81,35 +81,33 @@ class LoopDetector:
                 one = candidates[best]
                 loop = planar_loop(one.query, one.match, one.alignment, probability=float(probabilities[best]))
                 self._waiting.append(loop)
-        new = [loop for loop in self._confirmed() if self._agrees(loop)]
+        first = len(self) - self.config.consistency.neighbours
+        self._waiting = [loop for loop in self._waiting if loop.query >= first]
+        new = self._confirmed() if self._waiting else []
         self.loops += new
         return new
 
     def _confirmed(self) -> list[Loop]:
-        """Probable loops of the last frames that enough of their neighbours speak for, each once."""
-        rules, first = self.config.consistency, len(self) - self.config.consistency.neighbours
-        self._waiting = [loop for loop in self._waiting if loop.query >= first]
-        pairs = self._agreeing(self._waiting)
+        """Probable loops of the last frames that neighbours and, where there is odometry, other loops speak for."""
+        rules = self.config.consistency
+        odometry = np.stack(self.finder.odometry) if self.finder.odometry else None
+        if odometry is None:
+            pairs = agree_in_order(self._waiting, config=rules)
+        else:
+            pairs = agree(self._waiting, odometry, config=rules)
         done = {loop.query for loop in self.loops[-rules.neighbours :]}
-        supported = pairs.sum(axis=1) >= rules.support
         return [
             loop
-            for loop, enough in zip(self._waiting, supported, strict=True)
-            if enough and loop.query not in done and loop.probability >= self.config.min_probability
+            for loop, supporters in zip(self._waiting, pairs.sum(axis=1), strict=True)
+            if loop.probability >= self.config.min_probability
+            and supporters >= rules.support
+            and loop.query not in done
+            and (odometry is None or self._agrees(loop, odometry))
         ]
 
-    def _agreeing(self, loops: list[Loop]) -> Any:
-        if not self.finder.odometry or not loops:
-            return agree_in_order(loops, config=self.config.consistency)
-        return agree(loops, np.stack(self.finder.odometry), config=self.config.consistency)
-
-    def _agrees(self, loop: Loop) -> bool:
-        """Whether it agrees with most of the loops about it; without odometry nobody can tell."""
-        if not self.finder.odometry or not self.loops:
-            return True
-        odometry = np.stack(self.finder.odometry)
-        steps = np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1)
-        way = np.concatenate([[0.0], np.cumsum(steps)])
+    def _agrees(self, loop: Loop, odometry: Float[np.ndarray, "n 4 4"]) -> bool:
+        """Whether it agrees with most of the loops about it."""
+        way = travelled(odometry)
         about = [
             other
             for other in self.loops

@@ -23,7 +23,7 @@ def overlaid(
     at_x = query_from_match[0, 0] * x + query_from_match[0, 1] * y + query_from_match[0, 3]
     at_y = query_from_match[1, 0] * x + query_from_match[1, 1] * y + query_from_match[1, 3]
     cells = [-at_y / resolution_m + (size - 1) / 2, at_x / resolution_m + (size - 1) / 2]
-    moved = map_coordinates(np.asarray(query, np.float64), cells, order=1, cval=0)
+    moved = map_coordinates(np.asarray(query, np.float64), cells, order=1, mode="grid-constant")
     return np.stack([_bright(match), _bright(moved), _bright(moved)], axis=-1)
 
 

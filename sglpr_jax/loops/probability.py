@@ -29,6 +29,11 @@ class Evidence(NamedTuple):
     """The second peak as a share of the first."""
 
     @classmethod
+    def of(cls, distance: float, margin: float, correlation: Any, second: Any) -> "Evidence":
+        """Of one pair."""
+        return cls(*(np.asarray(value, np.float64) for value in (distance, margin, correlation, second)))
+
+    @classmethod
     def stack(cls, pairs: Sequence["Evidence"]) -> "Evidence":
         """Of several pairs, in order."""
         return cls(*np.array(pairs, np.float64).reshape(len(pairs), len(cls._fields)).T)

@@ -8,7 +8,7 @@ or a trunk: a blur, less a wider blur, without which one street looks like any o
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +58,10 @@ class Alignment(NamedTuple):
     """At the peak: 1 for equal images, about 0 for images that have nothing to do with each other."""
     second: Float[Array, "*b"]
     """The height of the second peak as a share of the first: near 1 where another pose fits as well."""
+
+    def one(self, k: int) -> "Alignment":
+        """The k-th of several."""
+        return Alignment(*(value[k] for value in self))
 
 
 DEFAULT = VerificationConfig()
@@ -151,7 +155,7 @@ def _product(
 
     It is so large that no shift up to the greatest one wraps around.
     """
-    size = next_fast_len(match.shape[0] + _cells(config.max_shift_m, cell_m), real=True)
+    size = _fast_size(match.shape[0] + _cells(config.max_shift_m, cell_m))
     along, across = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
     frequency = 2 * (np.pi / cell_m) ** 2 * (along**2 + across**2)
     band = np.exp(-frequency * config.blur_m**2) - np.exp(-frequency * config.wide_blur_m**2)
@@ -162,6 +166,12 @@ def _product(
         return filtered / jnp.sqrt(jnp.maximum(power, 1e-9))
 
     return spectrum(match[None]) * jnp.conj(spectrum(queries)), size
+
+
+def _fast_size(least: int) -> int:
+    """A size, no smaller, of which Fourier transforms are fast."""
+    size: Any = next_fast_len(least, real=True)  # whose types say None
+    return int(size)
 
 
 def _twice(size: int) -> Float[np.ndarray, "1 f"]:

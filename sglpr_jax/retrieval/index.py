@@ -7,7 +7,7 @@ again in float64. Room for rows doubles when it is full, so that adding stays ch
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
 FORMAT = "sglpr-jax index 1"
 """Stands in every file."""
+COLUMNS = ("descriptors", "times", "positions")
 FIRST_ROOM = 256
 """Rows that an empty index has room for."""
 SPARE = 16
@@ -174,12 +175,17 @@ class Index:
 
     def save(self, path: Path | str) -> None:
         """Write one file, whole or not at all: safetensors, with ids and the rest as JSON in its header."""
-        arrays = {name: values[: len(self)] for name, values in self._columns.items()}
-        about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash, "distance": self.distance}
-        text = json.dumps({**about, "ids": self.ids})
-        content = safetensors.numpy.save(arrays, metadata={"about": text, "sha256": _checksum(text, arrays)})
+        content = self.to_bytes()
         with replacing(Path(path)) as temporary:
             temporary.write_bytes(content)
+
+    def to_bytes(self, more: Mapping[str, np.ndarray] | None = None) -> bytes:
+        """What `save` writes, with `more` arrays of the caller's, which `load_with` gives back."""
+        arrays = {name: values[: len(self)] for name, values in self._columns.items()} | dict(more or {})
+        about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash, "distance": self.distance}
+        text = json.dumps({**about, "ids": self.ids})
+        arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+        return safetensors.numpy.save(arrays, metadata={"about": text, "sha256": _checksum(text, arrays)})
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "Index":
@@ -188,14 +194,20 @@ class Index:
         Raises FileNotFoundError; ValueError, naming the file, where it is damaged or, by `weights_hash`, of another
         model.
         """
+        return cls.load_with(path, weights_hash=weights_hash)[0]
+
+    @classmethod
+    def load_with(cls, path: Path | str, *, weights_hash: str | None = None) -> tuple["Index", dict[str, np.ndarray]]:
+        """Read what `to_bytes` made: the index, and the other arrays. Errors are those of `load`."""
         path = Path(path)
         about, arrays = _read(path)
-        index = cls(about["width"], about["weights_hash"], about["distance"], about["ids"], arrays)
+        columns = {name: arrays.pop(name) for name in COLUMNS if name in arrays}
+        index = cls(about["width"], about["weights_hash"], about["distance"], about["ids"], columns)
         try:
             index._check_weights(weights_hash)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        return index
+        return index, arrays
 
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Int[np.ndarray, " n"], k: int

@@ -50,7 +50,7 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
             recording,
             params,
             **options,
-            should_stop=lambda: bool(should_stop() or len(done) >= 5 and _interrupt(should_stop)),
+            should_stop=lambda: bool(should_stop() or (len(done) >= 5 and _interrupt(should_stop))),
             on_progress=done.append,
         )
 

@@ -97,7 +97,7 @@ def test_odometry_far_off_leaves_a_candidate_out_and_margins_are_of_other_places
         assert len(finder.add(Record(points=query), odometry=transform(metres, 0.0, 0.0))) == there
     finder = CandidateFinder(params, config=NOW)
     for k, cloud in enumerate((match, drive.points(0), query)):
-        found = finder.add(Record(points=cloud), odometry=transform((0.0, 30.0, 2.0)[k], 0.0, 0.0))
+        found = finder.add(Record(points=cloud), odometry=transform((0.0, 21.0, 2.0)[k], 0.0, 0.0))
     distances = np.linalg.norm(finder.index.descriptors[:2] - finder.index.descriptors[2], axis=1)
     assert found[0].match == 0
     assert found[0].evidence.margin == pytest.approx(distances[1] - distances[0], rel=1e-4)
@@ -117,7 +117,7 @@ def _candidate(query: int, match: int):
 
 def test_one_probable_frame_is_no_loop_two_in_a_row_are(drive, params, revisit):
     """A model that calls everything a loop, so that what counts is the order of frames."""
-    always = LoopModel({}, {}, {}, 10.0, "everything")
+    always = LoopModel({"distance": 0.0}, {"distance": 0.0}, {"distance": 1.0}, 10.0, "everything")
     config = DetectorConfig(candidates=NOW)
     detector = LoopDetector(params, model=always, config=config)
     places = (revisit[1], revisit[1] + 1, revisit[0] - 1, revisit[0])

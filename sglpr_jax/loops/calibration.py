@@ -1,0 +1,136 @@
+"""The probability of loops fitted to one's own drive, without knowing a single loop of it.
+
+Pairs of frames farther apart than the odometry can have drifted are certainly no loops: of these the ones that look
+most alike are taken. Frames some metres apart in one pass, one of them turned, certainly show one place. They are
+easier than a revisit: what stands about has not moved meanwhile.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from sglpr_jax.bev import even_cells, rotate_image
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.views import picture, rotated
+from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder
+from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
+from sglpr_jax.loops.transforms import travelled
+from sglpr_jax.loops.verification import align
+from sglpr_jax.models.params import Params
+from sglpr_jax.poses import NEGATIVE_M
+
+NEAR_M = (2.0, 10.0)
+"""How far apart the frames of a certain loop are."""
+SAME_PASS_M = 50.0
+"""Of way between them, at most."""
+
+
+def calibrated(
+    params: Params,
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"],
+    *,
+    pairs: int = 200,
+    seed: int = 0,
+    model: LoopModel | None = None,
+    config: CandidateConfig = CandidateConfig(),
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> LoopModel:
+    """The shipped `model` (or the one given), with its log odds stretched and shifted to fit a drive with odometry.
+
+    `pairs` frames are drawn for loops, and as many for others. `odometry` has a pose of the LiDAR for each scan.
+    Raises ValueError for odometry of another length, and for a drive that is too short to have either kind of pair.
+    """
+    evidence, is_loop = certain_pairs(
+        params, recording, odometry, pairs=pairs, seed=seed, config=config, on_progress=on_progress
+    )
+    shipped = default_model(CandidateFinder(params).index.weights_hash) if model is None else model
+    made_with = f"{shipped.made_with}; {is_loop.sum()} loops and {(~is_loop).sum()} others of {recording.name}"
+    return recalibrated(shipped, evidence, is_loop, made_with=made_with)
+
+
+def certain_pairs(
+    params: Params,
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"],
+    *,
+    pairs: int,
+    seed: int = 0,
+    config: CandidateConfig = CandidateConfig(),
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
+    """Evidence of pairs of a drive that are certainly loops or certainly none, and which they are."""
+    n = len(recording)
+    if len(odometry) != n:
+        raise ValueError(
+            f"expected odometry of {n} poses, one for each scan of {recording.name}, found {len(odometry)}"
+        )
+    places = _Places(params, recording, odometry, config)
+    rng = np.random.default_rng(seed)
+    evidence, is_loop = [], []
+    for done, frame in enumerate(rng.permutation(n)[: 2 * pairs]):
+        descriptor, image = places.turned(int(frame), rng.uniform(0, 2 * np.pi))
+        near, far = places.near(int(frame)), places.far(int(frame))
+        rows = rng.permutation(np.flatnonzero(near))[:1] if done % 2 else places.nearest(descriptor, far)
+        for row in rows:
+            evidence.append(places.evidence(descriptor, image, int(row)))
+            is_loop.append(bool(near[row]))
+        on_progress(done + 1)
+    if not evidence or all(is_loop) or not any(is_loop):
+        raise ValueError(
+            f"{recording.name}: expected a drive with frames {NEAR_M[0]:g} to {NEAR_M[1]:g} m apart, and with frames "
+            "farther apart than odometry drifts, found none of one kind: it is too short to calibrate on"
+        )
+    return Evidence.stack(evidence), np.array(is_loop)
+
+
+class _Places:
+    """All frames of a drive, described, with what the odometry says of every two."""
+
+    def __init__(
+        self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], config: CandidateConfig
+    ):
+        self.finder, self.recording, self.config = CandidateFinder(params, config=config), recording, config
+        seen = [self.finder.seen(recording.record(i, labels=False)) for i in range(len(recording))]
+        self.images = [image for _, image in seen]
+        for descriptor, _ in seen:
+            self.finder.index.add(descriptor)
+        self.positions, self.way = odometry[:, :3, 3], travelled(odometry)
+
+    def apart(self, frame: int) -> Float[np.ndarray, " n"]:
+        return np.linalg.norm(self.positions - self.positions[frame], axis=1)
+
+    def near(self, frame: int) -> Bool[np.ndarray, " n"]:
+        """Which frames certainly show the same place, seen from elsewhere."""
+        apart = self.apart(frame)
+        return (apart >= NEAR_M[0]) & (apart <= NEAR_M[1]) & (np.abs(self.way - self.way[frame]) <= SAME_PASS_M)
+
+    def far(self, frame: int) -> Bool[np.ndarray, " n"]:
+        """Which frames certainly show another place."""
+        bound = self.config.gate_m + self.config.gate_share * np.abs(self.way - self.way[frame])
+        return self.apart(frame) > bound
+
+    def nearest(self, descriptor: Float32[np.ndarray, " d"], among: Bool[np.ndarray, " n"]) -> np.ndarray:
+        """The frame of these that looks most like a descriptor; none where there are none."""
+        rows = self.finder.index.query(descriptor, exclude=~among).rows
+        return rows[rows >= 0]
+
+    def turned(self, frame: int, angle: float) -> tuple[Float32[np.ndarray, " d"], UInt8[np.ndarray, "n n"]]:
+        """Descriptor and image of a frame turned by `angle`."""
+        record = self.recording.record(frame, labels=False)
+        if record.points is not None:
+            return self.finder.seen(Record(points=rotated(record.points, angle)))
+        whole = even_cells(jnp.asarray(picture(record, None)[0]))
+        return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
+
+    def evidence(self, descriptor: Float32[np.ndarray, " d"], image: UInt8[np.ndarray, "n n"], row: int) -> Evidence:
+        index = self.finder.index
+        found = jax.device_get(align(image, self.images[row], config=self.finder.verification))
+        distance = float(np.linalg.norm(index.descriptors[row].astype(np.float64) - descriptor))
+        other = float(index.query(descriptor, exclude=self.apart(row) <= NEGATIVE_M).distances[0])
+        margin = other - distance if np.isfinite(other) else np.nan
+        return Evidence.of(distance, margin, found.correlation, found.second)

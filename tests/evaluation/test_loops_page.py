@@ -1,0 +1,45 @@
+"""The page of loops stands alone and shows what was found, also where there is little to show."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from recordings import of_images
+
+from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.page.of_loops import loops_page, write_loops_page
+from sglpr_jax.loops.find import FoundLoops
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import transform
+
+from .test_page import Parsed
+
+
+@pytest.fixture
+def found(tmp_path) -> FoundLoops:
+    rng = np.random.default_rng(0)
+    images = {tmp_path / f"{i:06d}.png": rng.uniform(0, 10, (20, 20)).astype(np.float32) for i in range(8)}
+    odometry = np.stack([transform(float(x), 0.0, 0.0) for x in range(8)])
+    loops = tuple(Loop(q, q - 4, transform(1.0, 2.0, 0.3), np.eye(6), 0.99 + q / 1000) for q in (5, 6, 7))
+    return FoundLoops(of_images(images, times=np.arange(8.0)), 8, loops, (), odometry)
+
+
+def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_path):
+    page = Parsed(write_loops_page(found, tmp_path).read_text())
+    assert [headline for headline, _ in page.images] == ["Where", "Where", "Pairs"]
+    assert all(address.startswith("data:") for address in page.addresses)
+    table = page.texts["Loops"]
+    assert "0.9950" in table and "000005" in table and "17.2" in table
+
+
+def test_without_odometry_or_loops_or_frames_it_says_so(found):
+    assert len(Parsed(loops_page(dataclasses.replace(found, odometry=None))).images) == 2
+    none = dataclasses.replace(found, loops=())
+    assert loops_page(none).count("No loops.") == 2
+    assert "No scan was looked at." in loops_page(dataclasses.replace(none, frames=0))
+
+
+def test_without_matplotlib_there_is_a_table(found, monkeypatch):
+    monkeypatch.setattr(figures, "can_draw", lambda: False)
+    page = loops_page(found)
+    assert "sglpr-jax[viz]" in page and "0.9950" in page and not Parsed(page).images

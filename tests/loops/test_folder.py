@@ -1,0 +1,40 @@
+"""The folder of what was found holds what each program reads, of the frames that were looked at."""
+
+import numpy as np
+import pytest
+from recordings import of_images
+
+from sglpr_jax.files import WriteError
+from sglpr_jax.loops.find import FoundLoops
+from sglpr_jax.loops.folder import write_found
+from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_csv, read_loops_jsonl, read_tum
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import transform
+
+
+@pytest.fixture
+def found(tmp_path) -> FoundLoops:
+    images = {tmp_path / f"{i:06d}.png": np.eye(8, dtype=np.float32) for i in range(6)}
+    odometry = np.stack([transform(float(x), 0.0, 0.1 * x) for x in range(6)])
+    loop = Loop(4, 0, transform(1.0, 2.0, 0.3), np.eye(6), 0.995)
+    return FoundLoops(of_images(images, times=10.0 + np.arange(6)), 5, (loop,), (), odometry)
+
+
+def test_all_files_are_of_the_frames_looked_at(found, tmp_path):
+    paths = write_found(found, tmp_path / "out")
+    assert sorted(path.name for path in paths) == sorted(path.name for path in (tmp_path / "out").iterdir())
+    graph = read_g2o(tmp_path / "out" / "loops.g2o")
+    assert len(graph.poses) == 5 and [(i, j) for i, j, *_ in graph.edges] == [(0, 1), (1, 2), (2, 3), (3, 4), (0, 4)]
+    poses, times = read_tum(tmp_path / "out" / "trajectory.tum")
+    np.testing.assert_allclose(poses, found.odometry[:5], atol=1e-6)
+    np.testing.assert_allclose(times, found.recording.times[:5])
+    np.testing.assert_allclose(read_kitti(tmp_path / "out" / "trajectory.kitti"), found.odometry[:5], atol=1e-6)
+    assert (
+        len(read_loops_jsonl(tmp_path / "out" / "loops.jsonl")) == 1 == len(read_loops_csv(tmp_path / "out/loops.csv"))
+    )
+
+
+def test_a_file_that_cannot_be_written_is_named(found, tmp_path):
+    (tmp_path / "out").write_text("a file, no folder")
+    with pytest.raises(WriteError, match="out"):
+        write_found(found, tmp_path / "out")
