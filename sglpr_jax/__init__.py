@@ -18,58 +18,77 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
-from sglpr_jax.data import Record, Recording, open_recording, read_scan, recording_names
-from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.data.mounting import Mounting, estimate_mounting
-from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes
-from sglpr_jax.models.backbones.rings import RingConfig
-from sglpr_jax.models.backbones.sglpr import SglprConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import MODELS, model_preset
-from sglpr_jax.models.sglpr import Outputs, describe, forward, init, is_describable, segment
-from sglpr_jax.models.shipped import shipped_weights
-from sglpr_jax.models.weights import for_places
-from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import embed, scan_image
-from sglpr_jax.retrieval.index import Index
-from sglpr_jax.retrieval.nearest import Nearest, nearest
-
 if TYPE_CHECKING:
+    from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
+    from sglpr_jax.data import Record, Recording, open_recording, read_scan, recording_names
+    from sglpr_jax.data.density_image import density_bev
+    from sglpr_jax.data.mounting import Mounting, estimate_mounting
     from sglpr_jax.evaluation.scoring import Evaluation, evaluate
+    from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes
     from sglpr_jax.loops.detector import LoopDetector
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.loop import Loop
+    from sglpr_jax.models.backbones.rings import RingConfig
+    from sglpr_jax.models.backbones.sglpr import SglprConfig
+    from sglpr_jax.models.backbones.swin import SwinConfig
+    from sglpr_jax.models.config import HeadConfig, ModelConfig
+    from sglpr_jax.models.params import Params
+    from sglpr_jax.models.presets import MODELS, model_preset
     from sglpr_jax.models.program import save_program
+    from sglpr_jax.models.sglpr import Outputs, describe, forward, init, is_describable, segment
+    from sglpr_jax.models.shipped import shipped_weights
+    from sglpr_jax.models.weights import for_places
+    from sglpr_jax.models.weights_file import load, save
+    from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+    from sglpr_jax.retrieval.embed import embed, scan_image
+    from sglpr_jax.retrieval.index import Index
+    from sglpr_jax.retrieval.nearest import Nearest, nearest
     from sglpr_jax.sim.simulation import simulate
     from sglpr_jax.training.presets import load_preset as preset
     from sglpr_jax.training.recipe import TrainResult, train
 
 __version__ = "0.1.0"
 
-_LATER = {
-    "Evaluation": ("evaluation.scoring", "Evaluation"),
-    "evaluate": ("evaluation.scoring", "evaluate"),
-    "save_program": ("models.program", "save_program"),
-    "Loop": ("loops.loop", "Loop"),
-    "LoopDetector": ("loops.detector", "LoopDetector"),
-    "find_loops": ("loops.find", "find_loops"),
-    "simulate": ("sim.simulation", "simulate"),
-    "preset": ("training.presets", "load_preset"),
-    "TrainResult": ("training.recipe", "TrainResult"),
-    "train": ("training.recipe", "train"),
+_HOMES = {
+    "bev": ("Grid", "count_outside", "rasterize", "rasterize_labels", "rotate_image", "rotate_points"),
+    "data": ("Record", "Recording", "open_recording", "read_scan", "recording_names"),
+    "data.density_image": ("density_bev",),
+    "data.mounting": ("Mounting", "estimate_mounting"),
+    "evaluation.scoring": ("Evaluation", "evaluate"),
+    "labels": ("CATEGORIES", "taxonomy", "to_classes"),
+    "loops.detector": ("LoopDetector",),
+    "loops.find": ("find_loops",),
+    "loops.loop": ("Loop",),
+    "models.backbones.rings": ("RingConfig",),
+    "models.backbones.sglpr": ("SglprConfig",),
+    "models.backbones.swin": ("SwinConfig",),
+    "models.config": ("HeadConfig", "ModelConfig"),
+    "models.params": ("Params",),
+    "models.presets": ("MODELS", "model_preset"),
+    "models.program": ("save_program",),
+    "models.sglpr": ("Outputs", "describe", "forward", "init", "is_describable", "segment"),
+    "models.shipped": ("shipped_weights",),
+    "models.weights": ("for_places",),
+    "models.weights_file": ("load", "save"),
+    "retrieval.descriptor_file": ("DescriptorFile",),
+    "retrieval.embed": ("embed", "scan_image"),
+    "retrieval.index": ("Index",),
+    "retrieval.nearest": ("Nearest", "nearest"),
+    "sim.simulation": ("simulate",),
+    "training.presets": ("preset",),
+    "training.recipe": ("TrainResult", "train"),
 }
-"""Imported when they are first asked for: training, scoring, loops and simulating bring as much along as the rest."""
+"""Where each name is defined. It is imported when it is first asked for: JAX alone takes most of a second."""
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+_THERE = {"preset": "load_preset"}
+"""Names that are others at home."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, attribute = _LATER[name]
-    globals()[name] = getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+    home = importlib.import_module(f"{__name__}.{_HOME_OF[name]}")
+    globals()[name] = getattr(home, _THERE.get(name, name))
     return globals()[name]
 
 

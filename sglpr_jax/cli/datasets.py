@@ -10,7 +10,7 @@ from sglpr_jax import sim
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Recording, readers
 from sglpr_jax.data import leave_one_out as split
-from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.sim.simulation import Simulated, default_dataset, default_sessions
 
 

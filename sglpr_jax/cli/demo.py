@@ -55,7 +55,7 @@ def demo(command: DemoCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: demo(parse_command(DemoCommand, "demo")))
+    run(lambda: parse_command(DemoCommand, "demo"), demo)
 
 
 if __name__ == "__main__":

@@ -4,13 +4,9 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.formats.trajectory import PoseFormat
-from sglpr_jax.data.reader import PoseChoice, SensorHeight
-from sglpr_jax.methods.registry import MethodName, method_named
-from sglpr_jax.retrieval.embed import embed
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
+from sglpr_jax.methods.names import MethodName
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +55,10 @@ class EmbedCommand:
 
 def embed_recording(command: EmbedCommand) -> Path:
     """Do what the command says; returns the file written."""
+    from sglpr_jax.cli.datasets import open_recording  # these bring JAX and more, which --help does not need
+    from sglpr_jax.methods.registry import method_named
+    from sglpr_jax.retrieval.embed import embed
+
     if command.out.suffix != ".npz":
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
@@ -95,7 +95,7 @@ def _report(scan: str, error: Exception) -> None:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: embed_recording(parse_command(EmbedCommand, "embed")))
+    run(lambda: parse_command(EmbedCommand, "embed"), embed_recording)
 
 
 if __name__ == "__main__":

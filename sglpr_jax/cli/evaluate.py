@@ -8,9 +8,8 @@ import tyro
 
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data import open_recording
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.formats.trajectory import PoseFormat, read_trajectory
-from sglpr_jax.data.reader import SensorHeight
+from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.formats.trajectory import read_trajectory
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.inputs.methods import read_methods
 from sglpr_jax.evaluation.page.recording_pictures import check_same_frames, poses_of, take_pictures
@@ -145,7 +144,7 @@ def _folder(file: Path) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: evaluate_file(parse_command(EvaluateCommand, "evaluate")))
+    run(lambda: parse_command(EvaluateCommand, "evaluate"), evaluate_file)
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def export(command: ExportCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: export(parse_command(ExportCommand, "export")))
+    run(lambda: parse_command(ExportCommand, "export"), export)
 
 
 if __name__ == "__main__":

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.runtime import progress_bar, run, stop_on_signal
+from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data import open_recording
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.evaluation.page.of_loops import write_loops_page
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
@@ -77,7 +76,7 @@ def loops_of_recording(command: LoopsCommand) -> int:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: sys.exit(loops_of_recording(tyro.cli(LoopsCommand, prog="loops"))))
+    run(lambda: parse_command(LoopsCommand, "loops"), lambda command: sys.exit(loops_of_recording(command)))
 
 
 if __name__ == "__main__":

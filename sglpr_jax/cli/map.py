@@ -6,10 +6,9 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.runtime import progress_bar, run
+from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.data import open_recording
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
 from sglpr_jax.loops.places import SPACING_M, PlaceMap
 from sglpr_jax.models.weights import weights_hash
@@ -67,7 +66,7 @@ def write_map(command: MapCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: write_map(tyro.cli(MapCommand, prog="map")))
+    run(lambda: parse_command(MapCommand, "map"), write_map)
 
 
 if __name__ == "__main__":

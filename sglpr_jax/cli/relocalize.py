@@ -8,8 +8,8 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from sglpr_jax.cli.runtime import console, run
-from sglpr_jax.data.formats.scan_files import ScanFormat
+from sglpr_jax.cli.runtime import console, parse_command, run
+from sglpr_jax.data.choices import ScanFormat
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.record import Record, scan_record
 from sglpr_jax.files import write_json
@@ -74,7 +74,7 @@ def _table(scan: Path, found: list[Relocated]) -> Table:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: relocalize(tyro.cli(RelocalizeCommand, prog="relocalize")))
+    run(lambda: parse_command(RelocalizeCommand, "relocalize"), relocalize)
 
 
 if __name__ == "__main__":

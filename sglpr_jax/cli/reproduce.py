@@ -12,7 +12,7 @@ from sglpr_jax.cli.datasets import cached_sessions, dataset_root
 from sglpr_jax.cli.runtime import console, parse_command, preset_asked_for, progress_bar, run, stop_on_signal
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data import recording_names
-from sglpr_jax.data.readers.kitti import PoseChoice
+from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.files import write_json
 from sglpr_jax.reproduce.check import check
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
@@ -109,7 +109,7 @@ def reproduce(command: ReproduceCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: reproduce(parse()))
+    run(parse, reproduce)
 
 
 if __name__ == "__main__":

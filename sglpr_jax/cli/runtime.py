@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -49,8 +48,8 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
     return tyro.cli(command, args=arguments, **about)
 
 
-def run(command: Callable[[], object]) -> None:
-    """Run a command line: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
+def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
+    """Parse a command line and do its work: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
     for chatty in ("absl", "asyncio"):  # pages about a checkpoint that failed, which orbax raises too
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)  # the same at the very end
@@ -58,15 +57,23 @@ def run(command: Callable[[], object]) -> None:
     warnings.simplefilter("always", DataWarning)
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _show_unraisable
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # where the user has chosen a place, JAX has read it
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     try:
-        command()
+        command = parse()
+        _keep_compiled_programs()
+        work(command)
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
         sys.exit(own_names(f"error: {' '.join(str(error).split())}"))
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _keep_compiled_programs() -> None:
+    """For the next start; where the user has chosen a place for them, JAX has read it."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        import jax  # takes most of a second, which --help and a wrong flag need not wait for
+
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 
 from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.reader import SensorHeight
+from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.evaluation.segmentation import map_confusion
 from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
 from sglpr_jax.files import write_json
@@ -76,7 +75,7 @@ def segment_recording(command: SegmentCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: segment_recording(parse_command(SegmentCommand, "segment")))
+    run(lambda: parse_command(SegmentCommand, "segment"), segment_recording)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def write_simulation(command: SimulateCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: write_simulation(parse_command(SimulateCommand, "simulate")))
+    run(lambda: parse_command(SimulateCommand, "simulate"), write_simulation)
 
 
 if __name__ == "__main__":

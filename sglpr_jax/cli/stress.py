@@ -6,13 +6,12 @@ from pathlib import Path
 
 from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.formats.trajectory import PoseFormat
-from sglpr_jax.data.reader import PoseChoice, SensorHeight
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
-from sglpr_jax.methods.registry import MethodName, methods_named
+from sglpr_jax.methods.names import MethodName
+from sglpr_jax.methods.registry import methods_named
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +96,7 @@ def run_stress_test(command: StressCommand) -> Path:
 
 def main() -> None:
     """The entry point."""
-    run(lambda: run_stress_test(parse_command(StressCommand, "stress")))
+    run(lambda: parse_command(StressCommand, "stress"), run_stress_test)
 
 
 if __name__ == "__main__":

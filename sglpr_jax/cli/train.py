@@ -20,8 +20,8 @@ from sglpr_jax.cli.runtime import (
     stop_on_signal,
 )
 from sglpr_jax.data import Recording
+from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.pseudo_labels import with_pseudo_labels
-from sglpr_jax.data.readers.kitti import PoseChoice
 from sglpr_jax.evaluation.final_test import BESIDE, BesideName, final_test
 from sglpr_jax.evaluation.learning_curves import LearningCurves
 from sglpr_jax.training.callbacks import Callbacks
@@ -176,7 +176,7 @@ def _pseudo_labelled(recordings: Sequence[Recording], folder: Path, config: Trai
 
 def main() -> None:
     """The entry point."""
-    run(lambda: print(f"run: {train_and_test(parse())}"))
+    run(parse, lambda command: print(f"run: {train_and_test(command)}"))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from sglpr_jax.data.reader import PoseChoice
+from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.recording import Recording
 

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
-from sglpr_jax.data.reader import SensorHeight
 from sglpr_jax.data.recording import Recording
 
 SCANS = 11

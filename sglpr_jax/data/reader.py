@@ -3,19 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from sglpr_jax.data.formats.scan_files import ScanFormat
-from sglpr_jax.data.formats.trajectory import PoseFormat
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat
 from sglpr_jax.data.recording import Recording
-
-PoseChoice = Literal["auto", "semantickitti", "kitti"]
-"""Which of the two pose files of KITTI's layout."""
-
-
-SensorHeight = float | Literal["auto", "estimate"]
-"""Metres over the ground; "estimate" finds them, and the tilt, from the scans; "auto" does where the layout does not
-tell how the sensor was mounted."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from sglpr_jax.data.formats.bin_records import RecordFormat
+from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.label_images import read_label_image
-from sglpr_jax.data.formats.scan_files import ScanFormat, read_labels, read_points_and_lasers
+from sglpr_jax.data.formats.scan_files import read_labels, read_points_and_lasers
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.labels import to_classes
 

@@ -16,7 +16,8 @@ from sglpr_jax.evaluation.semantic_score import SemanticScore, score_semantics
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import Method
-from sglpr_jax.methods.registry import NETWORK, handcrafted, network
+from sglpr_jax.methods.names import NETWORK
+from sglpr_jax.methods.registry import handcrafted, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.progress import Progress, no_progress

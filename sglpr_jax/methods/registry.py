@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -11,22 +10,13 @@ from sglpr_jax.bev import Grid
 from sglpr_jax.data import Recording
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
+from sglpr_jax.methods.names import NETWORK
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
-
-NETWORK = "sglpr"
-METHODS = (NETWORK, *HANDCRAFTED)
-"""The names of all methods."""
-
-if TYPE_CHECKING:
-    MethodName = str
-else:
-    MethodName = Literal[METHODS]
-"""One of `METHODS`: a command line lists them in its help and refuses others."""
 
 
 def method_named(name: str, weights: str | None, recording: Recording) -> Method:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sglpr_jax.data import Recording, open_recording, recording_names
+from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION
-from sglpr_jax.data.readers.kitti import PoseChoice
 from sglpr_jax.evaluation.learning_curves import LearningCurves
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.methods.method import Method

@@ -8,7 +8,7 @@ import pytest
 from sglpr_jax.methods import handcrafted as package
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod
-from sglpr_jax.methods.registry import METHODS
+from sglpr_jax.methods.names import METHODS
 from sglpr_jax.retrieval.distances import DISTANCES
 
 

@@ -4,27 +4,12 @@ A `.bin` does not say what it holds; `record_size.py` finds it out.
 """
 
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeGuard, get_args
+from typing import NamedTuple, TypeGuard, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
-RecordFormat = Literal[
-    "kitti",
-    "nuscenes",
-    "nclt",
-    "float32x3",
-    "float32x4",
-    "float32x5",
-    "float32x6",
-    "float32x7",
-    "float32x8",
-    "float64x3",
-    "float64x4",
-    "float64x5",
-    "float64x6",
-]
-"""kitti is float32x4; nuscenes is float32x5 with other axes and the laser in the last column."""
+from sglpr_jax.data.choices import RecordFormat
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 NCLT_UNIT_M = 0.005

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.choices import PoseFormat
 from sglpr_jax.data.formats.pose_files import read_times
-from sglpr_jax.data.formats.trajectory import PoseFormat, read_trajectory
+from sglpr_jax.data.formats.trajectory import read_trajectory
 
 POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
 TIMES_FILE = "times.txt"

@@ -16,7 +16,8 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.bin_records import RecordFormat, described, read_records, record_type
+from sglpr_jax.data.choices import RecordFormat
+from sglpr_jax.data.formats.bin_records import described, read_records, record_type
 from sglpr_jax.data.warning import warn
 
 MOST_M = 300.0

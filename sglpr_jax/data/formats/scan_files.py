@@ -2,19 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.arrays import read_npy, read_npz
-from sglpr_jax.data.formats.bin_records import RecordFormat, is_record, read_records
+from sglpr_jax.data.formats.bin_records import is_record, read_records
 from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.formats.pcd import read_pcd
 from sglpr_jax.data.formats.ply import read_ply
-
-ScanFormat = Literal["auto", "pcd", "ply", "npy", "npz", "las", RecordFormat]
-"""What a scan file is; "auto": what its name says."""
 
 READERS: dict[ScanFormat, Callable[[Path], Float32[np.ndarray, "n 3"]]] = {
     "pcd": read_pcd,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from sglpr_jax.data.choices import PoseFormat
 from sglpr_jax.data.formats.pose_files import (
     ROTATION_TOLERANCE,
     check_positions,
@@ -26,8 +27,6 @@ from sglpr_jax.data.formats.pose_files import (
 )
 from sglpr_jax.data.warning import warn
 from sglpr_jax.poses import positions_from_camera
-
-PoseFormat = Literal["auto", "kitti", "lidar", "tum", "csv"]
 
 MOST_HEIGHT_M = 100.0
 """Over a drive; more is believed where it reaches farther still on the ground."""

@@ -8,10 +8,10 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat
-from sglpr_jax.data.formats.trajectory import PoseFormat
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.mounted import mounted
-from sglpr_jax.data.reader import PoseChoice, Reader, ReadOptions, SensorHeight
+from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
 
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.choices import PoseChoice, ScanFormat
 from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 from sglpr_jax.data.formats.record_size import unusual_record
-from sglpr_jax.data.formats.scan_files import ScanFormat
 from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.reader import PoseChoice, Reader
+from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.poses import positions_from_camera

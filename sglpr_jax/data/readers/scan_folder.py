@@ -9,11 +9,12 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
-from sglpr_jax.data.formats.bin_records import RecordFormat, described, is_record
+from sglpr_jax.data.choices import PoseFormat, RecordFormat, ScanFormat
+from sglpr_jax.data.formats.bin_records import described, is_record
 from sglpr_jax.data.formats.folder_poses import POSE_FILES, TIMES_FILE, folder_trajectory
 from sglpr_jax.data.formats.record_size import check_record, find_record
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, ScanFormat, guess_format, says_its_format, scan_id
-from sglpr_jax.data.formats.trajectory import PoseFormat, check_order
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, guess_format, says_its_format, scan_id
+from sglpr_jax.data.formats.trajectory import check_order
 from sglpr_jax.data.listing import files_in, left_aside
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record

@@ -1,6 +1,6 @@
 """Methods that need no training: each file has a pure function and declares what it takes.
 
-A new one is a file here and its name in the list.
+A new one is a file here, an entry of the list, and its name in `methods/names.py`.
 """
 
 from sglpr_jax.methods.handcrafted.lidar_iris import LIDAR_IRIS
