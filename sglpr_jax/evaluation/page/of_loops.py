@@ -62,8 +62,8 @@ def _pairs(found: FoundLoops) -> str:
 
 
 def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
-    images = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
-    return overlaid(*images, loop.match_from_query)
+    query, match = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
+    return overlaid(query, match, loop.match_from_query)
 
 
 def _title(loop: Loop) -> str:
