@@ -149,7 +149,9 @@ def test_weights_of_another_model_or_damaged_ones_are_named(embed, town, trained
     options = ("--data", town, "--seq", "08", "--weights", folder)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "backbone": {**config["backbone"], "embed_dim": 16}}))
-    assert_one_line_error(embed(*options)[0], folder / "model.safetensors", "expected the weights of its configuration", "found")
+    assert_one_line_error(
+        embed(*options)[0], folder / "model.safetensors", "expected the weights of its configuration", "found"
+    )
     (folder / "config.json").write_text(json.dumps({**config, "unknown": 1}))
     assert_one_line_error(embed(*options)[0], folder / "config.json", "ModelConfig", "unknown")
     (folder / "config.json").write_text(json.dumps(config)[:-20])
