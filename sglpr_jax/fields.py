@@ -53,6 +53,11 @@ def field_types(config: type) -> dict[str, Any]:
     return typing.get_type_hints(config, include_extras=True)
 
 
+def is_config(annotation: Any) -> bool:
+    """Whether a field with this annotation holds a configuration of its own."""
+    return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
+
+
 def check_value(value: Any, annotation: Any, field: str) -> None:
     """Raise ValueError, which begins with `field`, unless a field with this annotation may hold the value."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
@@ -69,7 +74,7 @@ def check_value(value: Any, annotation: Any, field: str) -> None:
     elif annotation is float:
         require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
         require(value, abs(value) <= sys.float_info.max, "a finite number", field)  # no whole number is too long for it
-    elif dataclasses.is_dataclass(annotation):
+    elif is_config(annotation):
         require(value, isinstance(value, annotation), f"the fields of a {annotation.__name__}", field)
     else:
         expected = "null" if annotation is types.NoneType else f"a value of type {annotation.__name__}"
@@ -88,7 +93,7 @@ def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
     """One member must hold it. The first says what was expected, or all, where they are configurations."""
     if value is None and types.NoneType in members:
         return
-    configs = [member for member in members if dataclasses.is_dataclass(member)]
+    configs = [member for member in members if is_config(member)]
     if configs:
         names = " or ".join(member.__name__ for member in configs)
         require(value, isinstance(value, tuple(configs)), f"the fields of a {names}", field)

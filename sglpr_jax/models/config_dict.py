@@ -1,12 +1,11 @@
 """A model's configuration from the plain values of a JSON file, every one of which must fit its field."""
 
-import dataclasses
 import types
 import typing
 from pathlib import Path
 from typing import Annotated, Any
 
-from sglpr_jax.fields import check_value, field_types, require
+from sglpr_jax.fields import check_value, field_types, is_config, require
 from sglpr_jax.models.config import ModelConfig
 
 ADDED_LATER = {"head.means": (), "head.whiten": False}
@@ -27,7 +26,7 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 def _read(annotation: Any, value: Any, field: str) -> Any:
     """The value of a field: dictionaries become dataclasses, lists tuples and whole numbers floats where one is due."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
-    if dataclasses.is_dataclass(annotation):
+    if is_config(annotation):
         return _read_dataclass(annotation, value, field)
     if origin in (typing.Union, types.UnionType):
         return None if value is None and types.NoneType in parts else _read(_member(parts, value, field), value, field)
@@ -65,7 +64,7 @@ def _differing(value: dict[str, Any], annotations: dict[str, Any]) -> tuple[set[
 
 def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:
     """The member of a union that a value belongs to; of several configurations the one of its `kind`."""
-    configs: dict[str, Any] = {member.kind: member for member in members if dataclasses.is_dataclass(member)}
+    configs: dict[str, Any] = {member.kind: member for member in members if is_config(member)}
     if not configs:
         return next(member for member in members if member is not types.NoneType)
     names = " or ".join(member.__name__ for member in configs.values())

@@ -79,7 +79,7 @@ class Checkpoints:
         items = ocp.args.Composite(
             weights=ocp.args.StandardSave(state.params.weights),
             optimizer=ocp.args.StandardSave(state.optimizer),
-            unlogged=ocp.args.JsonSave([dict(measured) for measured in unlogged]),
+            unlogged=ocp.args.JsonSave({_UNLOGGED: [dict(measured) for measured in unlogged]}),
         )
         with self._writing():
             self._manager.save(
@@ -125,7 +125,7 @@ class Checkpoints:
         """The measurements that the newest state was saved with."""
         self._wait()
         found: Any = self._manager.restore(self.latest_step(), args=ocp.args.Composite(unlogged=ocp.args.JsonRestore()))
-        return found.unlogged
+        return found.unlogged[_UNLOGGED]
 
     def best_params(self, config: TrainConfig) -> Params:
         """The weights of the best score among the checkpoints kept, the later of equal ones. ValueError without one."""
