@@ -76,7 +76,7 @@ def test_las_is_scaled_and_moved_as_its_header_says(tmp_path):
     path = write_las(tmp_path / "a.las", CLOUD.astype(np.float64))
     np.testing.assert_allclose(read_las(path), CLOUD, atol=1e-3)
     whole = path.read_bytes()
-    path.write_bytes(whole[:-40])
+    path.write_bytes(whole[:-68])
     with pytest.raises(ValueError, match=r"a\.las: expected 4 points, as its header says, found 2"):
         read_las(path)
     path.write_bytes(whole[:100])
