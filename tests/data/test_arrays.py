@@ -75,7 +75,11 @@ def write_las(path, points):
 def test_las_is_scaled_and_moved_as_its_header_says(tmp_path):
     path = write_las(tmp_path / "a.las", CLOUD.astype(np.float64))
     np.testing.assert_allclose(read_las(path), CLOUD, atol=1e-3)
-    path.write_bytes(path.read_bytes()[:100])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-68])
+    with pytest.raises(ValueError, match=r"a\.las: expected 4 points, as its header says, found 2"):
+        read_las(path)
+    path.write_bytes(whole[:100])
     with pytest.raises(ValueError, match=r"a\.las: expected a \.las file, found none that can be read"):
         read_las(path)
     with pytest.raises(ValueError, match=r"e\.las: expected at least one point"):
@@ -101,3 +105,22 @@ def test_beside_other_scans_arrays_are_none(tmp_path):
     np.savez(tmp_path / "mine.npz", about=np.zeros(3))
     recording = open_recording(tmp_path)
     assert recording.ids == ("0",) and recording.found[-1] == "left aside: 1 .npz"
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "las"])
+def test_no_flipped_byte_comes_through_as_another_error(tmp_path, kind):
+    """Each byte of the headers changed in turn: points, or one ValueError that names the file."""
+    path = tmp_path / f"a.{kind}"
+    {"npy": np.save, "npz": np.savez, "las": lambda path, points: write_las(path, points.astype(np.float64))}[kind](
+        path, CLOUD
+    )
+    whole, read = path.read_bytes(), {"npy": read_npy, "npz": read_npz, "las": read_las}[kind]
+    refused = 0
+    for at in range(0, len(whole), 1 if kind == "npy" else 3):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x15]) + whole[at + 1 :])
+        try:
+            assert read(path).shape[1] == 3
+        except ValueError as error:
+            refused += 1
+            assert str(error).startswith(str(path))
+    assert refused > 5

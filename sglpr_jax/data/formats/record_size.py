@@ -55,7 +55,9 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
         return None, "too few points to find out"
     strange: dict[RecordFormat, str] = {name: strangeness(chosen, name) for name in CANDIDATES}
     fits: list[RecordFormat] = [name for name in CANDIDATES if not strange[name]]
-    simplest = [name for name in fits if not any(_repeats(name, other) for other in fits if other != name)]
+    simplest: list[RecordFormat] = [
+        name for name in fits if not any(_repeats(name, other) for other in fits if other != name)
+    ]
     if len(simplest) == 1:
         return simplest[0], f"found from {len(chosen)} of {len(paths)} scans"
     reasons = dict.fromkeys(strange.values())
