@@ -1,7 +1,8 @@
-"""Score loops: on simulated drives with drifting odometry, and on ready-made images with and without verification.
+"""Score loops: on simulated drives with drifting odometry, on ready-made images with and without verification; speed.
 
     python benchmarks/loops.py simulated --towns 08:101 00:102
     python benchmarks/loops.py images --data BEV_IMAGES --seqs 06
+    python benchmarks/loops.py speed
 
 The odometry is that of the true poses, made 1 % too long and turned by half a degree every 100 m, with noise.
 """
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float
@@ -27,6 +29,7 @@ from sglpr_jax.loops.find import settled
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.verification import align_all
 from sglpr_jax.models.params import Params
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
@@ -96,6 +99,39 @@ class Images:
                 ("most probable, loops that were kept first", log_odds + bonus),
             ):
                 score_top1(title, recording, detector.candidates, np.asarray(scores))
+
+
+@dataclasses.dataclass(frozen=True)
+class Speed:
+    """Processor time of each part, with so many frames behind: of one core under `taskset -c 0`."""
+
+    frames: int = 4541
+    repeats: int = 20
+    azimuth_steps: int = 900
+    weights: str = "simulated"
+
+    def run(self) -> None:
+        detector = LoopDetector(sglpr_jax.load(self.weights))
+        finder, sensor = detector.finder, dataclasses.replace(HDL64E, azimuth_steps=self.azimuth_steps)
+        drive = simulate_recording("08", scans=60, sensor=sensor, seed=101)
+        records = [drive.record(i, labels=False) for i in range(20)]
+        rows = np.random.default_rng(0).normal(size=(self.frames, finder.index.width)).astype(np.float32)
+        finder.index.add(rows / np.linalg.norm(rows, axis=1, keepdims=True), times=np.arange(self.frames) / 10)
+        image = finder.seen(records[0])[1]
+        finder.images += [image] * self.frames
+        clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
+        matches = np.stack([image] * finder.config.candidates)
+        for name, work in (
+            ("image and descriptor", lambda i: finder.seen(records[i % 20])),
+            ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder.index.recent(500.0))),
+            ("verification", lambda i: jax.block_until_ready(align_all(image, matches))),
+            ("all of it", lambda i: detector.add(records[i % 20], time=float(next(clock)))),
+        ):
+            work(0)
+            start = time.process_time()
+            for i in range(self.repeats):
+                work(i)
+            print(f"{name}: {1e3 * (time.process_time() - start) / self.repeats:.1f} ms of processor time a scan")
 
 
 def drifted(poses: Float[np.ndarray, "n 4 4"], *, seed: int) -> Float[np.ndarray, "n 4 4"]:
@@ -216,5 +252,7 @@ def score_top1(
 
 if __name__ == "__main__":
     tyro.cli(
-        Annotated[Simulated, tyro.conf.subcommand("simulated")] | Annotated[Images, tyro.conf.subcommand("images")]
+        Annotated[Simulated, tyro.conf.subcommand("simulated")]
+        | Annotated[Images, tyro.conf.subcommand("images")]
+        | Annotated[Speed, tyro.conf.subcommand("speed")]
     ).run()

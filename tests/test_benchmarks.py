@@ -111,6 +111,16 @@ def test_loops_are_scored_on_images(tmp_path):
     assert "nearest descriptor: top-1 F1max" in output and "most probable of three: top-1 F1max" in output
 
 
+def test_the_parts_of_a_loop_are_timed():
+    output = printed("loops.py", "speed", "--frames", "300", "--repeats", "2", "--azimuth-steps", "90")
+    assert [line.split(":")[0] for line in output.splitlines()][-4:] == [
+        "image and descriptor",
+        "query",
+        "verification",
+        "all of it",
+    ]
+
+
 def test_models_of_loops_are_fitted_and_written(tmp_path):
     output = printed("fit_loops.py", *SMALL, "--out", str(tmp_path / "models.json"))
     assert "simulated: LoopModel" in output
