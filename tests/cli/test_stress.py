@@ -139,7 +139,7 @@ def test_scans_without_poses_or_rings_are_refused_before_any_work(stress, tmp_pa
     scans.mkdir()
     for i in range(3):
         np.random.default_rng(i).normal(scale=9, size=(3000, 4)).astype("<f4").tofile(scans / f"{i}.bin")
-    options = ("--data", scans, "--method", "solid")
+    options = ("--data", scans, "--method", "solid", "--format", "kitti")
     assert_one_line_error(stress(*options)[0], "my_scans", "expected poses")
     np.savetxt(scans / "poses.txt", np.tile(np.eye(3, 4).ravel(), (3, 1)))
     only_beams = stress(*options, "--corruption", "beams")[0]
