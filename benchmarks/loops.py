@@ -119,6 +119,7 @@ class Speed:
         finder.index.add(rows / np.linalg.norm(rows, axis=1, keepdims=True), times=np.arange(self.frames) / 10)
         image = finder.seen(records[0])[1]
         finder.images += [image] * self.frames
+        finder.empty += [False] * self.frames
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
         matches = np.stack([image] * finder.config.candidates)
         for name, work in (

@@ -34,6 +34,8 @@ class CandidateConfig:
     """Scans younger than this are neighbours and no loop: seconds, or frames where there are no times."""
     other_place_frames: int = 50
     """Without odometry, scans so many frames apart are taken for other places."""
+    min_cells: int = 50
+    """Images of fewer occupied cells, of a sensor that was covered or failed, show no place."""
     gate_m: float = 20.0
     gate_share: float = 0.05
     """With odometry, a candidate is no farther than `gate_m`, and this share of the way since, from where it says."""
@@ -66,6 +68,8 @@ class CandidateFinder:
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
+        self.empty: list[bool] = []
+        """Which frames show next to nothing."""
 
     def add(
         self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
@@ -80,10 +84,13 @@ class CandidateFinder:
         query = len(self.index)
         position = None if odometry is None else np.asarray(odometry, np.float64)[:3, 3]
         excluded = self._excluded(time, position)
+        empty = self.is_empty(image)
+        excluded = excluded | empty
         rows, distances = self.index.query(descriptor, self.config.candidates, exclude=excluded)
         others = [self._other_place(descriptor, int(row), excluded) for row in rows if row >= 0]
         self.index.add(descriptor, times=time, positions=position)
         self.images.append(image)
+        self.empty.append(empty)
         if odometry is not None:
             self.odometry.append(np.asarray(odometry, np.float64))
         rows, distances = rows[rows >= 0], distances[rows >= 0]
@@ -109,6 +116,10 @@ class CandidateFinder:
             bev = view(record, model.grid, image=model.image).image
         return np.asarray(describe(self.params, bev)), _kept(whole)
 
+    def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
+        """Whether an image shows too little to tell a place by."""
+        return bool(np.count_nonzero(image) < self.config.min_cells)
+
     def _check(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self.index):
             return
@@ -122,9 +133,10 @@ class CandidateFinder:
             raise ValueError(f"expected times that do not go back, found {time} after {self.index.times[-1]}")
 
     def _excluded(self, time: float | None, position: Float[np.ndarray, " 3"] | None) -> Bool[np.ndarray, " n"]:
-        """Which frames are no candidates of the next one: too young, or too far off by odometry."""
+        """Which frames are no candidates of the next one: too young, next to empty, or too far off by odometry."""
         config, known = self.config, self.index.positions
         excluded = self.index.recent(time, seconds=config.exclude_s, frames=config.exclude_frames)
+        excluded = excluded | np.array(self.empty, bool)
         if position is not None and known is not None and len(known):
             steps = np.linalg.norm(np.diff(known, axis=0, append=position[None]), axis=1)
             way = np.cumsum(steps[::-1])[::-1]  # from each frame to the next one's position

@@ -71,7 +71,8 @@ class PlaceMap:
     ) -> "PlaceMap":
         """The map of a recording whose poses (LiDAR frame, in the world) are known.
 
-        A place's id is `RECORDING/SCAN`. Raises ValueError for poses of another length and a recording without scans.
+        A place's id is `RECORDING/SCAN`. Scans that show next to nothing are left out. Raises ValueError for poses of
+        another length, and for a recording without scans that show something.
         """
         if len(poses) != len(recording) or not len(recording):
             raise ValueError(f"expected a pose for each of {len(recording)} scans of a recording, found {len(poses)}")
@@ -81,11 +82,14 @@ class PlaceMap:
             here = poses[i, :3, 3]
             if last is None or np.linalg.norm(here - last) >= spacing_m:
                 descriptor, image = finder.seen(recording.record(i, labels=False))
-                finder.index.add(descriptor, ids=f"{recording.name}/{recording.ids[i]}", positions=here)
-                rows.append(i)
-                images.append(image)
-                last = here
+                if not finder.is_empty(image):
+                    finder.index.add(descriptor, ids=f"{recording.name}/{recording.ids[i]}", positions=here)
+                    rows.append(i)
+                    images.append(image)
+                    last = here
             on_progress(i + 1)
+        if not rows:
+            raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
         return cls(finder.index, np.stack(images), np.asarray(poses, np.float64)[rows])
 
     def merged(self, other: "PlaceMap") -> "PlaceMap":
@@ -103,11 +107,12 @@ class PlaceMap:
     ) -> list[Relocated]:
         """Where a scan or image may have been taken: the poses by its nearest places, the most probable first.
 
-        Raises ValueError where other weights made the map.
+        None for a scan that shows next to nothing. Raises ValueError where other weights made the map.
         """
         finder = CandidateFinder(params)
         descriptor, image = finder.seen(record)
-        found = self.index.query(descriptor, candidates, weights_hash=finder.index.weights_hash)
+        exclude = np.full(len(self), finder.is_empty(image))
+        found = self.index.query(descriptor, candidates, exclude=exclude, weights_hash=finder.index.weights_hash)
         rows, distances = (values[found.rows >= 0] for values in found)
         if not len(rows):
             return []

@@ -138,10 +138,11 @@ def _whole_circle(
     shifts = jnp.roll(jnp.fft.irfft2(product, (size, size)), (reach, reach), (-2, -1))
     found = shifts[:, : 2 * reach + 1, : 2 * reach + 1]
     turn, down, right = jnp.unravel_index(jnp.argmax(found), found.shape)
-    best = jnp.maximum(found[turn, down, right], 1e-6)
+    best = found[turn, down, right]
     elsewhere = jnp.where(_near(found.shape, (turn, down, right), cell_m, config), 0.0, found)
     start = jnp.stack([(right - reach) * cell_m, (reach - down) * cell_m, jnp.asarray(angles)[turn]])
-    return start, jnp.maximum(jnp.max(elsewhere), 0) / best
+    second = jnp.maximum(jnp.max(elsewhere), 0) / jnp.maximum(best, 1e-6)
+    return start, jnp.where(best > 1e-3, second, 1.0)  # where nothing fits, any pose fits as well
 
 
 def _turned(image: Float[Array, "m m"], angles: Float[Array, " t"]) -> Float[Array, "t m m"]:

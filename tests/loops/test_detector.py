@@ -126,6 +126,13 @@ def test_one_probable_frame_is_no_loop_two_in_a_row_are(drive, params, revisit):
     assert detector.loops and all(loop.probability > 0.99 for loop in detector.loops)
 
 
+def test_scans_without_points_or_with_one_close_no_loops(params):
+    detector = LoopDetector(params, config=DetectorConfig(candidates=NOW))
+    for cloud in (np.zeros((0, 3)), np.array([[5.0, 3, 1]]), np.full((4, 3), np.nan)) * 3:
+        assert detector.add(cloud) == []
+    assert len(detector) == 9 and not detector.candidates
+
+
 def test_what_does_not_fit_is_one_clear_error(drive, params, random_params):
     detector = LoopDetector(params)
     cloud = drive.points(0)
@@ -135,6 +142,7 @@ def test_what_does_not_fit_is_one_clear_error(drive, params, random_params):
         (cloud, {"time": 4.0}, "times that do not go back, found 4.0 after 5.0"),
         (cloud, {"time": 6.0, "odometry": np.eye(4)}, "expected odometry for every frame or for none"),
         (cloud, {"time": 6.0, "odometry": 2 * np.eye(4)}, "4 x 4 pose with a rotation"),
+        (cloud, {"time": 6.0, "odometry": np.diag([1.0, 1, 1, np.nan])}, "4 x 4 pose with a rotation"),
         (np.zeros(7), {"time": 6.0}, r"points \(n, 3\) or an image"),
     ):
         with pytest.raises(ValueError, match=message):

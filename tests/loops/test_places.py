@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import with_points
 
 import sglpr_jax
 from sglpr_jax.data.record import Record
@@ -78,6 +79,10 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
     assert len(PlaceMap.of(recording, params, np.tile(poses[:1], (len(poses), 1, 1)))) == 1
     with pytest.raises(ValueError, match="expected a pose for each of 30 scans of a recording, found 3"):
         PlaceMap.of(recording, params, poses[:3])
+    assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
+    empty = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
+    with pytest.raises(ValueError, match="08: expected scans that show something, found 30 empty ones"):
+        PlaceMap.of(dataclasses.replace(empty, label_paths=()), params, poses)
     places.index.save(tmp_path / "index.safetensors")
     with pytest.raises(ValueError, match="expected a map of places, found an index without images"):
         PlaceMap.load(tmp_path / "index.safetensors")

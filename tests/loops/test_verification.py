@@ -124,6 +124,7 @@ def test_empty_images_fit_nothing_and_nothing_is_nan():
     for query, match in ((empty, empty), (empty, seen_from(place(0), (0.0,) * 3))):
         found = align(query, match, config=SMALL)
         assert all(np.isfinite(value).all() for value in found) and abs(found.correlation) < 1e-3
+        assert found.second == 1
 
 
 @pytest.mark.slow
