@@ -34,7 +34,7 @@ class CandidateConfig:
     """Scans younger than this are neighbours and no loop: seconds, or frames where there are no times."""
     other_place_frames: int = 50
     """Without odometry, scans so many frames apart are taken for other places."""
-    min_cells: int = 50
+    min_cells: int = 20
     """Images of fewer occupied cells, of a sensor that was covered or failed, show no place."""
     gate_m: float = 20.0
     gate_share: float = 0.05
