@@ -72,7 +72,7 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--poses")
     assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
     assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line with --pose-format kitti")
-    assert_one_line_error(command(*run, flat, "--pose-format", "lidar"), "flat.txt, pose 0: expected a rotation")
+    assert_one_line_error(command(*run, flat, "--pose-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
     assert_one_line_error(command("loops", tmp_path, "--out", tmp_path / "found"), tmp_path)
     assert not (tmp_path / "found").exists()

@@ -156,7 +156,7 @@ def test_a_corruption_that_needs_rings_is_left_out_of_scans_without(stress, tmp_
     rows = "".join(f"1 0 0 {30 * place} 0 1 0 0 0 0 1 0\n" for place in places)
     (scans / "poses.txt").write_text(rows)
     (scans / "times.txt").write_text("".join(f"{i}\n" for i in range(len(places))))
-    options = ("--data", scans, "--method", "solid", "--protocol", "top1-f1max")
+    options = ("--data", scans, "--method", "solid", "--format", "kitti", "--protocol", "top1-f1max")
     ended, out = stress(*options, "--corruption", "beams-16", "noise-0.05")
     assert ended.status == 0
     assert "beams-16 left out: scan 0 of sequence my_scans: beams-16: expected a scan with rings" in ended.error

@@ -14,7 +14,7 @@ from .pages import PAGES, ROOT, blocks, command_lines, name_of
 COMMANDS = [(page, line) for page in PAGES for b in blocks(page) if b.language == "bash" for line in command_lines(b)]
 WITH_PYTHON = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
 QUICK = [
-    "bin/embed --weights simulated --data my_scans --out mine.npz",
+    "bin/embed --weights sglpr --data my_scans --out mine.npz",
     "bin/embed --method scan-context --data KITTI --seq 08 --out 08-scan-context.npz",
     "bin/evaluate 08.npz",
 ]
