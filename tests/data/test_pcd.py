@@ -127,5 +127,5 @@ def test_binary_compressed_with_several_numbers_a_field(tmp_path):
     ],
 )
 def test_a_broken_compressed_file_is_named(tmp_path, body, message):
-    with pytest.raises(ValueError, match=rf"a\.pcd: not a readable \.pcd file: {message}"):
+    with pytest.raises(ValueError, match=rf"a\.pcd: expected a \.pcd file that can be read, found: {message}"):
         read_pcd(write(tmp_path / "a.pcd", body, data="binary_compressed"))

@@ -162,7 +162,7 @@ def test_times_beside_the_scans(tmp_path):
     np.testing.assert_array_equal(recording.times, [0, 0.1, 0.2])
     assert "times: over 0.2 s; poses: none" in recording.description
     (folder / "times.txt").write_text("0\n0.1\n")
-    with pytest.raises(ValueError, match=r"times\.txt: expected 3 times, one per scan, found 2"):
+    with pytest.raises(ValueError, match=r"times\.txt: expected 3 rows, one per scan, found 2"):
         open_recording(folder)
 
 
