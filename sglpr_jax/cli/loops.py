@@ -7,9 +7,9 @@ from typing import Annotated
 
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.choices import PoseChoice, ScanFormat
+from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.evaluation.page.of_loops import write_loops_page
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
@@ -32,7 +32,7 @@ class LoopsCommand:
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
-    """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    """A dataset, a bag or a folder of scans, of any layout that is known."""
     out: Path
     """The folder to write into."""
     poses: Path | None = None
@@ -46,7 +46,10 @@ class LoopsCommand:
     pose_source: PoseChoice = "auto"
     """Which positions of KITTI's layout are drawn where there is no odometry."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
     register: bool = False
     """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
     min_probability: float = DetectorConfig().min_probability
@@ -56,7 +59,13 @@ class LoopsCommand:
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
     odometry = None if command.poses is None else read_odometry(command.poses, format=command.pose_format)
-    recording = open_recording(command.recording, command.seq, pose_source=command.pose_source, format=command.format)
+    recording = open_recording(
+        command.recording,
+        command.seq,
+        pose_source=command.pose_source,
+        format=command.format,
+        sensor_height=command.sensor_height,
+    )
     params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import tyro
 
+from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.choices import PoseChoice, ScanFormat
+from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
 from sglpr_jax.loops.places import SPACING_M, PlaceMap
 from sglpr_jax.models.weights import weights_hash
@@ -25,7 +25,7 @@ class MapCommand:
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
-    """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    """A dataset, a bag or a folder of scans, of any layout that is known."""
     poses: Path
     """A pose in the world for each scan: a corrected trajectory, not raw odometry."""
     out: Path
@@ -43,7 +43,10 @@ class MapCommand:
     pose_source: PoseChoice = "auto"
     """Which pose file of KITTI's layout the recording is opened with; the map's poses are those of --poses."""
     format: ScanFormat = "auto"
-    """What the scans of a plain folder are, where their names do not tell."""
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
 
 
 def write_map(command: MapCommand) -> Path:
@@ -55,7 +58,13 @@ def write_map(command: MapCommand) -> Path:
     before = None
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
-    recording = open_recording(command.recording, command.seq, pose_source=command.pose_source, format=command.format)
+    recording = open_recording(
+        command.recording,
+        command.seq,
+        pose_source=command.pose_source,
+        format=command.format,
+        sensor_height=command.sensor_height,
+    )
     with progress_bar(f"map {recording.name}", len(recording)) as show:
         places = PlaceMap.of(recording, params, poses, spacing_m=command.spacing_m, on_progress=show)
     whole = places if before is None else before.merged(places)

@@ -3,9 +3,12 @@
 import contextlib
 import signal
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from sglpr_jax.data.warning import DataWarning
 
 from .damage import Damaged
 
@@ -19,8 +22,9 @@ class Outcome(NamedTuple):
     text: str
 
 
-KINDS = ("refused", "right", "silent", "traceback", "bad message", "new file", "hang")
-ALLOWED = ("refused", "right")
+KINDS = ("refused", "right", "told", "silent", "traceback", "bad message", "new file", "hang")
+ALLOWED = ("refused", "right", "told")
+"""Told: read, with a warning that names the file."""
 
 
 class Hang(BaseException):
@@ -37,7 +41,8 @@ def outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Cal
 
 def _outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Callable[[Any], bool]) -> Outcome:
     try:
-        with _limited():
+        with _limited(), warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", DataWarning)
             result = read(path)
     except (ValueError, OSError) as error:
         line = str(error)
@@ -52,6 +57,8 @@ def _outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Ca
     with contextlib.suppress(Exception):  # a plain parser that fails where ours did not says: it is not the same
         if damaged.expected != "refused" and same(result):
             return Outcome("right", "")
+    if told and path.name in str(told[0].message):
+        return Outcome("told", str(told[0].message))
     return Outcome("silent", repr(result)[:300])
 
 
