@@ -14,7 +14,7 @@ from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.registration import register
 from sglpr_jax.models.params import Params
 
-MIN_OVERLAP = 0.5
+MIN_OVERLAP = 0.6
 """Registered scans that share less of their space show two places. Measured: docs/decisions/loops.md."""
 
 

@@ -59,7 +59,7 @@ def register(
 
     Example:
       found = register(recording.points(52), recording.points(4501))
-      found.overlap > 0.5  # it is a loop
+      found.overlap >= 0.6  # it is a loop
     """
     gicp = _library("small_gicp")
     query, match = _finite(query, "query"), _finite(match, "match")

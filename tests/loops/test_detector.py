@@ -9,7 +9,7 @@ import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, labelled, square_image
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.find import MIN_OVERLAP, find_loops
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
@@ -70,7 +70,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
     assert str(found).startswith(f"{len(found.loops)} loops in 240 of 240 frames of 08")
     for loop in found.loops:
         error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
-        assert loop.overlap >= 0.5 and np.linalg.norm(error[:3, 3]) < 0.5
+        assert loop.overlap >= MIN_OVERLAP and np.linalg.norm(error[:3, 3]) < 0.5
     stopped = find_loops(drive, params, should_stop=lambda: True)
     assert stopped.frames == 0 and stopped.loops == ()
 
