@@ -57,7 +57,7 @@ def test_the_maps_that_a_preset_names_are_there_and_have_the_form_of_its_image(p
 def test_every_preset_and_every_shipped_weight_has_pictures(name, random_params):
     params = load(name) if name in shipped_weights() else random_params(model_preset(name))
     grid = params.config.grid
-    found = heat_maps(params, np.random.default_rng(0).poisson(0.3, (grid.height, grid.width)))
+    found = heat_maps(params, np.random.default_rng(0).poisson(0.3, (grid.height, grid.width)).astype(np.float32))
     assert len(found) >= 3
     for title, values in found.items():
         assert values.shape == (grid.height, grid.width)

@@ -219,7 +219,7 @@ def test_files_that_were_not_simulated_are_never_written_among(tmp_path):
 
 def test_damaged_settings_are_named(tmp_path):
     (tmp_path / "simulation.json").write_text('{"seed": 1')
-    with pytest.raises(ValueError, match=r"simulation.json: expected the settings of a simulated dataset"):
+    with pytest.raises(ValueError, match=r"simulation.json: expected JSON"):
         write(tmp_path)
 
 
