@@ -157,7 +157,9 @@ def test_along_a_pose_file_distances_are_the_files(tmp_path, pose_file):
 def test_another_pose_file_of_that_name_is_refused(tmp_path, pose_file):
     root = write(tmp_path / "along", names=(), along=(pose_file,), scans=8)
     before = content(root)
-    np.savetxt(pose_file, np.loadtxt(pose_file) * 1.1)
+    poses = np.loadtxt(pose_file)
+    poses[:, 3::4] *= 1.1
+    np.savetxt(pose_file, poses)
     with pytest.raises(ValueError, match=r"simulation.json belongs to another.*drive campus"):
         write(root, names=(), along=(pose_file,), scans=8)
     assert content(root) == before

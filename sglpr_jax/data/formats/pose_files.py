@@ -114,6 +114,7 @@ def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.nd
         raise ValueError(f"{where}: expected numbers, found {text!r:.200}") from error
     if "_" in text or not text.isascii():  # Python takes 1_0 for 10
         raise ValueError(f"{where}: expected numbers, found {text!r:.200}")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{where}: expected finite numbers, found {text!r:.200}")
+    finite = np.isfinite(values)
+    if not finite.all():
+        raise ValueError(f"{where}: expected finite numbers, found {words[int(finite.argmin())]!r:.40}")
     return values
