@@ -1,6 +1,6 @@
 """Fit the models of loops that ship with the package: how probable a pair is, by what simulated towns showed.
 
-    python benchmarks/fit_loops.py --weights simulated
+    python benchmarks/fit_loops.py --weights rings
 
 Every town is driven through by a LiDAR of 64 beams; of each scan the nearest three descriptors are verified. Pairs up
 to 10 m apart are loops, those beyond 20 m are none.
@@ -28,7 +28,7 @@ TOWNS = ("00:11", "08:12", "06:13", "02:14", "05:15", "08:16")
 
 def main(
     *,
-    weights: tuple[str, ...] = ("simulated",),
+    weights: tuple[str, ...] = ("rings",),
     towns: tuple[str, ...] = TOWNS,
     scans: int = 600,
     azimuth_steps: int = 900,

@@ -6,7 +6,7 @@ are learnt on real images, and on simulated ones with label images places and se
 Expect: on the KITTI BEV images, trained on 00 and 02 and tested on 06: top-1 F1max .977, Recall@1 1.000; rotated .975
 and 1.000 (means of two seeds). The 240 steps take four to five minutes on one CPU core.
 
-Command: bin/train --seq 06 --data KITTI_BEV --also SIMULATED --weights simulated --preset rings-adapt
+Command: bin/train --seq 06 --data KITTI_BEV --also SIMULATED --weights rings --preset rings-adapt
 """
 
 from sglpr_jax.data.sampling.tuples import TupleConfig

@@ -1,6 +1,6 @@
 """LiDAR place recognition in JAX: the public API, by what one wants to do.
 
-    params = sglpr_jax.load("simulated")                # weights by name, or by folder
+    params = sglpr_jax.load("sglpr")                    # weights by name, or by folder
     bev = sglpr_jax.scan_image(points, params.config)   # scan (n, 3), metres -> image (h, w)
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 

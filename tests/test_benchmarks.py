@@ -100,6 +100,14 @@ def test_throughput_is_a_share_of_the_peak(tmp_path):
 SMALL = ("--scans", "100", "--azimuth-steps", "200", "--towns", "08:3")
 
 
+def test_the_movement_of_descriptors_under_rotations_is_measured(tmp_path):
+    write_dataset(tmp_path, names=("08",), scans=40, sensor=SENSOR, layout="images")
+    options = ("--scans", "2", "--step-deg", "120", "--among", "20")
+    output = printed("rotation.py", "--data", str(tmp_path), "--weights", "sglpr", "rings", *options)
+    assert [line.split(":")[0] for line in output.splitlines()][-2:] == ["sglpr", "rings"]
+    assert "4 rotations of 2 scans: moved by 0." in output
+
+
 def test_loops_are_scored_on_simulated_drives():
     output = printed("loops.py", "simulated", *SMALL)
     assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output

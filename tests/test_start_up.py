@@ -6,6 +6,8 @@ import sys
 import pytest
 
 SLOW = ("jax", "flax", "numpy", "jaxtyping")
+QUICK = ("embed", "evaluate", "export", "segment")
+"""Commands whose --help does not wait for JAX."""
 
 
 def imported_by(program: str) -> set[str]:
@@ -15,7 +17,7 @@ def imported_by(program: str) -> set[str]:
     return set(ended.stdout.splitlines()[-1].split()[1:])
 
 
-@pytest.mark.parametrize("module", ["sglpr_jax", "sglpr_jax.data", "sglpr_jax.cli.embed"])
+@pytest.mark.parametrize("module", ["sglpr_jax", "sglpr_jax.data", *(f"sglpr_jax.cli.{name}" for name in QUICK)])
 def test_an_import_brings_nothing_slow(module):
     assert imported_by(f"import {module}") == set()
 
@@ -25,12 +27,13 @@ def test_a_name_of_the_library_brings_what_it_needs():
     assert "jax" in imported_by("import sglpr_jax; sglpr_jax.describe")
 
 
+@pytest.mark.parametrize("command", QUICK)
 @pytest.mark.parametrize("flags", ["'--help'", "'--no-such-flag'", ""])
-def test_help_and_wrong_flags_do_not_wait_for_jax(flags):
+def test_help_and_wrong_flags_do_not_wait_for_jax(command, flags):
     program = f"""
 import sys
-from sglpr_jax.cli.embed import main
-sys.argv = ["embed", {flags}]
+from sglpr_jax.cli.{command} import main
+sys.argv = ["{command}", {flags}]
 try:
     main()
 except SystemExit as ended:

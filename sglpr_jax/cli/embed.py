@@ -15,8 +15,8 @@ class EmbedCommand:
 
     Examples:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
-      bin/embed --weights simulated --data my_scans/ --out mine.npz --skip-bad
-      bin/embed --weights simulated --data my_scans/ --poses odometry.tum --out mine.npz
+      bin/embed --weights rings --data my_scans/ --out mine.npz --skip-bad
+      bin/embed --weights rings --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
     """
 

@@ -7,17 +7,7 @@ from pathlib import Path
 import tyro
 
 from sglpr_jax.cli.runtime import console, parse_command, run
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight
-from sglpr_jax.data.formats.trajectory import read_trajectory
-from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.inputs.methods import read_methods
-from sglpr_jax.evaluation.page.recording_pictures import check_same_frames, poses_of, take_pictures
-from sglpr_jax.evaluation.page.writing import write_evaluation, write_sessions
-from sglpr_jax.evaluation.protocols.choice import check_names
-from sglpr_jax.evaluation.scoring import evaluate_methods
-from sglpr_jax.evaluation.sessions import evaluate_session_files
-from sglpr_jax.models.weights_file import load
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +64,9 @@ class EvaluateCommand:
 
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Do what the command says; returns the folder written."""
+    from sglpr_jax.evaluation.page.writing import write_sessions  # these bring JAX and more, which --help does not need
+    from sglpr_jax.evaluation.sessions import evaluate_session_files
+
     _check_options(command)
     folder = command.out or _folder(command.file)
     if command.database is not None:
@@ -90,6 +83,15 @@ def evaluate_file(command: EvaluateCommand) -> Path:
 
 def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     """Score, print and write; returns the paths written."""
+    from sglpr_jax.data import open_recording
+    from sglpr_jax.data.formats.trajectory import read_trajectory
+    from sglpr_jax.evaluation import figures
+    from sglpr_jax.evaluation.inputs.methods import read_methods
+    from sglpr_jax.evaluation.page.recording_pictures import check_same_frames, poses_of, take_pictures
+    from sglpr_jax.evaluation.page.writing import write_evaluation
+    from sglpr_jax.evaluation.scoring import evaluate_methods
+    from sglpr_jax.models.weights_file import load
+
     recording = (
         None
         if command.data is None
@@ -119,6 +121,8 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
 
 def _check_options(command: EvaluateCommand) -> None:
     """Raise ValueError for options that do not go together."""
+    from sglpr_jax.evaluation.protocols.choice import check_names
+
     if command.database is not None:
         silent = ("poses", "times", "distance", "compare", "data", "seq", "weights")
         given = [name for name in silent if getattr(command, name)]

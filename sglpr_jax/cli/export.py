@@ -4,14 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from sglpr_jax.bev import ImageKind
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.data import open_recording, recording_names
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.program import ProgramFormat, save_program
-from sglpr_jax.models.weights import for_places
-from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.retrieval.whiten import whiten
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,22 +14,22 @@ class ExportCommand:
 
     Examples:
       bin/export --weights runs/small-08 --out mine --half
-      bin/export --weights sglpr --whiten my_scans/ --out mine      for one's own sensor, without labels or poses
-      bin/export --weights sglpr --format onnx --out mine           for other runtimes
+      bin/export --whiten my_scans/ --out mine      for one's own sensor, without labels or poses
+      bin/export --format onnx --out mine           for other runtimes
     """
 
-    weights: str
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     out: Path
     """The folder to write; there must be none yet."""
-    format: Literal["weights"] | ProgramFormat = "weights"
+    weights: str = DEFAULT_WEIGHTS
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    format: Literal["weights", "stablehlo", "onnx"] = "weights"
     """`weights` for this package. `stablehlo` (what jax.export reads) and `onnx` are programs that make descriptors of
     images, with the weights inside, for runtimes that do not know this package."""
     half: bool = False
     """Store float16 numbers, in half the room; they are read as float32."""
     keep_segmentation: bool = False
     """Keep the segmentation head, for semantic maps."""
-    image: ImageKind | None = None
+    image: Literal["points", "density"] | None = None
     """What raw scans are made into, where config.json says something else: `density` for weights that were trained on
     ready-made density images."""
     whiten: tuple[Path, ...] = ()
@@ -47,6 +41,13 @@ class ExportCommand:
 
 def export(command: ExportCommand) -> Path:
     """Do what the command says; returns the folder written. Raises FileExistsError where there is one."""
+    from sglpr_jax.data import open_recording, recording_names  # these bring JAX and more, which --help does not need
+    from sglpr_jax.models.params import Params
+    from sglpr_jax.models.program import save_program
+    from sglpr_jax.models.weights import for_places
+    from sglpr_jax.models.weights_file import load, save
+    from sglpr_jax.retrieval.whiten import whiten
+
     if command.out.exists():
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")
     if command.format != "weights" and (command.half or command.keep_segmentation):

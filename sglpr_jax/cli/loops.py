@@ -39,7 +39,7 @@ class LoopsCommand:
     """Odometry: a pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
     pose_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
-    weights: str = "simulated"
+    weights: str = "rings"
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     seq: str | None = None
     """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""

@@ -36,7 +36,7 @@ class MapCommand:
     """A map in the same world frame, of the same weights, whose places the new one has too."""
     spacing_m: float = SPACING_M
     """Scans nearer than this to the last place are left out."""
-    weights: str = "simulated"
+    weights: str = "rings"
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     seq: str | None = None
     """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""

@@ -35,7 +35,7 @@ class RelocalizeCommand:
     """A JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
     candidates: int = CANDIDATES
     """How many places are looked at."""
-    weights: str = "simulated"
+    weights: str = "rings"
     """The weights that made the map."""
     format: ScanFormat = "auto"
     """What the scan is, where its name does not tell."""

@@ -3,16 +3,9 @@
 import dataclasses
 from pathlib import Path
 
-import numpy as np
-
-from sglpr_jax.cli.datasets import open_recording
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.evaluation.segmentation import map_confusion
-from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
-from sglpr_jax.files import write_json
-from sglpr_jax.models.weights_file import load
-from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 RESULT_FILE = "segmentation.json"
 
@@ -25,16 +18,16 @@ class SegmentCommand:
     labels, also the intersection over union of every class and a picture of one scan (figure 7).
 
     Examples:
-      bin/segment --weights runs/small-08 --data KITTI --seq 08 --out maps/
+      bin/segment --data KITTI --seq 08 --out maps/
       bin/segment --weights runs/simulated --data IMAGES --seq 06 --min-confidence 0.8 --out pseudo/06
     """
 
-    weights: str
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     data: Path
     """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
     out: Path
     """The folder to write to; made if need be."""
+    weights: str = DEFAULT_WEIGHTS
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     seq: str | None = None
     """Which sequence; may be left out where there is only one."""
     format: ScanFormat = "auto"
@@ -48,6 +41,15 @@ class SegmentCommand:
 
 def segment_recording(command: SegmentCommand) -> Path:
     """Do what the command says; returns the folder written."""
+    import numpy as np  # these bring JAX and more, which --help does not need
+
+    from sglpr_jax.cli.datasets import open_recording
+    from sglpr_jax.evaluation.segmentation import map_confusion
+    from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
+    from sglpr_jax.files import write_json
+    from sglpr_jax.models.weights_file import load
+    from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
+
     recording = open_recording(command.data, command.seq, format=command.format, sensor_height=command.sensor_height)
     least = command.min_confidence
     if not 0 <= least <= 1:

@@ -56,7 +56,7 @@ def find_loops(
     for odometry of another length, and what reading the scans raises.
 
     Example:
-      found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("simulated"))
+      found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("rings"))
     """
     if odometry is not None and len(odometry) != len(recording):
         raise ValueError(

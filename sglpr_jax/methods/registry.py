@@ -15,26 +15,22 @@ from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
 
 
 def method_named(name: str, weights: str | None, recording: Recording) -> Method:
-    """Return the network with these weights, or a handcrafted method; ValueError for the network without weights."""
+    """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method."""
     if name != NETWORK:
         return handcrafted(name, recording, model_preset("small").grid)
-    if weights is None:
-        raise ValueError("expected --weights (a name, or a training run's folder), found none")
-    return network(load(weights))
+    return network(load(DEFAULT_WEIGHTS if weights is None else weights))
 
 
 def methods_named(names: Sequence[str], weights: str | None, recording: Recording) -> dict[str, Method]:
-    """Return the network, where there are weights, and these methods by name; ValueError where there are none."""
-    asked: list[str] = [*([NETWORK] if weights is not None else []), *names]
-    chosen = list(dict.fromkeys(asked))
-    if not chosen:
-        raise ValueError("expected --weights (a name, or a training run's folder) or --method, found neither")
-    return {name: method_named(name, weights, recording) for name in chosen}
+    """Return these methods by name; before them the network, where weights or nothing at all are named."""
+    described_first = [NETWORK] if weights is not None or not names else []
+    return {name: method_named(name, weights, recording) for name in dict.fromkeys([*described_first, *names])}
 
 
 def network(params: Params) -> ImageMethod:

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1] / "weights"
+DEFAULT_WEIGHTS = "sglpr"
+"""What describes where no weights are named."""
 
 
 def shipped_weights() -> tuple[str, ...]:

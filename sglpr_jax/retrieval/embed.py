@@ -44,7 +44,7 @@ def embed(
     the labels that the method needs.
 
     Example:
-      params = sglpr_jax.load("simulated")
+      params = sglpr_jax.load("sglpr")
       file = sglpr_jax.embed(params, sglpr_jax.open_recording(root, "08"))
       file.save(Path("08.npz"))
     """

@@ -31,7 +31,7 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
     ended = command("loops", town, "--seq", "08", *options)
     assert ended.status == 0, ended.error
     assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES
-    expected = find_loops(open_recording(town, "08"), load("simulated"), odometry=odometry)
+    expected = find_loops(open_recording(town, "08"), load("rings"), odometry=odometry)
     found = read_loops_jsonl(out / "loops.jsonl")
     assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
     assert ended.out.splitlines()[0] == str(expected)

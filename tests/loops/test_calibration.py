@@ -14,7 +14,7 @@ FRAMES = 50
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("simulated")
+    return sglpr_jax.load("rings")
 
 
 @pytest.fixture(scope="module")

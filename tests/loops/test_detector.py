@@ -18,7 +18,7 @@ NOW = CandidateConfig(exclude_frames=0)
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("simulated")
+    return sglpr_jax.load("rings")
 
 
 @pytest.fixture(scope="module")

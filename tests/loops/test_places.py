@@ -17,7 +17,7 @@ MAPPED = 60
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("simulated")
+    return sglpr_jax.load("rings")
 
 
 @pytest.fixture(scope="module")

@@ -107,7 +107,7 @@ def test_models_go_to_a_file_and_back(tmp_path):
 
 
 def test_the_shipped_models_say_how_they_were_made_and_tell_clear_pairs():
-    simulated = default_model(weights_hash(sglpr_jax.load("simulated")))
+    simulated = default_model(weights_hash(sglpr_jax.load("rings")))
     others = default_model("no such weights")
     assert set(simulated.weights) == set(ALL) and set(others.weights) == set(OF_IMAGES)
     loop, none = Evidence(0.6, 0.4, 0.8, 0.3), Evidence(1.2, 0.05, 0.2, 0.98)
