@@ -108,6 +108,12 @@ def test_the_movement_of_descriptors_under_rotations_is_measured(tmp_path):
     assert "4 rotations of 2 scans: moved by 0." in output
 
 
+def test_the_way_from_a_file_to_its_descriptor_is_timed():
+    output = printed("embed.py", "--weights", "rings", "--scans", "65", "--repeats", "1", "--azimuth-steps", "90")
+    assert "rings: " in output and "scans/s" in output
+    assert all(f"{part} " in output for part in ("reading", "image", "network"))
+
+
 def test_loops_are_scored_on_simulated_drives():
     output = printed("loops.py", "simulated", *SMALL)
     assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output

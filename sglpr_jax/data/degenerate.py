@@ -10,13 +10,15 @@ FARTHEST_M = 300.0
 def check_cloud(points: Float32[np.ndarray, "n 3"], *, name: str = "") -> None:
     """Raise ValueError, which begins with `name`, for a cloud (metres) that shows no place; says what was found."""
     where = f"{name}: " if name else ""
-    finite = points[np.isfinite(points).all(axis=1)]
-    if not len(finite):
+    x, y, z = np.abs(points.T)  # a column at a time: reductions along the three axes of a point take ten times as long
+    largest = np.maximum(np.maximum(x, y), z)  # not finite where one of them is not
+    largest = largest[np.isfinite(largest)]
+    if not len(largest):
         raise ValueError(f"{where}expected finite points, found none among {len(points)}")
-    if not finite.any():
-        raise ValueError(f"{where}expected points around the sensor, found all {len(finite)} of them at (0, 0, 0)")
-    largest = np.abs(finite).max(axis=1)
-    if np.median(largest) > FARTHEST_M:
+    if not largest.any():
+        raise ValueError(f"{where}expected points around the sensor, found all {len(largest)} of them at (0, 0, 0)")
+    half_are_beyond = 2 * np.count_nonzero(largest > FARTHEST_M) >= len(largest)
+    if half_are_beyond and np.median(largest) > FARTHEST_M:
         raise ValueError(
             f"{where}expected metres, most of them within {FARTHEST_M:g}, found half of the points beyond"
             f" {np.median(largest):.4g} and the farthest at {largest.max():.4g}; are these millimetres, or is the file"

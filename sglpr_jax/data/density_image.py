@@ -6,7 +6,7 @@ image as `bev_images.read_image` reads it, in the orientation of eq. 1 and on th
 """
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M, as_counts
@@ -87,21 +87,27 @@ def _cell_of_point(points: Float[np.ndarray, "n _"]) -> Int[np.ndarray, " n"]:
 def _voxel_centroids(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 2"]:
     """The mean x and y of the points in each voxel, with the smallest edge that leaves few enough voxels."""
     voxels = _voxel_of_point(points, edge_m := FIRST_EDGE_M)
-    while _distinct(voxels) > MAX_VOXELS:
+    while np.count_nonzero(_found(voxels)) > MAX_VOXELS:
         voxels = _voxel_of_point(points, edge_m := edge_m + EDGE_STEP_M)
-    _, voxel, count = np.unique(voxels, return_inverse=True, return_counts=True)
-    sums = [np.bincount(voxel, weights=axis, minlength=len(count)) for axis in points.T[:2]]
+    voxel = _numbered(voxels)
+    count = np.bincount(voxel)
+    sums = [np.bincount(voxel, weights=axis) for axis in points.T[:2]]
     return np.stack(sums, axis=1) / count[:, None]
 
 
-def _distinct(numbers: Int32[np.ndarray, " n"]) -> int:
-    """How many different numbers there are, by a flag for each that there can be: np.unique sorts, which is slower."""
+def _numbered(numbers: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The place of each number among the different ones, in order: the inverse of np.unique."""
+    return (np.cumsum(_found(numbers)) - 1)[numbers - numbers.min()] if len(numbers) else numbers
+
+
+def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
+    """Of the numbers from the smallest to the largest, which are there. np.unique sorts, which is slower."""
     if not len(numbers):
-        return 0
-    numbers = numbers - numbers.min()
-    found = np.zeros(int(numbers.max()) + 1, bool)
-    found[numbers] = True
-    return int(np.count_nonzero(found))
+        return np.zeros(0, bool)
+    least = numbers.min()
+    found = np.zeros(int(numbers.max()) - int(least) + 1, bool)
+    found[numbers - least] = True
+    return found
 
 
 def _voxel_of_point(points: Float32[np.ndarray, "n 3"], edge_m: float) -> Int32[np.ndarray, " n"]:

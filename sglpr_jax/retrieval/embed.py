@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int32
+from jaxtyping import Array, Bool, Float, Float32, Int32, Num
 
 from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data.degenerate import check_cloud
@@ -83,7 +83,8 @@ def embed_images(
     scans are read too, and `describe` gets each scan's map of so many classes. The other options are those of `embed`.
     """
     angles = _angles(len(recording), rotation_seed)
-    rows, views, descriptors = [], [], []
+    rows, views = [], []
+    descriptors = _Descriptors()
 
     def see(row: int) -> View:
         record = recording.record(row, labels=bool(categories))
@@ -96,14 +97,31 @@ def embed_images(
         rows.append(row)
         views.append(seen)
         if len(views) == batch:
-            descriptors.append(_describe_padded(describe, views, batch))
+            descriptors.add(_describe_padded(describe, views, batch))
             views = []
             on_progress(row + 1)
     if views:
-        descriptors.append(_describe_padded(describe, views, batch))
+        descriptors.add(_describe_padded(describe, views, batch)[: len(views)])
     on_progress(len(recording))
     config = {**config, "rotation_seed": rotation_seed}
-    return _file(recording, rows, descriptors, config=config, weights_hash=weights_hash)
+    return _file(recording, rows, descriptors.all(), config=config, weights_hash=weights_hash)
+
+
+class _Descriptors:
+    """What was described, batch by batch. JAX computes the last one while the next images are being read."""
+
+    def __init__(self):
+        self._done: list[Float32[np.ndarray, "b d"]] = []
+        self._computing: list[Num[Array | np.ndarray, "b d"]] = []
+
+    def add(self, batch: Num[Array | np.ndarray, "b d"]) -> None:
+        """Wait for the batch before, so that no more than two are in memory."""
+        self._done += [np.asarray(one, np.float32) for one in self._computing]
+        self._computing = [batch]
+
+    def all(self) -> list[Float32[np.ndarray, "b d"]]:
+        """The descriptors, after the last batch has ended."""
+        return [*self._done, *(np.asarray(one, np.float32) for one in self._computing)]
 
 
 def embed_scans(
@@ -211,9 +229,9 @@ def _finite_points(
     return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
 
 
-def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Float[np.ndarray, "b d"]:
-    """Describe up to `batch` images in a call of always the same shape, so that it compiles once."""
+def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Num[Array | np.ndarray, "b d"]:
+    """Describe up to `batch` images in a call of always the same shape, so that it compiles once; does not wait."""
     padded = views + [views[-1]] * (batch - len(views))
-    stacked = jax.tree.map(lambda *each: jnp.stack(each), *padded)
+    stacked = jax.tree.map(lambda *each: np.stack(each), *padded)
     inputs = [each for each in stacked if each is not None]
-    return np.asarray(jax.block_until_ready(describe(*inputs)), np.float32)[: len(views)]
+    return describe(*inputs)
