@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.backbones.swin_layers import SwinBlock
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.sim import Sensor, write_dataset
 
 pytestmark = pytest.mark.slow
@@ -112,6 +113,29 @@ def test_the_way_from_a_file_to_its_descriptor_is_timed():
     output = printed("embed.py", "--weights", "rings", "--scans", "65", "--repeats", "1", "--azimuth-steps", "90")
     assert "rings: " in output and "scans/s" in output
     assert all(f"{part} " in output for part in ("reading", "image", "network"))
+
+
+def test_two_ways_of_training_are_compared_seed_by_seed(tmp_path):
+    rng = np.random.default_rng(0)
+    places = np.repeat(rng.normal(size=(1, 120, 16)), 2, axis=0).reshape(240, 16)  # every place twice
+    positions = np.tile(np.stack([np.arange(120) * 10.0, np.zeros(120), np.zeros(120)], axis=1), (2, 1))
+
+    def written(name: str, noise: float) -> str:
+        descriptors = (places + noise * rng.normal(size=places.shape)).astype(np.float32)
+        frames = {"sequence": "06", "ids": tuple(map(str, range(240))), "positions": positions, "pose_source": "true"}
+        times = np.arange(240) * 1.0
+        DescriptorFile(**frames, times=times, descriptors=descriptors, config={}, weights_hash="").save(tmp_path / name)
+        return str(tmp_path / name)
+
+    good, bad = ([written(f"{noise}-{seed}.npz", noise) for seed in (1, 2)] for noise in (0.05, 2.0))
+    output = printed("paired.py", "--ours", *good, "--others", *bad)
+    (row,) = [line for line in output.splitlines() if "top1-f1max" in line]
+    ours, others, difference, each, interval = (cell.strip() for cell in row.split("│")[2:-1])
+    assert float(ours) == 1 and 0 < float(others) < 0.9
+    assert float(difference) == pytest.approx(float(ours) - float(others), abs=2e-3)
+    assert np.mean([float(one) for one in each.split()]) == pytest.approx(float(difference), abs=2e-3)
+    low, high = map(float, interval.split(" to "))
+    assert 0 < low < float(difference) < high
 
 
 def test_loops_are_scored_on_simulated_drives():

@@ -34,13 +34,31 @@ def f1_max_interval(
     query: Int[np.ndarray, " n"],
     seed: int,
 ) -> tuple[float, float]:
-    """Return the interval of F1max over the decisions of `metrics.decision_curve`, of which item i is `query[i]`'s.
+    """Return the interval of F1max over the decisions of `metrics.decision_curve`, of which item i is `query[i]`'s."""
+    flags = {
+        "true_if_accepted": true_if_accepted,
+        "false_if_accepted": false_if_accepted,
+        "missed_if_rejected": missed_if_rejected,
+    }
+    return interval(resampled_f1_max(scores, **flags, query=query, seed=seed))
+
+
+def resampled_f1_max(
+    scores: Float[np.ndarray, " n"],
+    *,
+    true_if_accepted: Bool[np.ndarray, " n"],
+    false_if_accepted: Bool[np.ndarray, " n"],
+    missed_if_rejected: Bool[np.ndarray, " n"],
+    query: Int[np.ndarray, " n"],
+    seed: int,
+) -> Float[np.ndarray, " resamples"]:
+    """Return F1max in every resample; with one seed, two methods that answer the same queries meet the same resamples.
 
     All items of a query are drawn or left out together. Every resample has its own best threshold, sought among at most
     256 scores of items that are right or could be missed: accepting any other cannot raise F1.
     """
     if not np.any(true_if_accepted & np.isfinite(scores)):
-        return 0.0, 0.0
+        return np.zeros(RESAMPLES)
     edges = np.unique(scores[(true_if_accepted | missed_if_rejected) & np.isfinite(scores)])
     edges = edges[np.unique(np.linspace(0, len(edges) - 1, THRESHOLDS).round().astype(np.int64))]
     bins = np.searchsorted(edges, scores, side="right")  # accepted at the edges [:bins]
@@ -58,7 +76,7 @@ def f1_max_interval(
     drawn = _times_drawn(shape[0], seed)
     whole = drawn @ (twice_right + wrong[:, 1:] + caught[:, :1] - caught[:, 1:])
     f1 = np.divide(drawn @ twice_right, whole, out=np.zeros_like(whole), where=whole > 0)
-    return interval(f1.max(axis=1).astype(np.float64))
+    return f1.max(axis=1).astype(np.float64)
 
 
 def _times_drawn(n: int, seed: int) -> Float32[np.ndarray, "resamples {n}"]:
