@@ -10,19 +10,24 @@ from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
 from sglpr_jax.cli.runtime import own_names, parse_command, run
 from sglpr_jax.cli.train import TrainCommand, train_and_test
+from sglpr_jax.evaluation.final_test import SHIPPED, UNTRAINED
 from sglpr_jax.evaluation.page.writing import PAGE
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.training.presets import load_preset
 
 SCANS = 300
 AZIMUTH_STEPS = 450
 TESTED = "00"
+WEIGHTS = DEFAULT_WEIGHTS
+BESIDE = (SHIPPED, UNTRAINED, "thumbnail", "polar-fft")
 
 
 @dataclasses.dataclass(frozen=True)
 class DemoCommand:
-    """Train a small model on two simulated recordings and find the loop closures of a third, never seen.
+    """Go on training the shipped weights on two simulated recordings; find the loop closures of a third, never seen.
 
-    The third is 00, which comes back to its places in the same direction.
+    The third is 00, which comes back to its places in the same direction. The shipped weights as they are, and methods
+    that need no training, are scored beside the trained ones.
     """
 
     out: Path = Path("runs/demo")
@@ -41,7 +46,9 @@ def demo(command: DemoCommand) -> Path:
         shutil.rmtree(trained)
     config = load_preset("demo")
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
-    train_and_test(TrainCommand(seq=TESTED, data=town, preset="demo", out=trained, config=config))
+    train_and_test(
+        TrainCommand(seq=TESTED, data=town, preset="demo", weights=WEIGHTS, method=BESIDE, out=trained, config=config)
+    )
     print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
     descriptors = embed_recording(
         EmbedCommand(data=town, seq=TESTED, weights=str(trained), out=command.out / f"{TESTED}.npz")

@@ -74,7 +74,8 @@ class TrainCommand:
     cache: Path | None = None
     """A folder in which the training recordings are packed, each once, to be read faster; docs/guides/training.md."""
     method: tuple[BesideName, ...] = BESIDE
-    """Methods that are scored beside the trained network at the end; `untrained`: this network before training."""
+    """Methods that are scored beside the trained network at the end; `untrained`: this network before training;
+    `shipped`: the weights that describe where none are named."""
     tensorboard: bool = False
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     pose_source: PoseChoice = "auto"

@@ -20,17 +20,20 @@ from sglpr_jax.methods.names import NETWORK
 from sglpr_jax.methods.registry import handcrafted, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.models.weights_file import load
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.embed import embed
 
 ROTATION_SEED = 0
-UNTRAINED = "untrained"
+UNTRAINED, SHIPPED = "untrained", "shipped"
+"""This network with fresh weights, and the weights that describe where none are named."""
 BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
 """The methods that stand beside the trained network, where none are named."""
 if TYPE_CHECKING:
     BesideName = str
 else:
-    BesideName = Literal[(UNTRAINED, *HANDCRAFTED)]
+    BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED)]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -72,9 +75,10 @@ def final_test(
 ) -> FinalTest:
     """Score a trained network on a recording, raw and with every scan rotated at random.
 
-    Beside it stand `methods`: handcrafted ones by name, or `untrained`, the same network with fresh weights made from
-    `seed`. Descriptors, pictures and results.json go to `folder`. Raises ValueError where a method does not fit the
-    recording, OSError where something cannot be read or written.
+    Beside it stand `methods`: handcrafted ones by name, `untrained`, the same network with fresh weights made from
+    `seed`, or `shipped`, the weights `DEFAULT_WEIGHTS` of the package. Descriptors, pictures and results.json go to
+    `folder`. Raises ValueError where a method does not fit the recording, OSError where something cannot be read or
+    written.
 
     Example:
       print(final_test(result.params, recording, result.folder / "test"))
@@ -97,6 +101,8 @@ def final_test(
 def _method(name: str, params: Params, recording: Recording, seed: int) -> Method:
     if name == UNTRAINED:
         return network(init(jax.random.key(seed + 1), config=params.config))
+    if name == SHIPPED:
+        return network(load(DEFAULT_WEIGHTS))
     return handcrafted(name, recording, params.config.grid)
 
 

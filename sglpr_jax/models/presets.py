@@ -28,6 +28,10 @@ MODELS: dict[str, ModelConfig] = {
     "paper-head-b": dataclasses.replace(_PAPER, head=HeadConfig(kernels=(4, 3, 3), strides=(4, 2, 2))),
     # The paper says "projection radius 11.2 m", which its own eq. 1 gives only with cells of 0.1 m.
     "paper-11m": dataclasses.replace(_PAPER, grid=Grid(resolution_m=0.1)),
+    # Every stage of the paper's Swin-Unet and its window, from cells of 0.4 m: it reads the ready-made KITTI images.
+    "paper-112": dataclasses.replace(
+        _PAPER, grid=Grid(resolution_m=0.4, height=112, width=112), image="density", backbone=SwinConfig(patch=2)
+    ),
     # Trains on two CPU cores within the hour; its window is that of the ready-made KITTI images (+-25.6 m).
     "small": _SMALL,
     # With convolutions in front, which learn the semantic map better (docs/results.md); a step takes longer.
@@ -47,8 +51,6 @@ MODELS: dict[str, ModelConfig] = {
         head=HeadConfig(tap="tokens", channels=(96, 128, 160), strides=(2, 1, 1), means=(1, 2, 1)),
         detail=0,
     ),
-    # Smaller still, for bin/demo.
-    "demo": dataclasses.replace(_SMALL, backbone=dataclasses.replace(_SMALL_SWIN, embed_dim=32, heads=(1, 2, 4))),
     # For tests: every part of the model, next to no arithmetic.
     "tiny": ModelConfig(
         grid=Grid(resolution_m=1.6, height=32, width=32),

@@ -1,9 +1,11 @@
 import ast
+import dataclasses
 import re
 from pathlib import Path
 
 import pytest
 
+from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset, preset_names
 
@@ -24,10 +26,18 @@ def test_a_preset_loads_and_says_what_to_expect_and_how_to_run_it(path):
     assert command[1] == f"bin/{path.stem}" or command[1].endswith(f"--preset {path.stem}")
 
 
-def test_the_paper_presets_differ_in_the_model_alone():
-    paper, other = load_preset("paper"), load_preset("paper-11m")
-    assert other.model.grid.resolution_m == paper.model.grid.resolution_m / 2
-    assert other.optimizer == paper.optimizer and other.loss == paper.loss and other.sampling == paper.sampling
+@pytest.mark.parametrize(("name", "cells_of_paper"), [("paper-11m", 0.5), ("paper-112", 2)])
+def test_the_paper_presets_differ_in_the_model_alone(name, cells_of_paper):
+    paper, other = load_preset("paper"), load_preset(name)
+    assert other.model.grid.resolution_m == paper.model.grid.resolution_m * cells_of_paper
+    assert dataclasses.replace(other, model=paper.model) == paper
+
+
+def test_the_paper_on_ready_made_images_has_the_tokens_of_the_paper():
+    paper, other = model_preset("paper"), model_preset("paper-112")
+    tokens = [config.grid.height // config.backbone.patch for config in (paper, other)]
+    assert tokens == [56, 56] and other.grid.resolution_m * other.grid.width == pytest.approx(44.8)
+    assert dataclasses.replace(other.backbone, patch=4) == paper.backbone
 
 
 def test_a_file_of_ones_own_is_a_preset(preset):

@@ -128,7 +128,7 @@ def test_a_damaged_configuration_is_named(params, tmp_path, text, expected):
 
 def test_the_weights_of_another_preset_are_refused(params, tmp_path):
     folder = save(params, tmp_path / "weights")
-    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("demo"))))
+    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("small"))))
     with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected the weights of its configuration, \S+ of shape"):
         load(folder)
 
