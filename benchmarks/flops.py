@@ -7,6 +7,7 @@ operations of all kinds, of which a matrix multiplier does none.
 """
 
 import math
+from collections import Counter
 from typing import Any
 
 from jax.extend.core import ClosedJaxpr, Jaxpr
@@ -18,26 +19,36 @@ def count_flops(program: ClosedJaxpr) -> int:
 
     Of a branch the dearer side counts. Raises ValueError for a product in a loop whose turns depend on values.
     """
+    return flops_by_name(program).total()
+
+
+def flops_by_name(program: ClosedJaxpr) -> Counter[str]:
+    """The same, by the path of names under which the operations were traced (transforms, modules, the operation)."""
     needed, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars))
-    return _count(needed)
+    return _count(needed, "")
 
 
-def _count(program: Jaxpr) -> int:
-    return sum(_of_equation(equation) for equation in program.eqns)
+def _count(program: Jaxpr, outside: str) -> Counter[str]:
+    counted: Counter[str] = Counter()
+    for equation in program.eqns:
+        counted += _of_equation(equation, outside)
+    return counted
 
 
-def _of_equation(equation: Any) -> int:
+def _of_equation(equation: Any, outside: str) -> Counter[str]:
     name = equation.primitive.name
+    path = "/".join(filter(None, (outside, str(equation.source_info.name_stack))))
     if name == "dot_general":
-        return _of_product(equation)
+        return Counter({f"{path}/{name}": _of_product(equation)})
     if name == "conv_general_dilated":
-        return _of_convolution(equation)
-    inner = [_count(each) for each in _inner_programs(equation.params)]
+        return Counter({f"{path}/{name}": _of_convolution(equation)})
+    inner = [_count(each, path) for each in _inner_programs(equation.params)]
     if name == "cond":
-        return max(inner)
+        return max(inner, key=Counter.total)
     if name == "while" and any(inner):
         raise ValueError("a matrix product in a loop whose number of turns is not known cannot be counted")
-    return sum(inner) * (equation.params["length"] if name == "scan" else 1)
+    turns = equation.params["length"] if name == "scan" else 1
+    return Counter({path: turns * flops for path, flops in sum(inner, Counter()).items()})
 
 
 def _of_product(equation: Any) -> int:

@@ -140,6 +140,17 @@ def product_job(type_: str, size: int, products: int) -> Job:
     return job
 
 
+def best_rate(job: Job, work: float, *, repeats: int) -> float:
+    """Operations a second of a job that does `work` of them, in its fastest run."""
+    job()  # compiles
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        job()
+        seconds.append(time.perf_counter() - start)
+    return work / min(seconds)
+
+
 def summary(config: TrainConfig, flops: int, rates: np.ndarray, peaks: np.ndarray) -> dict[str, Any]:
     """What is reported of a preset."""
     steps_per_second = float(np.median(rates)) / flops

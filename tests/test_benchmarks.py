@@ -138,6 +138,19 @@ def test_two_ways_of_training_are_compared_seed_by_seed(tmp_path):
     assert 0 < low < float(difference) < high
 
 
+def test_the_time_of_a_step_is_told_by_parts(tmp_path):
+    (tmp_path / "own.py").write_text(PRESET)
+    output = printed("profile_step.py", "--preset", str(tmp_path / "own.py"), "--steps", "1")
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in output.splitlines() if line.startswith("│")]
+    parts = {row[0] for row in rows}
+    assert {"place_head/cbam", "images, losses, optimiser", "segmentation_head"} <= parts
+    assert any(part.startswith("backbone/") for part in parts)
+    forward = sum(float(row[1]) for row in rows)
+    backward = sum(float(row[3]) for row in rows)
+    assert forward > 0 and backward > 0
+    assert sum(float(row[5][:-1]) for row in rows) == pytest.approx(100, abs=0.1 * len(rows))
+
+
 def test_loops_are_scored_on_simulated_drives():
     output = printed("loops.py", "simulated", *SMALL)
     assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output
