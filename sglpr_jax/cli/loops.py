@@ -7,9 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.datasets import open_recording
+from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
-from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.evaluation.page.of_loops import write_loops_page
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
@@ -27,29 +26,21 @@ class LoopsCommand:
 
     Examples:
       bin/loops my_scans --out found
-      bin/loops my_scans --poses odometry.tum --out found
-      bin/loops KITTI --seq 08 --poses KITTI/poses/08.txt --pose-format kitti --out found --register
+      bin/loops my_scans --odometry odometry.tum --out found
+      bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found --register
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
     """A dataset, a bag or a folder of scans, of any layout that is known."""
     out: Path
     """The folder to write into."""
-    poses: Path | None = None
-    """Odometry: a pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
-    pose_format: OdometryFormat = "auto"
+    odometry: Path | None = None
+    """A pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
+    odometry_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
     weights: str = "simulated"
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
-    seq: str | None = None
-    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
-    pose_source: PoseChoice = "auto"
-    """Which positions of KITTI's layout are drawn where there is no odometry."""
-    format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     register: bool = False
     """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
     min_probability: float = DetectorConfig().min_probability
@@ -58,14 +49,8 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
-    odometry = None if command.poses is None else read_odometry(command.poses, format=command.pose_format)
-    recording = open_recording(
-        command.recording,
-        command.seq,
-        pose_source=command.pose_source,
-        format=command.format,
-        sensor_height=command.sensor_height,
-    )
+    odometry = None if command.odometry is None else read_odometry(command.odometry, format=command.odometry_format)
+    recording = command.source.open(command.recording)
     params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(

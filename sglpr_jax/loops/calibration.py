@@ -123,7 +123,7 @@ class _Places:
         """Descriptor and image of a frame turned by `angle`."""
         record = self.recording.record(frame, labels=False)
         if record.points is not None:
-            return self.finder.seen(Record(points=rotated(record.points, angle)))
+            return self.finder.seen(Record(points=rotated(record.upright_points, angle)))
         whole = even_cells(jnp.asarray(picture(record, None)[0]))
         return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import image_view, picture, view
@@ -68,6 +69,8 @@ class CandidateFinder:
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
+        self.mounting: Mounting | None = None
+        """Of the sensor, one for all frames."""
         self.empty: list[bool] = []
         """Which frames show next to nothing."""
 
@@ -77,10 +80,10 @@ class CandidateFinder:
         """Describe a scan or image, and return its candidates, those of the nearest descriptor first.
 
         `odometry` is its pose, LiDAR frame in any fixed frame. Raises ValueError where some frames have a time or a
-        pose and others have none, and where times run backwards.
+        pose and others have none, where times run backwards, and for a record of a sensor mounted otherwise.
         """
         descriptor, image = self.seen(record)
-        self._check(time, odometry)
+        self._check(record, time, odometry)
         query = len(self.index)
         position = None if odometry is None else np.asarray(odometry, np.float64)[:3, 3]
         excluded = self._excluded(time, position)
@@ -120,9 +123,12 @@ class CandidateFinder:
         """Whether an image shows too little to tell a place by."""
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
-    def _check(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
+    def _check(self, record: Record, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self.index):
+            self.mounting = record.mounting
             return
+        if record.mounting != self.mounting:
+            raise ValueError(f"expected one sensor, mounted {self.mounting}, found {record.mounting}")
         for name, given, known in (
             ("a time", time is not None, self.index.times is not None),
             ("odometry", odometry is not None, bool(self.odometry)),

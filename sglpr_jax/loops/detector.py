@@ -79,8 +79,7 @@ class LoopDetector:
             best = int(np.argmax(probabilities))
             if probabilities[best] >= self.config.min_neighbour_probability:
                 one = candidates[best]
-                loop = planar_loop(one.query, one.match, one.alignment, probability=float(probabilities[best]))
-                self._waiting.append(loop)
+                self._waiting.append(self._loop(one, float(probabilities[best])))
         first = len(self) - self.config.consistency.neighbours
         self._waiting = [loop for loop in self._waiting if loop.query >= first]
         new = self._confirmed() if self._waiting else []
@@ -94,7 +93,7 @@ class LoopDetector:
         if odometry is None:
             pairs = agree_in_order(self._waiting, config=rules)
         else:
-            pairs = agree(self._waiting, odometry, config=rules)
+            pairs = agree(self._waiting, odometry, mounting=self.finder.mounting, config=rules)
         done = {loop.query for loop in self.loops[-rules.neighbours :]}
         return [
             loop
@@ -113,7 +112,12 @@ class LoopDetector:
             for other in self.loops
             if abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
         ]
-        return not about or bool(agree([loop], odometry, about, config=self.config.consistency).mean() >= 0.5)
+        rules = {"mounting": self.finder.mounting, "config": self.config.consistency}
+        return not about or bool(agree([loop], odometry, about, **rules).mean() >= 0.5)
+
+    def _loop(self, one: Candidate, probability: float) -> Loop:
+        mountings = dict.fromkeys(("query_mounting", "match_mounting"), self.finder.mounting)
+        return planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
 
 
 def _record(scan: Record | Float[np.ndarray, "..."]) -> Record:

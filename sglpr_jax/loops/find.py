@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
@@ -87,7 +88,7 @@ def settled(
     registered: bool,
 ) -> tuple[list[Loop], list[Loop]]:
     """The loops of a whole drive that agree and, where they are registered, overlap; and those that do not."""
-    kept, refused = _agreeing(loops, odometry, config)
+    kept, refused = _agreeing(loops, odometry, recording.mounting, config)
     if registered:
         kept, others = _registered(recording, kept)
         refused = refused + others
@@ -95,12 +96,16 @@ def settled(
 
 
 def _agreeing(
-    loops: list[Loop], odometry: Float[np.ndarray, "n 4 4"] | None, config: DetectorConfig
+    loops: list[Loop],
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    mounting: Mounting | None,
+    config: DetectorConfig,
 ) -> tuple[list[Loop], list[Loop]]:
     """The largest set of loops that all agree, and the others; without odometry all of them."""
     if odometry is None or len(loops) < 2:
         return loops, []
-    members = set(largest_consistent_set(agree(loops, odometry, config=config.consistency)).tolist())
+    pairs = agree(loops, odometry, mounting=mounting, config=config.consistency)
+    members = set(largest_consistent_set(pairs).tolist())
     return [loop for i, loop in enumerate(loops) if i in members], [
         loop for i, loop in enumerate(loops) if i not in members
     ]

@@ -27,7 +27,7 @@ def odometry(town, tmp_path) -> np.ndarray:
 def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_path):
     write_kitti(tmp_path / "odometry.txt", odometry)
     out = tmp_path / "found"
-    options = ("--poses", tmp_path / "odometry.txt", "--pose-format", "kitti", "--out", out)
+    options = ("--odometry", tmp_path / "odometry.txt", "--odometry-format", "kitti", "--out", out)
     ended = command("loops", town, "--seq", "08", *options)
     assert ended.status == 0, ended.error
     assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES
@@ -69,10 +69,10 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     short, flat = tmp_path / "short.tum", tmp_path / "flat.txt"
     write_tum(short, odometry[:7], np.arange(7.0))
     np.savetxt(flat, np.zeros((SCANS, 12)))
-    run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--poses")
+    run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry")
     assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
-    assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line with --pose-format kitti")
-    assert_one_line_error(command(*run, flat, "--pose-format", "lidar"), "flat.txt: expected a rotation")
+    assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line and their axes named, kitti")
+    assert_one_line_error(command(*run, flat, "--odometry-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
     assert_one_line_error(command("loops", tmp_path, "--out", tmp_path / "found"), tmp_path)
     assert not (tmp_path / "found").exists()

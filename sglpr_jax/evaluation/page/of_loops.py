@@ -12,6 +12,7 @@ from sglpr_jax.loops.candidates import square_image
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.overlay import overlaid
+from sglpr_jax.loops.upright import upright_odometry, upright_poses
 
 PAGE = "index.html"
 SHOWN_PAIRS = 9
@@ -36,7 +37,9 @@ def _where(found: FoundLoops) -> str:
         return missing("The drawing needs matplotlib: pip install 'sglpr-jax[viz]'.")
     if not found.frames:
         return missing("No scan was looked at.")
-    positions = found.recording.positions if found.odometry is None else found.odometry[:, :3, 3]
+    positions = found.recording.positions
+    if found.odometry is not None:
+        positions = upright_odometry(found.odometry, found.recording.mounting)[:, :3, 3]
     parts = []
     if positions is not None:
         what = "as the odometry has it" if found.odometry is not None else f"by {found.recording.pose_source}"
@@ -63,7 +66,7 @@ def _pairs(found: FoundLoops) -> str:
 
 def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
     query, match = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
-    return overlaid(query, match, loop.match_from_query)
+    return overlaid(query, match, upright_poses(loop.match_from_query, found.recording.mounting))
 
 
 def _title(loop: Loop) -> str:
