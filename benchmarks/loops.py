@@ -117,7 +117,7 @@ class Speed:
         records = [drive.record(i, labels=False) for i in range(20)]
         rows = np.random.default_rng(0).normal(size=(self.frames, finder.index.width)).astype(np.float32)
         finder.index.add(rows / np.linalg.norm(rows, axis=1, keepdims=True), times=np.arange(self.frames) / 10)
-        image = finder.seen(records[0])[1]
+        image = finder.seen(records[0]).image
         finder.images += [image] * self.frames
         finder.empty += [False] * self.frames
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))

@@ -1,12 +1,11 @@
 """bin/embed: write the descriptors of a sequence, or of a folder of scans."""
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.recording import PosedRecordingOptions
+from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.methods.names import MethodName
 
@@ -58,17 +57,13 @@ def embed_recording(command: EmbedCommand) -> Path:
             recording,
             rotation_seed=command.seed if command.rotate else None,
             batch=command.batch,
-            on_bad_scan=_report if command.skip_bad else None,
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
             on_progress=show,
         )
     file.save(command.out)
     skipped = len(recording) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
     return command.out
-
-
-def _report(scan: str, error: Exception) -> None:
-    print(f"skipped {scan}: {error}", file=sys.stderr)
 
 
 def main() -> None:

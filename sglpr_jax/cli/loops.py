@@ -7,14 +7,18 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.recording import PosedRecordingOptions
+from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.evaluation.page.of_loops import write_loops_page
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
+from sglpr_jax.loops.unfinished import remove
 from sglpr_jax.models.weights_file import load
+
+UNFINISHED = "unfinished"
+"""The folder, in that of the results, of a run that has not ended."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +26,7 @@ class LoopsCommand:
     """Find the loops of a recording: pairs of scans of one place, how they lie to each other, and how sure that is.
 
     Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti.
-    Ctrl-C keeps what was found.
+    Ctrl-C keeps what was found; the same command goes on after it, and after a run that was killed.
 
     Examples:
       bin/loops my_scans --out found
@@ -45,6 +49,8 @@ class LoopsCommand:
     """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
     min_probability: float = DetectorConfig().min_probability
     """Of a loop."""
+    skip_bad: bool = False
+    """Report scans that cannot be read and go on without them."""
 
 
 def loops_of_recording(command: LoopsCommand) -> int:
@@ -59,13 +65,19 @@ def loops_of_recording(command: LoopsCommand) -> int:
             odometry=odometry,
             config=DetectorConfig(min_probability=command.min_probability),
             registered=command.register,
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
+            kept_in=command.out / UNFINISHED,
             should_stop=stop,
             on_progress=show,
         )
     paths = [*write_found(found, command.out), write_loops_page(found, command.out)]
     print(found)
     print(f"{command.out}: {', '.join(path.name for path in paths)}")
-    return stop.exit_status if stop() else 0
+    if stop():
+        print("the same command goes on from here", file=sys.stderr)
+        return stop.exit_status
+    remove(command.out / UNFINISHED)
+    return 0
 
 
 def main() -> None:

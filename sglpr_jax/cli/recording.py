@@ -1,6 +1,7 @@
 """The flags that open a recording, the same for every command that works on one."""
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,7 @@ class RecordingOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PosedRecordingOptions(RecordingOptions):
-    """The same, and the pose file of a plain folder of scans."""
+    """Which recording of a folder, how it is read, and where a plain folder of scans was taken."""
 
     poses: Path | None = None
     """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
@@ -42,3 +43,8 @@ class PosedRecordingOptions(RecordingOptions):
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
     """Seconds, one number a line, where no times.txt lies beside the scans."""
+
+
+def report_bad_scan(scan: str, error: Exception) -> None:
+    """Say on stderr that a scan is left out, and why."""
+    print(f"skipped {scan}: {error}", file=sys.stderr)

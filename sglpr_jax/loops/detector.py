@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
@@ -72,14 +72,27 @@ class LoopDetector:
         `odometry` the pose of the sensor in a frame that stays, drifting as it may. Raises ValueError for values of
         another shape, for times that go back, and where some frames have a time or odometry and others not.
         """
-        candidates = self.finder.add(_record(scan), time=time, odometry=_pose(odometry))
+        return self.add_seen(self.finder.seen(_record(scan)), time=time, odometry=_pose(odometry))
+
+    def add_seen(
+        self,
+        seen: Seen | None,
+        *,
+        time: float | None = None,
+        odometry: Float[np.ndarray, "4 4"] | None = None,
+        candidates: list[Candidate] | None = None,
+    ) -> list[Loop]:
+        """Do what `add` does, of a frame that was looked at before; None where its scan cannot be read.
+
+        `candidates` are those that an earlier run found for it (see `loops.unfinished`).
+        """
+        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, candidates=candidates)
         self.candidates += candidates
         if candidates:
             probabilities = self.model.probability(Evidence.stack([one.evidence for one in candidates]))
             best = int(np.argmax(probabilities))
             if probabilities[best] >= self.config.min_neighbour_probability:
-                one = candidates[best]
-                self._waiting.append(self._loop(one, float(probabilities[best])))
+                self._waiting.append(self._loop(candidates[best], float(probabilities[best])))
         first = len(self) - self.config.consistency.neighbours
         self._waiting = [loop for loop in self._waiting if loop.query >= first]
         new = self._confirmed() if self._waiting else []

@@ -87,11 +87,11 @@ class PlaceMap:
         for i in range(len(recording)):
             here = poses[i, :3, 3]
             if last is None or np.linalg.norm(here - last) >= spacing_m:
-                descriptor, image = finder.seen(recording.record(i, labels=False))
-                if not finder.is_empty(image):
-                    finder.index.add(descriptor, ids=f"{recording.name}/{recording.ids[i]}", positions=here)
+                seen = finder.seen(recording.record(i, labels=False))
+                if not finder.is_empty(seen.image):
+                    finder.index.add(seen.descriptor, ids=f"{recording.name}/{recording.ids[i]}", positions=here)
                     rows.append(i)
-                    images.append(image)
+                    images.append(seen.image)
                     last = here
             on_progress(i + 1)
         if not rows:
@@ -124,7 +124,7 @@ class PlaceMap:
         shows next to nothing. Raises ValueError where other weights made the map.
         """
         finder = CandidateFinder(params)
-        descriptor, image = finder.seen(record)
+        descriptor, image, mounting = finder.seen(record)
         exclude = np.full(len(self), finder.is_empty(image))
         found = self.index.query(descriptor, candidates, exclude=exclude, weights_hash=finder.index.weights_hash)
         rows, distances = (values[found.rows >= 0] for values in found)
@@ -137,7 +137,7 @@ class PlaceMap:
             alignment = alignments.one(k)
             margin = self._other_place(descriptor, int(row)) - distance
             evidence = Evidence.of(float(distance), margin, alignment.correlation, alignment.second)
-            mountings = {"query_mounting": record.mounting, "match_mounting": self.mounting(row)}
+            mountings = {"query_mounting": mounting, "match_mounting": self.mounting(int(row))}
             probability = float(model.probability(evidence))
             loop = planar_loop(len(self), int(row), alignment, probability=probability, **mountings)
             pose = self.world_from_place[row] @ loop.match_from_query

@@ -62,7 +62,8 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == 130
     assert ended.out.startswith("0 loops in 5 of 40 frames of 08")
-    assert {path.name for path in (tmp_path / "found").iterdir()} == FILES
+    assert {path.name for path in (tmp_path / "found").iterdir()} == FILES | {"unfinished"}
+    assert "the same command goes on from here" in ended.error
 
 
 def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
