@@ -8,7 +8,8 @@
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
   `estimate_mounting`
 - find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index`; score that: `evaluate`
-- close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans
+- close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans; `optimize_trajectory` by them;
+  `PlaceMap` for scans of another day
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from sglpr_jax.loops.detector import LoopDetector
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.loop import Loop
+    from sglpr_jax.loops.optimization import optimize_trajectory
+    from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.models.backbones.rings import RingConfig
     from sglpr_jax.models.backbones.sglpr import SglprConfig
     from sglpr_jax.models.backbones.swin import SwinConfig
@@ -59,6 +62,8 @@ _HOMES = {
     "loops.detector": ("LoopDetector",),
     "loops.find": ("find_loops",),
     "loops.loop": ("Loop",),
+    "loops.optimization": ("optimize_trajectory",),
+    "loops.places": ("PlaceMap",),
     "models.backbones.rings": ("RingConfig",),
     "models.backbones.sglpr": ("SglprConfig",),
     "models.backbones.swin": ("SwinConfig",),
@@ -111,6 +116,7 @@ __all__ = [
     "Nearest",
     "Outputs",
     "Params",
+    "PlaceMap",
     "Record",
     "Recording",
     "RingConfig",
@@ -132,6 +138,7 @@ __all__ = [
     "model_preset",
     "nearest",
     "open_recording",
+    "optimize_trajectory",
     "preset",
     "rasterize",
     "rasterize_labels",

@@ -14,6 +14,7 @@ from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
+from sglpr_jax.loops.optimization import optimize_trajectory
 from sglpr_jax.loops.unfinished import remove
 from sglpr_jax.models.weights_file import load
 
@@ -25,13 +26,15 @@ UNFINISHED = "unfinished"
 class LoopsCommand:
     """Find the loops of a recording: pairs of scans of one place, how they lie to each other, and how sure that is.
 
-    Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti.
+    Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti,
+    with --optimize also the corrected trajectory.
     Ctrl-C keeps what was found; the same command goes on after it, and after a run that was killed.
 
     Examples:
       bin/loops my_scans --out found
       bin/loops my_scans --odometry odometry.tum --out found
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found --register
+      bin/loops my_scans --odometry odometry.tum --optimize --out found
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
@@ -47,6 +50,9 @@ class LoopsCommand:
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     register: bool = False
     """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
+    optimize: bool = False
+    """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti; of thousands of frames a
+    minute or two."""
     min_probability: float = DetectorConfig().min_probability
     """Of a loop."""
     skip_bad: bool = False
@@ -55,6 +61,8 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
+    if command.optimize and command.odometry is None:
+        raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
     odometry = None if command.odometry is None else read_odometry(command.odometry, format=command.odometry_format)
     recording = command.source.open(command.recording)
     params = load(command.weights)
@@ -70,8 +78,12 @@ def loops_of_recording(command: LoopsCommand) -> int:
             should_stop=stop,
             on_progress=show,
         )
-    paths = [*write_found(found, command.out), write_loops_page(found, command.out)]
+    corrected = optimize_trajectory(found) if command.optimize else None
+    paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses)
+    paths.append(write_loops_page(found, command.out, optimized=corrected))
     print(found)
+    if corrected is not None:
+        print(f"trajectory corrected by {corrected.believed.sum()} of {len(found.loops)} loops")
     print(f"{command.out}: {', '.join(path.name for path in paths)}")
     if stop():
         print("the same command goes on from here", file=sys.stderr)

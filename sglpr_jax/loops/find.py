@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.candidates import Seen
+from sglpr_jax.loops.candidates import Candidate, Seen
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.loop import Loop
@@ -39,6 +39,10 @@ class FoundLoops:
     """Of all of the recording's scans."""
     skipped: tuple[str, ...] = ()
     """The ids of scans that could not be read."""
+    candidates: tuple[Candidate, ...] = ()
+    """All pairs that were looked at, loops or not."""
+    model: LoopModel | None = None
+    """What said how probable they are."""
 
     def __str__(self) -> str:
         found = f"{len(self.loops)} loops in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
@@ -100,7 +104,8 @@ def find_loops(
     if len(skipped) == len(recording):
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
     loops, refused = settled(recording, detector.loops, odometry, config, registered=registered)
-    return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, skipped)
+    seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model}
+    return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
 
 
 def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i: int) -> dict[str, Any]:
