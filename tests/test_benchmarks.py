@@ -121,6 +121,13 @@ def test_the_parts_of_a_loop_are_timed():
     ]
 
 
+def test_a_map_opens_however_the_command_was_killed():
+    output = printed("kill_map.py", "--kills", "3", "--scans", "30")
+    last = output.splitlines()[-1]
+    assert last.startswith("3 kills, a run takes") and "damaged" not in last
+    assert "absent" in last or "opened" in last
+
+
 def test_models_of_loops_are_fitted_and_written(tmp_path):
     output = printed("fit_loops.py", *SMALL, "--out", str(tmp_path / "models.json"))
     assert "simulated: LoopModel" in output

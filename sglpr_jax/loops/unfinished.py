@@ -30,6 +30,8 @@ from sglpr_jax.retrieval.reuse import fingerprint
 FORMAT = "sglpr-jax unfinished loops 1"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
+ALIGNMENT_NUMBERS = 14
+"""x, y, yaw, nine of the covariance, correlation, second."""
 FRAMES = 50
 """In a file."""
 
@@ -142,7 +144,7 @@ def _columns(candidates: list[Candidate]) -> dict[str, np.ndarray]:
     alignments = [np.concatenate([np.reshape(value, -1) for value in one.alignment]) for one in candidates]
     return {
         "pairs": np.array([(one.query, one.match) for one in candidates], np.int64).reshape(-1, 2),
-        "alignments": np.array(alignments, np.float64).reshape(len(candidates), -1),
+        "alignments": np.array(alignments, np.float64).reshape(-1, ALIGNMENT_NUMBERS),
         "evidence": np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(Evidence._fields)),
     }
 

@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from .conftest import SCANS, assert_one_line_error
 
 FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "index.html"}
 TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
+OPTIMIZED = {"trajectory-optimized.tum", "trajectory-optimized.kitti"}
 
 
 @pytest.fixture
@@ -27,10 +29,13 @@ def odometry(town, tmp_path) -> np.ndarray:
 def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_path):
     write_kitti(tmp_path / "odometry.txt", odometry)
     out = tmp_path / "found"
-    options = ("--odometry", tmp_path / "odometry.txt", "--odometry-format", "kitti", "--out", out)
+    options = ("--odometry", tmp_path / "odometry.txt", "--odometry-format", "kitti", "--out", out, "--optimize")
     ended = command("loops", town, "--seq", "08", *options)
     assert ended.status == 0, ended.error
-    assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES
+    assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES | {
+        "trajectory-optimized.tum",
+        "trajectory-optimized.kitti",
+    }
     expected = find_loops(open_recording(town, "08"), load("simulated"), odometry=odometry)
     found = read_loops_jsonl(out / "loops.jsonl")
     assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
@@ -38,7 +43,10 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
     graph = read_g2o(out / "loops.g2o")
     assert len(graph.poses) == SCANS and len(graph.edges) == SCANS - 1 + len(found)
     np.testing.assert_allclose(read_tum(out / "trajectory.tum")[0], odometry, atol=1e-5)
+    assert f"corrected by {len(found)} of {len(found)} loops" in ended.out
+    assert read_tum(out / "trajectory-optimized.tum")[0].shape == (SCANS, 4, 4)
     page = (out / "index.html").read_text()
+    assert "<h2>Corrected</h2>" in page and "<h2>Sure of it?</h2>" in page
     assert "<h2>Where</h2>" in page and page.count("data:image/png;base64,") >= 2
 
 
@@ -66,10 +74,26 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
     assert "the same command goes on from here" in ended.error
 
 
+@pytest.mark.slow
+def test_bad_scans_are_told_and_skipped(command, town, tmp_path):
+    folder = tmp_path / "town"
+    shutil.copytree(town / "sequences" / "08", folder / "sequences" / "08")
+    for scan in ("000003", "000021"):
+        (folder / "sequences/08/velodyne" / f"{scan}.bin").write_bytes(b"half")
+    assert_one_line_error(command("loops", folder, "--out", tmp_path / "found"), "000003.bin")
+    ended = command("loops", folder, "--out", tmp_path / "found", "--skip-bad")
+    assert ended.status == 0, ended.error
+    assert ended.out.splitlines()[0].endswith("2 scans skipped")
+    assert [line[:14] for line in ended.error.splitlines() if "skipped" in line] == ["skipped 000003", "skipped 000021"]
+
+
 def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     short, flat = tmp_path / "short.tum", tmp_path / "flat.txt"
     write_tum(short, odometry[:7], np.arange(7.0))
     np.savetxt(flat, np.zeros((SCANS, 12)))
+    assert_one_line_error(
+        command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--optimize"), "--odometry", "found none"
+    )
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry")
     assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
     assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line and their axes named, kitti")
