@@ -101,8 +101,9 @@ SMALL = ("--scans", "100", "--azimuth-steps", "200", "--towns", "08:3")
 
 
 def test_loops_are_scored_on_simulated_drives():
-    output = printed("loops.py", "simulated", *SMALL)
+    output = printed("loops.py", "simulated", *SMALL, "--optimized")
     assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output
+    assert "trajectory: off by" in output and "pairs at 0.99 or more" in output
 
 
 def test_loops_are_scored_on_images(tmp_path):
