@@ -154,7 +154,7 @@ def _candidates(columns: dict[str, np.ndarray]) -> list[Candidate]:
     for (query, match), values, evidence in zip(
         columns["pairs"].tolist(), columns["alignments"], columns["evidence"], strict=True
     ):
-        x, y, yaw, *covariance, correlation, second = values
-        alignment = Alignment(x, y, yaw, np.reshape(covariance, (3, 3)), correlation, second)
+        fields: list[Any] = [*values[:3], values[3:12].reshape(3, 3), *values[12:]]
+        alignment = Alignment(*fields)
         found.append(Candidate(query, match, alignment, Evidence(*map(np.asarray, evidence))))
     return found

@@ -47,20 +47,15 @@ def wait_for(process: subprocess.Popen, path: Path) -> None:
 def test_a_run_killed_again_and_again_ends_like_one_that_was_not(arguments, tmp_path):
     whole, out = finish(arguments, tmp_path / "whole"), tmp_path / "killed"
     rng = np.random.default_rng(0)
-    for name in ("settings.json", "000000.safetensors", "000050.safetensors"):
+    written = set()
+    for name in ("000000.safetensors", "000050.safetensors"):
         process = start(arguments, out)
         wait_for(process, out / "unfinished" / name)
         time.sleep(rng.uniform(0, 0.3))
         process.kill()
         process.wait()
-    kept = sorted(path.name for path in (out / "unfinished").glob("0*"))
-    assert kept[:2] == ["000000.safetensors", "000050.safetensors"]
-    written = (out / "unfinished" / kept[0]).stat().st_mtime_ns
-    process = start(arguments, out)
-    wait_for(process, out / "unfinished" / "000100.safetensors")
-    assert (out / "unfinished" / kept[0]).stat().st_mtime_ns == written  # not seen again
-    process.kill()
-    process.wait()
+        written.add((out / "unfinished" / "000000.safetensors").stat().st_mtime_ns)
+    assert len(written) == 1  # what was seen is not seen again
     found = finish(arguments, out)
     assert found == whole
     assert len(whole["loops.jsonl"].splitlines()) > 3
