@@ -14,7 +14,7 @@ from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
-from sglpr_jax.loops.optimization import optimize_trajectory
+from sglpr_jax.loops.optimization import check_installed, optimize_trajectory
 from sglpr_jax.loops.unfinished import remove
 from sglpr_jax.models.weights_file import load
 
@@ -63,6 +63,8 @@ def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
     if command.optimize and command.odometry is None:
         raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
+    if command.optimize:
+        check_installed()
     odometry = None if command.odometry is None else read_odometry(command.odometry, format=command.odometry_format)
     recording = command.source.open(command.recording)
     params = load(command.weights)

@@ -16,7 +16,7 @@ from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.probability import LoopModel
-from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.registration import check_installed, register
 from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.embed import OnBadScan
@@ -74,7 +74,8 @@ def find_loops(
     numbers. With `kept_in`, a folder, what was seen of the scans is kept there, and a run that was killed goes on from
     it, if the recording, the odometry, the weights and the settings are the same; the folder stays. Ends early, with
     what was found, when `should_stop` says so. `on_progress` is told how many scans are done. Raises ValueError for
-    odometry of another length and where no scan can be read, and what reading the scans raises.
+    odometry of another length and where no scan can be read, ImportError without the extra, and what reading the scans
+    raises.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("simulated"))
@@ -85,6 +86,8 @@ def find_loops(
         )
     if registered and recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
+    if registered:
+        check_installed()
     detector = LoopDetector(params, model=model, config=config)
     given = functools.partial(_given, recording, odometry)
     kept = None if kept_in is None else Unfinished.opened(Path(kept_in), settings(recording, detector, odometry))

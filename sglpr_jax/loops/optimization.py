@@ -83,6 +83,11 @@ def _rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "
     return covariance[np.ix_(order, order)]
 
 
+def check_installed() -> None:
+    """Raise ImportError where the extra `gtsam` is not installed, before hours of work that end in a graph."""
+    _library()
+
+
 def _library() -> ModuleType:
     try:
         return importlib.import_module("gtsam")

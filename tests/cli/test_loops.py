@@ -1,5 +1,6 @@
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -85,6 +86,15 @@ def test_bad_scans_are_told_and_skipped(command, town, tmp_path):
     assert ended.status == 0, ended.error
     assert ended.out.splitlines()[0].endswith("2 scans skipped")
     assert [line[:14] for line in ended.error.splitlines() if "skipped" in line] == ["skipped 000003", "skipped 000021"]
+
+
+@pytest.mark.parametrize(("flag", "module"), [("--optimize", "gtsam"), ("--register", "small_gicp")])
+def test_a_missing_extra_is_said_before_the_search(command, town, odometry, tmp_path, monkeypatch, flag, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    write_tum(tmp_path / "odometry.tum", odometry, np.arange(float(SCANS)))
+    options = ("--odometry", tmp_path / "odometry.tum", "--out", tmp_path / "found", flag)
+    assert_one_line_error(command("loops", town, "--seq", "08", *options), "pip install 'sglpr-jax[")
+    assert not (tmp_path / "found").exists()
 
 
 def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
