@@ -74,7 +74,7 @@ class Unfinished:
             try:
                 other = [name for name, value in wanted.items() if read_json(path).get(name) != value]
             except (ValueError, OSError, AttributeError):
-                other = ["other settings"]
+                other = ["format"]
             if other:
                 warn(f"{folder}: expected what a run with the same settings has kept, found another {', '.join(other)}")
                 remove(folder)

@@ -3,7 +3,6 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import sglpr_jax
@@ -27,8 +26,7 @@ def examples(tmp_path_factory) -> Path:
         recording = sglpr_jax.open_recording(root, seq)
         sglpr_jax.embed(method_named("polar-fft", None, recording), recording).save(folder / f"{name}.npz")
     recording = sglpr_jax.open_recording(folder / "KITTI", "08")
-    poses = np.tile(np.eye(4), (len(recording), 1, 1))
-    poses[:, :3, 3] = recording.positions
+    poses = sglpr_jax.read_odometry(folder / "KITTI/sequences/08/poses.txt", format="kitti")
     write_tum(folder / "odometry.tum", poses, recording.times)
     return folder
 

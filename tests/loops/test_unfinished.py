@@ -105,7 +105,7 @@ def test_what_is_damaged_is_seen_again_and_what_others_made_is_thrown_away(twice
             find_loops(recording, params, **change, **options, on_progress=done.append)
         assert done[0] == (0 if words else 24)
     (kept / "settings.json").write_text("[]")
-    with pytest.warns(DataWarning, match="found another other settings"):
+    with pytest.warns(DataWarning, match="found another format"):
         find_loops(recording, params, **options, should_stop=lambda: True)
     assert sorted(path.name for path in kept.iterdir()) == ["mine.txt", "settings.json"]
 
