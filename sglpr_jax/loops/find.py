@@ -93,7 +93,8 @@ def find_loops(
     kept = None if kept_in is None else Unfinished.opened(Path(kept_in), settings(recording, detector, odometry))
     if kept is not None:
         kept.recall(detector, recording.mounting, given, missing=on_bad_scan is not None)
-        on_progress(len(detector))
+        if len(detector):
+            on_progress(len(detector))
     for i in range(len(detector), len(recording)):
         if should_stop():
             break

@@ -73,7 +73,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
             recording, params, **options, should_stop=stopping_after(frames, []), on_progress=done.append
         )
         reached.append(found.frames)
-        assert done[0] == (reached[-2] if len(reached) > 1 else 0)
+        assert done[0] == (reached[-2] if len(reached) > 1 else 1)
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
     (tmp_path / "kept" / ".000024.safetensors.1.tmp").write_bytes(b"half")
@@ -103,7 +103,7 @@ def test_what_is_damaged_is_seen_again_and_what_others_made_is_thrown_away(twice
                 find_loops(recording, params, **change, **options, on_progress=done.append)
         else:
             find_loops(recording, params, **change, **options, on_progress=done.append)
-        assert done[0] == (0 if words else 24)
+        assert done[0] == (1 if words else 24)
     (kept / "settings.json").write_text("[]")
     with pytest.warns(DataWarning, match="found another format"):
         find_loops(recording, params, **options, should_stop=lambda: True)
