@@ -9,7 +9,7 @@ The odometry is that of the true poses, made 1 % too long and turned by half a d
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -17,17 +17,21 @@ import jax
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float
+from rich.console import Console
 from rich.progress import track
+from rich.table import Table
 
 import sglpr_jax
 from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
-from sglpr_jax.loops.candidates import Candidate, labelled
+from sglpr_jax.loops.candidates import Candidate
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.find import settled
 from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.optimization import optimized, trajectory_error
 from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.reliability import Bin, reliability_of
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import align_all
 from sglpr_jax.models.params import Params
@@ -37,6 +41,7 @@ from sglpr_jax.sim.sensor import HDL64E
 LOOP_M, OTHER_M, REVISIT_M = 10.0, 20.0, 5.0
 """A loop is right up to the first and wrong beyond the second; a revisit that counts is within the third."""
 SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
+SURE = 0.99
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,11 +57,14 @@ class Simulated:
     """Hand in drifting odometry."""
     registered: bool = False
     """Register full scans too (extra slam)."""
+    optimized: bool = False
+    """Correct the odometry by the loops too (extra gtsam)."""
     seed: int = 0
 
     def run(self) -> None:
         params = sglpr_jax.load(self.weights)
         sensor = dataclasses.replace(HDL64E, azimuth_steps=self.azimuth_steps)
+        sure = {}
         for town in self.towns:
             route, seed = town.split(":")
             drive = simulate_recording(route, scans=self.scans, sensor=sensor, seed=int(seed))
@@ -64,7 +72,13 @@ class Simulated:
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(drive, params, odometry, f"town {town}")
             kept, refused = settled(drive, detector.loops, odometry, DetectorConfig(), registered=self.registered)
-            report(f"town {town}", drive, poses, detector, kept, refused, seconds)
+            sure[f"town {town}"] = report(f"town {town}", drive, poses, detector, kept, refused, seconds)
+            if self.optimized and odometry is not None:
+                found = optimized(odometry, tuple(kept))
+                before, after = (trajectory_error(each, drive.positions) for each in (odometry, found.poses))
+                print(f"  trajectory: off by {before:.2f} m before, {after:.2f} m after, ", end="")
+                print(f"{found.believed.sum()} of {len(kept)} loops believed")
+        Console().print(sure_table(sure))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +94,7 @@ class Images:
     seed: int = 0
 
     def run(self) -> None:
-        params = sglpr_jax.load(self.weights)
+        params, sure = sglpr_jax.load(self.weights), {}
         for name in self.seqs:
             recording = sglpr_jax.open_recording(self.data, name)
             poses = np.tile(np.eye(4), (len(recording), 1, 1))
@@ -88,7 +102,7 @@ class Images:
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(recording, params, odometry, name)
             kept, refused = settled(recording, detector.loops, odometry, DetectorConfig(), registered=False)
-            report(name, recording, poses, detector, kept, refused, seconds)
+            sure[name] = report(name, recording, poses, detector, kept, refused, seconds)
             log_odds = detector.model.log_odds(Evidence.stack([one.evidence for one in detector.candidates]))
             agreed = {(loop.query, loop.match) for loop in kept}
             bonus = [1000.0 * ((one.query, one.match) in agreed) for one in detector.candidates]
@@ -99,6 +113,7 @@ class Images:
                 ("most probable, loops that were kept first", log_odds + bonus),
             ):
                 score_top1(title, recording, detector.candidates, np.asarray(scores))
+        Console().print(sure_table(sure))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +132,7 @@ class Speed:
         records = [drive.record(i, labels=False) for i in range(20)]
         rows = np.random.default_rng(0).normal(size=(self.frames, finder.index.width)).astype(np.float32)
         finder.index.add(rows / np.linalg.norm(rows, axis=1, keepdims=True), times=np.arange(self.frames) / 10)
-        image = finder.seen(records[0])[1]
+        image = finder.seen(records[0]).image
         finder.images += [image] * self.frames
         finder.empty += [False] * self.frames
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
@@ -172,8 +187,8 @@ def report(
     kept: Sequence[Loop],
     refused: Sequence[Loop],
     seconds: Float[np.ndarray, " n"],
-) -> None:
-    """Print precision, recall, pose errors, calibration and time."""
+) -> Bin | None:
+    """Print precision, recall, pose errors, calibration and time; return what `calibration` does."""
     print(f"\n{title}: {len(recording)} frames, median {1e3 * np.median(seconds):.1f} ms a frame, ", end="")
     print(f"95 % {1e3 * np.percentile(seconds, 95):.1f} ms, without reading")
     revisited = revisits(recording, poses)
@@ -191,7 +206,7 @@ def report(
     for low, high in ((0, REVISIT_M), (REVISIT_M, LOOP_M)):
         near = (distances(pairs, poses) >= low) & (distances(pairs, poses) < high)
         pose_errors(f"poses of all candidates {low:g} to {high:g} m apart", list(np.array(pairs, object)[near]), poses)
-    calibration(detector, poses)
+    return calibration(detector, poses)
 
 
 def revisits(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, " n"]:
@@ -218,15 +233,25 @@ def pose_errors(title: str, loops: Sequence[Loop], poses: Float[np.ndarray, "n 4
     print(f"median {np.median(metres):.3f} m and {np.median(degrees):.3f} degrees")
 
 
-def calibration(detector: LoopDetector, poses: Float[np.ndarray, "n 4 4"]) -> None:
-    """How many of the pairs of each probability are loops."""
-    evidence, is_loop = labelled(detector.candidates, poses[:, :3, 3], loop_m=LOOP_M)
-    probability = detector.model.probability(evidence)
-    for low, high in ((0, 0.01), (0.01, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01)):
-        chosen = (probability >= low) & (probability < high)
-        if chosen.any():
-            share = f"{is_loop[chosen].mean():.4f} are loops, {probability[chosen].mean():.4f} said"
-            print(f"  candidates of probability {low:g} to {min(high, 1):g}: {chosen.sum()}, {share}")
+def calibration(detector: LoopDetector, poses: Float[np.ndarray, "n 4 4"]) -> Bin | None:
+    """Print how many of the pairs of each probability are loops; return those at `SURE` and above."""
+    bins = reliability_of(detector.candidates, detector.model, poses[:, :3, 3])
+    for one in bins:
+        share = f"{one.loops} ({one.share:.4f}) are loops, {one.said:.4f} said"
+        print(f"  candidates of probability {one.low:g} to {one.high:g}: {one.pairs}, {share}")
+    return bins[-1] if bins and bins[-1].low == SURE else None
+
+
+def sure_table(sure: Mapping[str, Bin | None]) -> Table:
+    """At a probability of `SURE` or more, how many are loops: of each drive and of all."""
+    table = Table("drive", f"pairs at {SURE:g} or more", "loops", "share", "said")
+    there = {title: one for title, one in sure.items() if one is not None}
+    rows = [(title, one.pairs, one.loops, one.said) for title, one in there.items()]
+    pairs, loops = sum(one.pairs for one in there.values()), sum(one.loops for one in there.values())
+    rows.append(("all", pairs, loops, sum(one.pairs * one.said for one in there.values()) / max(pairs, 1)))
+    for title, pairs, loops, said in rows:
+        table.add_row(title, str(pairs), str(loops), f"{loops / max(pairs, 1):.4f}", f"{said:.4f}")
+    return table
 
 
 def score_top1(

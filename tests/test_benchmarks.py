@@ -152,8 +152,9 @@ def test_the_time_of_a_step_is_told_by_parts(tmp_path):
 
 
 def test_loops_are_scored_on_simulated_drives():
-    output = printed("loops.py", "simulated", *SMALL)
+    output = printed("loops.py", "simulated", *SMALL, "--optimized")
     assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output
+    assert "trajectory: off by" in output and "pairs at 0.99 or more" in output
 
 
 def test_loops_are_scored_on_images(tmp_path):
@@ -170,6 +171,13 @@ def test_the_parts_of_a_loop_are_timed():
         "verification",
         "all of it",
     ]
+
+
+def test_a_map_opens_however_the_command_was_killed():
+    output = printed("kill_map.py", "--kills", "3", "--scans", "30")
+    last = output.splitlines()[-1]
+    assert last.startswith("3 kills, a run takes") and "damaged" not in last
+    assert "absent" in last or "opened" in last
 
 
 def test_models_of_loops_are_fitted_and_written(tmp_path):

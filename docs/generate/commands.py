@@ -46,7 +46,13 @@ def _section(name: str, command: type) -> str:
     ]
     if commands:
         lines += ["```bash", *commands, "```", ""]
-    return "\n".join([*lines, table(("flag", "default", "meaning"), [_row(field) for field in fields_of(command)]), ""])
+    return "\n".join([*lines, table(("flag", "default", "meaning"), [_row(field) for field in _flags(command)]), ""])
+
+
+def _flags(command: type) -> list[Field]:
+    """The fields of a command, with those of the options that several commands share in their place."""
+    each = [fields_of(type(f.default)) if "OmitArgPrefixes" in f.annotation else [f] for f in fields_of(command)]
+    return [field for fields in each for field in fields]
 
 
 def _row(field: Field) -> tuple[str, str, str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from sglpr_jax.cli.datasets import simulate
 from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
+from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import own_names, parse_command, run
 from sglpr_jax.cli.train import TrainCommand, train_and_test
 from sglpr_jax.evaluation.final_test import SHIPPED, UNTRAINED
@@ -50,8 +51,9 @@ def demo(command: DemoCommand) -> Path:
         TrainCommand(seq=TESTED, data=town, preset="demo", weights=WEIGHTS, method=BESIDE, out=trained, config=config)
     )
     print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
+    source = PosedRecordingOptions(seq=TESTED)
     descriptors = embed_recording(
-        EmbedCommand(data=town, seq=TESTED, weights=str(trained), out=command.out / f"{TESTED}.npz")
+        EmbedCommand(data=town, source=source, weights=str(trained), out=command.out / f"{TESTED}.npz")
     )
     evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=str(trained)))
     pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])

@@ -1,11 +1,12 @@
 """bin/embed: write the descriptors of a sequence, or of a folder of scans."""
 
 import dataclasses
-import sys
 from pathlib import Path
 
+import tyro
+
+from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
 from sglpr_jax.methods.names import MethodName
 
 
@@ -28,21 +29,7 @@ class EmbedCommand:
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     method: MethodName = "sglpr"
     """The network, or a handcrafted method, which needs no weights; some need points, ssc labels too."""
-    seq: str | None = None
-    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
-    pose_source: PoseChoice = "auto"
-    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
-    format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
-    poses: Path | None = None
-    """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
-    pose_format: PoseFormat = "auto"
-    """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
-    times: Path | None = None
-    """Seconds, one number a line, where no times.txt lies beside the scans."""
+    source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     rotate: bool = False
     """Rotate every scan about z by its own random angle first."""
     seed: int = 0
@@ -55,24 +42,14 @@ class EmbedCommand:
 
 def embed_recording(command: EmbedCommand) -> Path:
     """Do what the command says; returns the file written."""
-    from sglpr_jax.cli.datasets import open_recording  # these bring JAX and more, which --help does not need
-    from sglpr_jax.methods.registry import method_named
+    from sglpr_jax.methods.registry import method_named  # these bring JAX and more, which --help does not need
     from sglpr_jax.retrieval.embed import embed
 
     if command.out.suffix != ".npz":
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
-    recording = open_recording(
-        command.data,
-        command.seq,
-        pose_source=command.pose_source,
-        format=command.format,
-        poses=command.poses,
-        pose_format=command.pose_format,
-        times=command.times,
-        sensor_height=command.sensor_height,
-    )
+    recording = command.source.open(command.data)
     method = method_named(command.method, command.weights, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         file = embed(
@@ -80,17 +57,13 @@ def embed_recording(command: EmbedCommand) -> Path:
             recording,
             rotation_seed=command.seed if command.rotate else None,
             batch=command.batch,
-            on_bad_scan=_report if command.skip_bad else None,
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
             on_progress=show,
         )
     file.save(command.out)
     skipped = len(recording) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
     return command.out
-
-
-def _report(scan: str, error: Exception) -> None:
-    print(f"skipped {scan}: {error}", file=sys.stderr)
 
 
 def main() -> None:

@@ -7,65 +7,66 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.datasets import open_recording
+from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
-from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.evaluation.page.of_loops import write_loops_page
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
+from sglpr_jax.loops.optimization import check_installed, optimize_trajectory
+from sglpr_jax.loops.unfinished import remove
 from sglpr_jax.models.weights_file import load
+
+UNFINISHED = "unfinished"
+"""The folder, in that of the results, of a run that has not ended."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopsCommand:
     """Find the loops of a recording: pairs of scans of one place, how they lie to each other, and how sure that is.
 
-    Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti.
-    Ctrl-C keeps what was found.
+    Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti,
+    with --optimize also the corrected trajectory.
+    Ctrl-C keeps what was found; the same command goes on after it, and after a run that was killed.
 
     Examples:
       bin/loops my_scans --out found
-      bin/loops my_scans --poses odometry.tum --out found
-      bin/loops KITTI --seq 08 --poses KITTI/poses/08.txt --pose-format kitti --out found --register
+      bin/loops my_scans --odometry odometry.tum --out found
+      bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found --register
+      bin/loops my_scans --odometry odometry.tum --optimize --out found
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
     """A dataset, a bag or a folder of scans, of any layout that is known."""
     out: Path
     """The folder to write into."""
-    poses: Path | None = None
-    """Odometry: a pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
-    pose_format: OdometryFormat = "auto"
+    odometry: Path | None = None
+    """A pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
+    odometry_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
     weights: str = "rings"
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
-    seq: str | None = None
-    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
-    pose_source: PoseChoice = "auto"
-    """Which positions of KITTI's layout are drawn where there is no odometry."""
-    format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     register: bool = False
     """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
+    optimize: bool = False
+    """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti; of thousands of frames a
+    minute or two."""
     min_probability: float = DetectorConfig().min_probability
     """Of a loop."""
+    skip_bad: bool = False
+    """Report scans that cannot be read and go on without them."""
 
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
-    odometry = None if command.poses is None else read_odometry(command.poses, format=command.pose_format)
-    recording = open_recording(
-        command.recording,
-        command.seq,
-        pose_source=command.pose_source,
-        format=command.format,
-        sensor_height=command.sensor_height,
-    )
+    if command.optimize and command.odometry is None:
+        raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
+    if command.optimize:
+        check_installed()
+    odometry = None if command.odometry is None else read_odometry(command.odometry, format=command.odometry_format)
+    recording = command.source.open(command.recording)
     params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(
@@ -74,13 +75,23 @@ def loops_of_recording(command: LoopsCommand) -> int:
             odometry=odometry,
             config=DetectorConfig(min_probability=command.min_probability),
             registered=command.register,
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
+            kept_in=command.out / UNFINISHED,
             should_stop=stop,
             on_progress=show,
         )
-    paths = [*write_found(found, command.out), write_loops_page(found, command.out)]
+    corrected = optimize_trajectory(found) if command.optimize else None
+    paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses)
+    paths.append(write_loops_page(found, command.out, optimized=corrected))
     print(found)
+    if corrected is not None:
+        print(f"trajectory corrected by {corrected.believed.sum()} of {len(found.loops)} loops")
     print(f"{command.out}: {', '.join(path.name for path in paths)}")
-    return stop.exit_status if stop() else 0
+    if stop():
+        print("the same command goes on from here", file=sys.stderr)
+        return stop.exit_status
+    remove(command.out / UNFINISHED)
+    return 0
 
 
 def main() -> None:

@@ -6,9 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.datasets import open_recording
+from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
 from sglpr_jax.loops.places import SPACING_M, PlaceMap
 from sglpr_jax.models.weights import weights_hash
@@ -38,15 +37,7 @@ class MapCommand:
     """Scans nearer than this to the last place are left out."""
     weights: str = "rings"
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
-    seq: str | None = None
-    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
-    pose_source: PoseChoice = "auto"
-    """Which pose file of KITTI's layout the recording is opened with; the map's poses are those of --poses."""
-    format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
 
 
 def write_map(command: MapCommand) -> Path:
@@ -58,13 +49,7 @@ def write_map(command: MapCommand) -> Path:
     before = None
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
-    recording = open_recording(
-        command.recording,
-        command.seq,
-        pose_source=command.pose_source,
-        format=command.format,
-        sensor_height=command.sensor_height,
-    )
+    recording = command.source.open(command.recording)
     with progress_bar(f"map {recording.name}", len(recording)) as show:
         places = PlaceMap.of(recording, params, poses, spacing_m=command.spacing_m, on_progress=show)
     whole = places if before is None else before.merged(places)

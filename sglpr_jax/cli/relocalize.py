@@ -9,7 +9,8 @@ import tyro
 from rich.table import Table
 
 from sglpr_jax.cli.runtime import console, parse_command, run
-from sglpr_jax.data.choices import ScanFormat
+from sglpr_jax.data.choices import ScanFormat, SensorHeight
+from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.record import Record, scan_record
 from sglpr_jax.files import write_json
@@ -39,23 +40,39 @@ class RelocalizeCommand:
     """The weights that made the map."""
     format: ScanFormat = "auto"
     """What the scan is, where its name does not tell."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scan, and `auto`
+    takes that of the map's last place."""
 
 
 def relocalize(command: RelocalizeCommand) -> list[Relocated]:
     """Do what the command says; returns the answers, the most probable first."""
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
-    found = places.relocate(params, _record(command), candidates=command.candidates)
+    found = places.relocate(params, _record(command, places), candidates=command.candidates)
     if command.out is not None:
         write_json(command.out, [_as_json(one) for one in found])
     console().print(_table(command.scan, found))
     return found
 
 
-def _record(command: RelocalizeCommand) -> Record:
+def _record(command: RelocalizeCommand, places: PlaceMap) -> Record:
     if command.scan.suffix == ".png":
         return Record(image=read_image(command.scan))
-    return scan_record(command.scan, format=command.format)
+    record = scan_record(command.scan, format=command.format)
+    return dataclasses.replace(record, mounting=_mounting(command, record, places))
+
+
+def _mounting(command: RelocalizeCommand, record: Record, places: PlaceMap) -> Mounting:
+    if command.sensor_height == "auto":
+        return places.mounting()
+    if command.sensor_height != "estimate":
+        return Mounting(float(command.sensor_height))
+    assert record.points is not None
+    found = estimate_mounting(record.points)
+    if found is None:
+        raise ValueError(f"{command.scan}: expected ground that tells the sensor's height, found none: say how high")
+    return found
 
 
 def _as_json(found: Relocated) -> dict:

@@ -4,9 +4,10 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from sglpr_jax.cli.datasets import open_recording
+import tyro
+
+from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
 from sglpr_jax.data.corruption.corruptions import chosen_corruptions
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
@@ -29,8 +30,6 @@ class StressCommand:
     """A dataset (KITTI's layout, ready-made BEV images) or a folder of scans with poses."""
     out: Path
     """Folder for results.json, config.json, stress.png and the descriptors; made if need be."""
-    seq: str | None = None
-    """Which sequence; may be left out where there is only one."""
     weights: str | None = None
     """The name of shipped weights or a training run's folder: the network is among the methods."""
     method: tuple[MethodName, ...] = ()
@@ -39,19 +38,7 @@ class StressCommand:
     """Their names, or `all`. None named: top1-f1max and pairs-f1max."""
     corruption: tuple[str, ...] = ()
     """Names (beams-16) or kinds (beams) of corruptions. None named: all; of ready-made images rotation alone."""
-    pose_source: PoseChoice = "auto"
-    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
-    format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
-    poses: Path | None = None
-    """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
-    pose_format: PoseFormat = "auto"
-    """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
-    times: Path | None = None
-    """Seconds, one number a line, where no times.txt lies beside the scans."""
+    source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     seed: int = 0
     """A scan's corruption is a function of it and the scan's number."""
     batch: int = 16
@@ -62,16 +49,7 @@ def run_stress_test(command: StressCommand) -> Path:
     """Do what the command says; returns the folder written."""
     stress_protocols(command.protocol)  # what is wrong with these is said first
     chosen_corruptions(command.corruption)
-    recording = open_recording(
-        command.data,
-        command.seq,
-        pose_source=command.pose_source,
-        format=command.format,
-        poses=command.poses,
-        pose_format=command.pose_format,
-        times=command.times,
-        sensor_height=command.sensor_height,
-    )
+    recording = command.source.open(command.data)
     if recording.has_images and not command.corruption:
         print(f"sequence {recording.name} has only images, which can only be rotated", file=sys.stderr)
     found = stress_test(

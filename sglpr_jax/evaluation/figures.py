@@ -236,6 +236,35 @@ def loops(positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]])
     return figure
 
 
+def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
+    """Draw named trajectories from above, the first one grey; a dot is where each ends."""
+    across, along = np.ptp(np.concatenate(list(named.values()))[:, :2], axis=0)
+    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    for (name, positions), colour in zip(named.items(), ("0.6", "#2b5fc4", "#d62728"), strict=False):
+        axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
+        axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    axes.legend(loc="best", framealpha=0.95)
+    return figure
+
+
+def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
+    """Draw the share of loops over the probability that was said: (said, share, pairs) of each bin, by its count."""
+    figure = _figure(5.0, 4.6)
+    axes = figure.add_subplot(xlabel="probability that was said", ylabel="share of loops", xlim=(-0.03, 1.09))
+    axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
+    said, share, _ = np.array(bins).T
+    axes.plot(said, share, "o-", color="#2b5fc4", markersize=5, linewidth=1.4)
+    for x, y, pairs in bins:
+        axes.annotate(f"{pairs}", (x, y), xytext=(5, -10), textcoords="offset points", fontsize=8, color="0.35")
+    axes.set_ylim(-0.08, 1.05)
+    axes.grid(color="0.92")
+    return figure
+
+
 def loops_in_time(found: Sequence[tuple[int, int, float]], frames: int) -> "matplotlib.figure.Figure":
     """Draw which frame comes back to which: (query, match, probability) of each loop, the less sure ones lighter."""
     figure = _figure(5.0, 4.2)

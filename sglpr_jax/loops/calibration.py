@@ -10,13 +10,13 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import picture, rotated
-from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder
+from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import align
@@ -73,11 +73,11 @@ def certain_pairs(
     rng = np.random.default_rng(seed)
     evidence, is_loop = [], []
     for done, frame in enumerate(rng.permutation(n)[: 2 * pairs]):
-        descriptor, image = places.turned(int(frame), rng.uniform(0, 2 * np.pi))
+        turned = places.turned(int(frame), rng.uniform(0, 2 * np.pi))
         near, far = places.near(int(frame)), places.far(int(frame))
-        rows = rng.permutation(np.flatnonzero(near))[:1] if done % 2 else places.nearest(descriptor, far)
+        rows = rng.permutation(np.flatnonzero(near))[:1] if done % 2 else places.nearest(turned.descriptor, far)
         for row in rows:
-            evidence.append(places.evidence(descriptor, image, int(row)))
+            evidence.append(places.evidence(turned, int(row)))
             is_loop.append(bool(near[row]))
         on_progress(done + 1)
     if not evidence or all(is_loop) or not any(is_loop):
@@ -96,9 +96,9 @@ class _Places:
     ):
         self.finder, self.recording, self.config = CandidateFinder(params, config=config), recording, config
         seen = [self.finder.seen(recording.record(i, labels=False)) for i in range(len(recording))]
-        self.images = [image for _, image in seen]
-        for descriptor, _ in seen:
-            self.finder.index.add(descriptor)
+        self.images = [one.image for one in seen]
+        for one in seen:
+            self.finder.index.add(one.descriptor)
         self.positions, self.way = odometry[:, :3, 3], travelled(odometry)
 
     def apart(self, frame: int) -> Float[np.ndarray, " n"]:
@@ -119,18 +119,18 @@ class _Places:
         rows = self.finder.index.query(descriptor, exclude=~among).rows
         return rows[rows >= 0]
 
-    def turned(self, frame: int, angle: float) -> tuple[Float32[np.ndarray, " d"], UInt8[np.ndarray, "n n"]]:
-        """Descriptor and image of a frame turned by `angle`."""
+    def turned(self, frame: int, angle: float) -> Seen:
+        """What is seen of a frame turned by `angle`."""
         record = self.recording.record(frame, labels=False)
         if record.points is not None:
-            return self.finder.seen(Record(points=rotated(record.points, angle)))
+            return self.finder.seen(Record(points=rotated(record.upright_points, angle)))
         whole = even_cells(jnp.asarray(picture(record, None)[0]))
         return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
 
-    def evidence(self, descriptor: Float32[np.ndarray, " d"], image: UInt8[np.ndarray, "n n"], row: int) -> Evidence:
+    def evidence(self, query: Seen, row: int) -> Evidence:
         index = self.finder.index
-        found = jax.device_get(align(image, self.images[row], config=self.finder.verification))
-        distance = float(np.linalg.norm(index.descriptors[row].astype(np.float64) - descriptor))
-        other = float(index.query(descriptor, exclude=self.apart(row) <= NEGATIVE_M).distances[0])
+        found = jax.device_get(align(query.image, self.images[row], config=self.finder.verification))
+        distance = float(np.linalg.norm(index.descriptors[row].astype(np.float64) - query.descriptor))
+        other = float(index.query(query.descriptor, exclude=self.apart(row) <= NEGATIVE_M).distances[0])
         margin = other - distance if np.isfinite(other) else np.nan
         return Evidence.of(distance, margin, found.correlation, found.second)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import image_view, picture, view
@@ -52,6 +53,16 @@ class Candidate(NamedTuple):
     evidence: Evidence
 
 
+class Seen(NamedTuple):
+    """What is kept of a scan or ready-made image."""
+
+    descriptor: Float32[np.ndarray, " d"]
+    image: UInt8[np.ndarray, "n n"]
+    """Its density image."""
+    mounting: Mounting | None
+    """Of the sensor that was turned upright for both."""
+
+
 class CandidateFinder:
     """Takes scans as they come, and remembers descriptor and image of each."""
 
@@ -68,8 +79,12 @@ class CandidateFinder:
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
+        self.mounting: Mounting | None = None
+        """Of the sensor, one for all frames."""
         self.empty: list[bool] = []
         """Which frames show next to nothing."""
+        self.missing: list[int] = []
+        """The frames whose scans could not be read."""
 
     def add(
         self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
@@ -77,36 +92,39 @@ class CandidateFinder:
         """Describe a scan or image, and return its candidates, those of the nearest descriptor first.
 
         `odometry` is its pose, LiDAR frame in any fixed frame. Raises ValueError where some frames have a time or a
-        pose and others have none, and where times run backwards.
+        pose and others have none, where times run backwards, and for a record of a sensor mounted otherwise.
         """
-        descriptor, image = self.seen(record)
-        self._check(time, odometry)
-        query = len(self.index)
-        position = None if odometry is None else np.asarray(odometry, np.float64)[:3, 3]
-        excluded = self._excluded(time, position)
-        empty = self.is_empty(image)
-        excluded = excluded | empty
-        rows, distances = self.index.query(descriptor, self.config.candidates, exclude=excluded)
-        others = [self._other_place(descriptor, int(row), excluded) for row in rows if row >= 0]
-        self.index.add(descriptor, times=time, positions=position)
-        self.images.append(image)
-        self.empty.append(empty)
-        if odometry is not None:
-            self.odometry.append(np.asarray(odometry, np.float64))
-        rows, distances = rows[rows >= 0], distances[rows >= 0]
-        if not len(rows):
-            return []
-        padded = np.resize(rows, self.config.candidates)  # always as many, so that it compiles once
-        matches = np.stack([self.images[row] for row in padded])
-        found = jax.device_get(align_all(image, matches, config=self.verification))
-        pairs = []
-        for k, (row, distance, other) in enumerate(zip(rows, distances, others, strict=True)):
-            alignment = found.one(k)
-            evidence = Evidence.of(distance, other - distance, alignment.correlation, alignment.second)
-            pairs.append(Candidate(query, int(row), alignment, evidence))
-        return pairs
+        return self.add_seen(self.seen(record), time=time, odometry=odometry)
 
-    def seen(self, record: Record) -> tuple[Float32[np.ndarray, " d"], UInt8[np.ndarray, "n n"]]:
+    def add_seen(
+        self,
+        seen: Seen | None,
+        *,
+        time: float | None = None,
+        odometry: Float[np.ndarray, "4 4"] | None = None,
+        candidates: list[Candidate] | None = None,
+    ) -> list[Candidate]:
+        """Do what `add` does, of a record that was looked at before; None where its scan cannot be read.
+
+        `candidates` are those that an earlier run found for it, which saves the search. Errors are those of `add`.
+        """
+        self._check(seen, time, odometry)
+        pose = None if odometry is None else np.asarray(odometry, np.float64)
+        position = None if pose is None else pose[:3, 3]
+        if candidates is None:
+            candidates = [] if seen is None else self._candidates(seen, time, position)
+        if seen is None:
+            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
+            self.missing.append(len(self.index))
+        self.index.add(seen.descriptor, times=time, positions=position)
+        self.images.append(seen.image)
+        self.empty.append(self.is_empty(seen.image))
+        self.mounting = seen.mounting
+        if pose is not None:
+            self.odometry.append(pose)
+        return candidates
+
+    def seen(self, record: Record) -> Seen:
         """The descriptor of a scan or image, and its density image as 8 bits; nothing is remembered."""
         model = self.params.config
         whole, _ = picture(record, None)
@@ -114,15 +132,33 @@ class CandidateFinder:
             bev = image_view(whole, None, model.grid).image
         else:
             bev = view(record, model.grid, image=model.image).image
-        return np.asarray(describe(self.params, bev)), _kept(whole)
+        return Seen(np.asarray(describe(self.params, bev)), _kept(whole), record.mounting)
 
     def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
         """Whether an image shows too little to tell a place by."""
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
-    def _check(self, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
+    def _candidates(self, seen: Seen, time: float | None, position: Float[np.ndarray, " 3"] | None) -> list[Candidate]:
+        excluded = self._excluded(time, position) | self.is_empty(seen.image)
+        rows, distances = self.index.query(seen.descriptor, self.config.candidates, exclude=excluded)
+        rows, distances = rows[rows >= 0], distances[rows >= 0]
+        if not len(rows):
+            return []
+        padded = np.resize(rows, self.config.candidates)  # always as many, so that it compiles once
+        matches = np.stack([self.images[row] for row in padded])
+        found = jax.device_get(align_all(seen.image, matches, config=self.verification))
+        pairs = []
+        for k, (row, distance) in enumerate(zip(rows, distances, strict=True)):
+            alignment, other = found.one(k), self._other_place(seen.descriptor, int(row), excluded)
+            evidence = Evidence.of(distance, other - distance, alignment.correlation, alignment.second)
+            pairs.append(Candidate(len(self.index), int(row), alignment, evidence))
+        return pairs
+
+    def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self.index):
             return
+        if seen is not None and seen.mounting != self.mounting and len(self.missing) < len(self.index):
+            raise ValueError(f"expected one sensor, mounted {self.mounting}, found {seen.mounting}")
         for name, given, known in (
             ("a time", time is not None, self.index.times is not None),
             ("odometry", odometry is not None, bool(self.odometry)),

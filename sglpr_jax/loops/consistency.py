@@ -11,8 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.transforms import travelled, yaw_of
+from sglpr_jax.loops.transforms import moved_covariance, travelled, yaw_of
+from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry, upright_poses
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,12 +52,16 @@ def agree(
     odometry: Float[np.ndarray, "n 4 4"],
     others: Sequence[Loop] | None = None,
     *,
+    mounting: Mounting | None = None,
     config: ConsistencyConfig = ConsistencyConfig(),
 ) -> Bool[np.ndarray, "a b"]:
-    """Which loops agree with which `others` (None: with each other), by the odometry of all frames."""
+    """Which loops agree with which `others` (None: with each other), by the odometry of all frames.
+
+    Loops and odometry are of LiDAR frames; `mounting` says how these are tilted, since the plane is that of the ground.
+    """
     way = travelled(odometry)
-    flat = _planar(odometry)
-    a, b = _columns(loops, flat, way), _columns(loops if others is None else others, flat, way)
+    flat = _planar(upright_odometry(odometry, mounting))
+    a, b = (_columns(each, flat, way, mounting) for each in (loops, loops if others is None else others))
     # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: that is loop a again.
     query_from_query = _relative(a["query_pose"][:, None], b["query_pose"][None])
     match_from_match = _relative(a["match_pose"][:, None], b["match_pose"][None])
@@ -99,11 +105,15 @@ Planar = Float[np.ndarray, "... 3"]
 """Poses in the plane: x, y, yaw."""
 
 
-def _columns(loops: Sequence[Loop], flat: Planar, way: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
+def _columns(
+    loops: Sequence[Loop], flat: Planar, way: Float[np.ndarray, " n"], mounting: Mounting | None
+) -> dict[str, np.ndarray]:
     query, match = (np.array([getattr(loop, name) for loop in loops], np.int64) for name in ("query", "match"))
+    poses = np.array([loop.match_from_query for loop in loops]).reshape(-1, 4, 4)
     covariances = np.array([loop.covariance for loop in loops]).reshape(-1, 6, 6)
+    covariances = moved_covariance(covariances, upright_from_lidar(mounting))
     return {
-        "pose": _planar(np.array([loop.match_from_query for loop in loops]).reshape(-1, 4, 4)),
+        "pose": _planar(upright_poses(poses, mounting)),
         "query_pose": flat[query],
         "match_pose": flat[match],
         "query_way": way[query],

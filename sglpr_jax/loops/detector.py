@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
@@ -68,19 +68,32 @@ class LoopDetector:
     ) -> list[Loop]:
         """Add the next frame; return the loops that it closes or confirms, of this and of the last few frames.
 
-        `scan` is a record, points (n, 3) in metres or an image (h, w) as `density_bev` makes them; `time` seconds;
-        `odometry` the pose of the sensor in a frame that stays, drifting as it may. Raises ValueError for values of
+        `scan` is a record (with the sensor's mounting, where it has one), points (n, 3) in metres or an image (h, w) as
+        `density_bev` makes them; `time` seconds; `odometry` the pose of the LiDAR in a frame that stays, drifting as it
+        may. Raises ValueError for values of
         another shape, for times that go back, and where some frames have a time or odometry and others not.
         """
-        candidates = self.finder.add(_record(scan), time=time, odometry=_pose(odometry))
+        return self.add_seen(self.finder.seen(_record(scan)), time=time, odometry=_pose(odometry))
+
+    def add_seen(
+        self,
+        seen: Seen | None,
+        *,
+        time: float | None = None,
+        odometry: Float[np.ndarray, "4 4"] | None = None,
+        candidates: list[Candidate] | None = None,
+    ) -> list[Loop]:
+        """Do what `add` does, of a frame that was looked at before; None where its scan cannot be read.
+
+        `candidates` are those that an earlier run found for it (see `loops.unfinished`).
+        """
+        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, candidates=candidates)
         self.candidates += candidates
         if candidates:
             probabilities = self.model.probability(Evidence.stack([one.evidence for one in candidates]))
             best = int(np.argmax(probabilities))
             if probabilities[best] >= self.config.min_neighbour_probability:
-                one = candidates[best]
-                loop = planar_loop(one.query, one.match, one.alignment, probability=float(probabilities[best]))
-                self._waiting.append(loop)
+                self._waiting.append(self._loop(candidates[best], float(probabilities[best])))
         first = len(self) - self.config.consistency.neighbours
         self._waiting = [loop for loop in self._waiting if loop.query >= first]
         new = self._confirmed() if self._waiting else []
@@ -94,7 +107,7 @@ class LoopDetector:
         if odometry is None:
             pairs = agree_in_order(self._waiting, config=rules)
         else:
-            pairs = agree(self._waiting, odometry, config=rules)
+            pairs = agree(self._waiting, odometry, mounting=self.finder.mounting, config=rules)
         done = {loop.query for loop in self.loops[-rules.neighbours :]}
         return [
             loop
@@ -113,7 +126,12 @@ class LoopDetector:
             for other in self.loops
             if abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
         ]
-        return not about or bool(agree([loop], odometry, about, config=self.config.consistency).mean() >= 0.5)
+        rules = {"mounting": self.finder.mounting, "config": self.config.consistency}
+        return not about or bool(agree([loop], odometry, about, **rules).mean() >= 0.5)
+
+    def _loop(self, one: Candidate, probability: float) -> Loop:
+        mountings = dict.fromkeys(("query_mounting", "match_mounting"), self.finder.mounting)
+        return planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
 
 
 def _record(scan: Record | Float[np.ndarray, "..."]) -> Record:

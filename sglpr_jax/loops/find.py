@@ -1,18 +1,25 @@
 """All loops of a recording: the detector over its scans, then what only the whole drive can tell."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.loops.candidates import Candidate, Seen
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.probability import LoopModel
-from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.registration import check_installed, register
+from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.embed import OnBadScan
 
 MIN_OVERLAP = 0.6
 """Registered scans that share less of their space show two places. Measured: docs/decisions/loops.md."""
@@ -30,10 +37,17 @@ class FoundLoops:
     """Pairs that were called loops first, but agree with too few others, or do not overlap."""
     odometry: Float[np.ndarray, "n 4 4"] | None
     """Of all of the recording's scans."""
+    skipped: tuple[str, ...] = ()
+    """The ids of scans that could not be read."""
+    candidates: tuple[Candidate, ...] = ()
+    """All pairs that were looked at, loops or not."""
+    model: LoopModel | None = None
+    """What said how probable they are."""
 
     def __str__(self) -> str:
         found = f"{len(self.loops)} loops in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
-        return f"{found}, {len(self.refused)} refused afterwards"
+        skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
+        return f"{found}, {len(self.refused)} refused afterwards{skipped}"
 
 
 def find_loops(
@@ -44,6 +58,8 @@ def find_loops(
     model: LoopModel | None = None,
     config: DetectorConfig = DetectorConfig(),
     registered: bool = False,
+    on_bad_scan: OnBadScan | None = None,
+    kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> FoundLoops:
@@ -51,9 +67,15 @@ def find_loops(
 
     With `odometry`, a pose for each scan (LiDAR frame, drifting as it may), candidates too far from it are left out,
     and of the loops found the largest set is kept in which all agree. With `registered` the pose of each loop is made
-    one in 6 degrees of freedom from its full scans (extra `slam`), and loops of little overlap are refused. Ends early,
-    with what was found, when `should_stop` says so. `on_progress` is told how many scans are done. Raises ValueError
-    for odometry of another length, and what reading the scans raises.
+    one in 6 degrees of freedom from its full scans (extra `slam`), and loops of little overlap are refused. Poses are
+    of the LiDAR's own frame, as the points have it, however the sensor is mounted.
+
+    A scan that cannot be read raises its error or, given `on_bad_scan(id, error)`, is left out; frames keep their
+    numbers. With `kept_in`, a folder, what was seen of the scans is kept there, and a run that was killed goes on from
+    it, if the recording, the odometry, the weights and the settings are the same; the folder stays. Ends early, with
+    what was found, when `should_stop` says so. `on_progress` is told how many scans are done. Raises ValueError for
+    odometry of another length and where no scan can be read, ImportError without the extra, and what reading the scans
+    raises.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("rings"))
@@ -64,18 +86,47 @@ def find_loops(
         )
     if registered and recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
+    if registered:
+        check_installed()
     detector = LoopDetector(params, model=model, config=config)
-    for i in range(len(recording)):
+    given = functools.partial(_given, recording, odometry)
+    kept = None if kept_in is None else Unfinished.opened(Path(kept_in), settings(recording, detector, odometry))
+    if kept is not None:
+        kept.recall(detector, recording.mounting, given, missing=on_bad_scan is not None)
+        if len(detector):
+            on_progress(len(detector))
+    for i in range(len(detector), len(recording)):
         if should_stop():
             break
-        detector.add(
-            recording.record(i, labels=False),
-            time=None if recording.times is None else float(recording.times[i]),
-            odometry=None if odometry is None else odometry[i],
-        )
+        detector.add_seen(_seen(detector, recording, i, on_bad_scan), **given(i))
+        if kept is not None:
+            kept.keep(detector)
         on_progress(i + 1)
-    kept, refused = settled(recording, detector.loops, odometry, config, registered=registered)
-    return FoundLoops(recording, len(detector), tuple(kept), tuple(refused), odometry)
+    if kept is not None:
+        kept.keep(detector, all=True)
+    skipped = tuple(recording.ids[i] for i in detector.finder.missing)
+    if len(skipped) == len(recording):
+        raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+    loops, refused = settled(recording, detector.loops, odometry, config, registered=registered)
+    seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model}
+    return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
+
+
+def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i: int) -> dict[str, Any]:
+    """Time and odometry of a frame."""
+    time = None if recording.times is None else float(recording.times[i])
+    return {"time": time, "odometry": None if odometry is None else odometry[i]}
+
+
+def _seen(detector: LoopDetector, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
+    """What is seen of a scan; None where it cannot be read, which `on_bad_scan` is told."""
+    try:
+        return detector.finder.seen(recording.record(i, labels=False))
+    except (ValueError, OSError) as error:
+        if on_bad_scan is None:
+            raise
+        on_bad_scan(recording.ids[i], error)
+        return None
 
 
 def settled(
@@ -87,7 +138,7 @@ def settled(
     registered: bool,
 ) -> tuple[list[Loop], list[Loop]]:
     """The loops of a whole drive that agree and, where they are registered, overlap; and those that do not."""
-    kept, refused = _agreeing(loops, odometry, config)
+    kept, refused = _agreeing(loops, odometry, recording.mounting, config)
     if registered:
         kept, others = _registered(recording, kept)
         refused = refused + others
@@ -95,12 +146,16 @@ def settled(
 
 
 def _agreeing(
-    loops: list[Loop], odometry: Float[np.ndarray, "n 4 4"] | None, config: DetectorConfig
+    loops: list[Loop],
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    mounting: Mounting | None,
+    config: DetectorConfig,
 ) -> tuple[list[Loop], list[Loop]]:
     """The largest set of loops that all agree, and the others; without odometry all of them."""
     if odometry is None or len(loops) < 2:
         return loops, []
-    members = set(largest_consistent_set(agree(loops, odometry, config=config.consistency)).tolist())
+    pairs = agree(loops, odometry, mounting=mounting, config=config.consistency)
+    members = set(largest_consistent_set(pairs).tolist())
     return [loop for i, loop in enumerate(loops) if i in members], [
         loop for i, loop in enumerate(loops) if i not in members
     ]

@@ -3,19 +3,22 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
 
 GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
-TRAJECTORY_TUM, TRAJECTORY_KITTI = "trajectory.tum", "trajectory.kitti"
 
 
-def write_found(found: FoundLoops, folder: Path | str) -> list[Path]:
+def write_found(
+    found: FoundLoops, folder: Path | str, *, optimized: Float[np.ndarray, "n 4 4"] | None = None
+) -> list[Path]:
     """Write loops as g2o, JSON lines and csv and, where there is odometry, the trajectory as TUM and KITTI.
 
-    The trajectory is the odometry as it was given, of the frames that were looked at. Its times are the recording's,
-    or the numbers of the frames. Returns the paths written. Raises WriteError where one cannot be written.
+    The trajectory is the odometry as it was given, of the frames that were looked at; `optimized` is the corrected one,
+    in files beside it. Their times are the recording's, or the numbers of the frames. Poses are those of the LiDAR.
+    Returns the paths written. Raises WriteError where one cannot be written.
     """
     folder = Path(folder)
     odometry = None if found.odometry is None else found.odometry[: found.frames]
@@ -23,10 +26,11 @@ def write_found(found: FoundLoops, folder: Path | str) -> list[Path]:
     write_loops_jsonl(folder / LINES, found.loops, found.recording.ids)
     write_loops_csv(folder / TABLE, found.loops)
     names = [GRAPH, LINES, TABLE]
-    if odometry is not None:
-        times = found.recording.times
-        clock = np.arange(found.frames, dtype=np.float64) if times is None else times[: found.frames]
-        write_tum(folder / TRAJECTORY_TUM, odometry, clock)
-        write_kitti(folder / TRAJECTORY_KITTI, odometry)
-        names += [TRAJECTORY_TUM, TRAJECTORY_KITTI]
+    times = found.recording.times
+    clock = np.arange(found.frames, dtype=np.float64) if times is None else times[: found.frames]
+    for stem, poses in (("trajectory", odometry), ("trajectory-optimized", optimized)):
+        if poses is not None:
+            write_tum(folder / f"{stem}.tum", poses, clock)
+            write_kitti(folder / f"{stem}.kitti", poses)
+            names += [f"{stem}.tum", f"{stem}.kitti"]
     return [folder / name for name in names]

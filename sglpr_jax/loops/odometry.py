@@ -41,8 +41,8 @@ def _format_of(path: Path) -> OdometryFormat:
         return "tum"
     found = "an empty file" if not columns else f"{columns} numbers a line"
     raise ValueError(
-        f"{path}: expected odometry as tum (8 numbers a line) or g2o, or 12 numbers a line with --pose-format kitti "
-        f"(camera axes) or lidar (z up), found {found}"
+        f"{path}: expected odometry as tum (8 numbers a line) or g2o, or 12 numbers a line and their axes named, "
+        f"kitti (camera axes) or lidar (z up), by --odometry-format (of bin/map: --pose-format), found {found}"
     )
 
 

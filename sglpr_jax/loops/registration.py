@@ -135,6 +135,11 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
     return points
 
 
+def check_installed() -> None:
+    """Raise ImportError where the extra `slam` is not installed, before hours of work that end in a registration."""
+    _library("small_gicp")
+
+
 def _library(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)

@@ -33,6 +33,16 @@ def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n
     return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
+def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "4 4"]) -> np.ndarray:
+    """The covariance of a small motion of a body (metres, then radians) in its frame a, from that in its frame b."""
+    x, y, z = a_from_b[:3, 3]
+    turned = a_from_b[:3, :3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = turned
+    adjoint[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turned
+    return adjoint @ covariance @ adjoint.T
+
+
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
     """The rotations as x, y, z, w, with w not negative."""
     return Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)

@@ -48,7 +48,8 @@ def embed_or_reuse(
 
 def fingerprint(recording: Recording) -> str:
     """Name what a recording holds without reading its scans: their ids, the sizes of their files, the positions."""
-    digest = hashlib.sha256(json.dumps([recording.ids, [path.stat().st_size for path in recording.paths]]).encode())
+    sizes = [path.stat().st_size for path in recording.paths if path.is_file()]
+    digest = hashlib.sha256(json.dumps([recording.ids, sizes]).encode())
     if recording.positions is not None:
         digest.update(recording.positions.tobytes())
     return digest.hexdigest()[:16]

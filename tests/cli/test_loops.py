@@ -1,4 +1,6 @@
 import json
+import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from .conftest import SCANS, assert_one_line_error
 
 FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "index.html"}
 TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
+OPTIMIZED = {"trajectory-optimized.tum", "trajectory-optimized.kitti"}
 
 
 @pytest.fixture
@@ -27,10 +30,13 @@ def odometry(town, tmp_path) -> np.ndarray:
 def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_path):
     write_kitti(tmp_path / "odometry.txt", odometry)
     out = tmp_path / "found"
-    options = ("--poses", tmp_path / "odometry.txt", "--pose-format", "kitti", "--out", out)
+    options = ("--odometry", tmp_path / "odometry.txt", "--odometry-format", "kitti", "--out", out, "--optimize")
     ended = command("loops", town, "--seq", "08", *options)
     assert ended.status == 0, ended.error
-    assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES
+    assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES | {
+        "trajectory-optimized.tum",
+        "trajectory-optimized.kitti",
+    }
     expected = find_loops(open_recording(town, "08"), load("rings"), odometry=odometry)
     found = read_loops_jsonl(out / "loops.jsonl")
     assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
@@ -38,7 +44,10 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
     graph = read_g2o(out / "loops.g2o")
     assert len(graph.poses) == SCANS and len(graph.edges) == SCANS - 1 + len(found)
     np.testing.assert_allclose(read_tum(out / "trajectory.tum")[0], odometry, atol=1e-5)
+    assert "trajectory corrected by " in ended.out and f" of {len(found)} loops" in ended.out
+    assert read_tum(out / "trajectory-optimized.tum")[0].shape == (SCANS, 4, 4)
     page = (out / "index.html").read_text()
+    assert "<h2>Corrected</h2>" in page and "<h2>Sure of it?</h2>" in page
     assert "<h2>Where</h2>" in page and page.count("data:image/png;base64,") >= 2
 
 
@@ -62,17 +71,43 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == 130
     assert ended.out.startswith("0 loops in 5 of 40 frames of 08")
-    assert {path.name for path in (tmp_path / "found").iterdir()} == FILES
+    assert {path.name for path in (tmp_path / "found").iterdir()} == FILES | {"unfinished"}
+    assert "the same command goes on from here" in ended.error
+
+
+@pytest.mark.slow
+def test_bad_scans_are_told_and_skipped(command, town, tmp_path):
+    folder = tmp_path / "town"
+    shutil.copytree(town / "sequences" / "08", folder / "sequences" / "08")
+    for scan in ("000003", "000021"):
+        (folder / "sequences/08/velodyne" / f"{scan}.bin").write_bytes(b"half")
+    assert_one_line_error(command("loops", folder, "--out", tmp_path / "found"), "000003.bin")
+    ended = command("loops", folder, "--out", tmp_path / "found", "--skip-bad")
+    assert ended.status == 0, ended.error
+    assert ended.out.splitlines()[0].endswith("2 scans skipped")
+    assert [line[:14] for line in ended.error.splitlines() if "skipped" in line] == ["skipped 000003", "skipped 000021"]
+
+
+@pytest.mark.parametrize(("flag", "module"), [("--optimize", "gtsam"), ("--register", "small_gicp")])
+def test_a_missing_extra_is_said_before_the_search(command, town, odometry, tmp_path, monkeypatch, flag, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    write_tum(tmp_path / "odometry.tum", odometry, np.arange(float(SCANS)))
+    options = ("--odometry", tmp_path / "odometry.tum", "--out", tmp_path / "found", flag)
+    assert_one_line_error(command("loops", town, "--seq", "08", *options), "pip install 'sglpr-jax[")
+    assert not (tmp_path / "found").exists()
 
 
 def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     short, flat = tmp_path / "short.tum", tmp_path / "flat.txt"
     write_tum(short, odometry[:7], np.arange(7.0))
     np.savetxt(flat, np.zeros((SCANS, 12)))
-    run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--poses")
+    assert_one_line_error(
+        command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--optimize"), "--odometry", "found none"
+    )
+    run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry")
     assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
-    assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line with --pose-format kitti")
-    assert_one_line_error(command(*run, flat, "--pose-format", "lidar"), "flat.txt: expected a rotation")
+    assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line and their axes named, kitti")
+    assert_one_line_error(command(*run, flat, "--odometry-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
     assert_one_line_error(command("loops", tmp_path, "--out", tmp_path / "found"), tmp_path)
     assert not (tmp_path / "found").exists()

@@ -3,9 +3,12 @@ import json
 import numpy as np
 import pytest
 
+import sglpr_jax
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops.graph_files import write_tum
 from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.retrieval.index import Index
 
 from .conftest import SCANS, assert_one_line_error
 
@@ -35,9 +38,32 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, town, poses, tmp_path):
     position = open_recording(town, "08").positions[20]
     np.testing.assert_allclose(np.array(answers[0]["world_from_query"])[:3, 3], position, atol=0.05)
 
+    higher = ("--sensor-height", "1.83", "--out", tmp_path / "higher.json")
+    assert command("relocalize", scan, "--map", out, *higher).status == 0
+    best = json.loads((tmp_path / "higher.json").read_text())[0]
+    assert best["place"] == "08/000020" and best["world_from_query"][2][3] == pytest.approx(position[2] + 0.1, abs=1e-6)
+
     again = ("map", town, "--seq", "08", "--poses", poses, "--add-to", out, "--out", out)
     assert command(*again).status == 0
     assert len(PlaceMap.load(out)) > 40
+
+
+def test_a_scan_without_ground_tells_no_height(command, places_file, tmp_path):
+    scan = tmp_path / "sky.bin"
+    np.random.default_rng(0).normal(scale=9, size=(200, 4)).astype(np.float32).tofile(scan)
+    ended = command("relocalize", scan, "--map", places_file, "--sensor-height", "estimate")
+    assert_one_line_error(ended, "sky.bin", "expected ground that tells the sensor's height")
+
+
+@pytest.fixture
+def places_file(tmp_path):
+    """A map of one place, made without describing a scan."""
+    params = sglpr_jax.load("rings")
+    index = Index.empty(256, weights_hash=weights_hash(params))
+    index.add(np.ones(256), positions=np.zeros(3))
+    mountings = np.array([[1.73, 0, 0, 1.0]])
+    PlaceMap(index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], mountings).save(tmp_path / "one.safetensors")
+    return tmp_path / "one.safetensors"
 
 
 def test_wrong_input_is_one_clear_error(command, town, poses, tmp_path):

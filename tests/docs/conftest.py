@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import sglpr_jax
+from sglpr_jax.loops.graph_files import write_tum
 from sglpr_jax.methods.registry import method_named
 from sglpr_jax.sim import Sensor, write_dataset
 
@@ -14,7 +15,8 @@ SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24
 
 @pytest.fixture(scope="session")
 def examples(tmp_path_factory) -> Path:
-    """KITTI/ (three recordings of 200 thin scans, about 2 m apart), my_scans/ (five of them), 08.npz and mine.npz."""
+    """KITTI/ (three recordings of 200 thin scans, about 2 m apart), my_scans/ (five of them), 08.npz and mine.npz, and
+    odometry.tum of 08."""
     folder = tmp_path_factory.mktemp("examples")
     write_dataset(folder / "KITTI", scans=200, sensor=SENSOR)
     (folder / "my_scans").mkdir()
@@ -23,6 +25,9 @@ def examples(tmp_path_factory) -> Path:
     for name, root, seq in (("08", folder / "KITTI", "08"), ("mine", folder / "my_scans", None)):
         recording = sglpr_jax.open_recording(root, seq)
         sglpr_jax.embed(method_named("polar-fft", None, recording), recording).save(folder / f"{name}.npz")
+    recording = sglpr_jax.open_recording(folder / "KITTI", "08")
+    poses = sglpr_jax.read_odometry(folder / "KITTI/sequences/08/poses.txt", format="kitti")
+    write_tum(folder / "odometry.tum", poses, recording.times)
     return folder
 
 

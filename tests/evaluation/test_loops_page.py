@@ -8,8 +8,11 @@ from recordings import of_images
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page.of_loops import loops_page, write_loops_page
+from sglpr_jax.loops.candidates import Candidate
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.optimization import OptimizedTrajectory
+from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import transform
 
 from .test_page import Parsed
@@ -37,6 +40,41 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     none = dataclasses.replace(found, loops=())
     assert loops_page(none).count("No loops.") == 2
     assert "No scan was looked at." in loops_page(dataclasses.replace(none, frames=0))
+
+
+@pytest.fixture
+def known(found) -> FoundLoops:
+    """The same with true positions, off the odometry, and with candidates: two loops, and one that is none."""
+    model = LoopModel({"correlation": 1.0}, {"correlation": 0.0}, {"correlation": 1.0}, 0.0, "by hand")
+    positions = np.zeros((8, 3))
+    positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
+    recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")
+    pairs = [(5, 1, 6.0), (6, 2, 7.0), (7, 3, -6.0)]
+    candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, c, 0.0)) for q, m, c in pairs)
+    return dataclasses.replace(found, recording=recording, candidates=candidates, model=model)
+
+
+def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known, monkeypatch):
+    page = Parsed(loops_page(known))
+    assert [headline for headline, _ in page.images] == ["Where", "Where", "Pairs", "Sure of it?"]
+    said = page.texts["Sure of it?"]
+    assert "0.99 to 1" in said and "1.000" in said and "0 to 0.01" in said and "by poses.txt" in said
+    assert "not known" in Parsed(loops_page(found)).texts["Sure of it?"]
+    assert "No pair was looked at." in loops_page(dataclasses.replace(known, candidates=()))
+    monkeypatch.setattr(figures, "can_draw", lambda: False)
+    assert "0.99 to 1" in Parsed(loops_page(known)).texts["Sure of it?"]
+
+
+def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):
+    optimized = OptimizedTrajectory(known.odometry + 0.0, np.array([True, True, False]))
+    optimized.poses[:, :3, 3] = known.recording.positions
+    page = Parsed(loops_page(known, optimized=optimized))
+    assert [headline for headline, _ in page.images].count("Corrected") == 1
+    said = page.texts["Corrected"]
+    assert "2 of 3 loops; the others do not fit" in said and "optimized 0.00 m" in said
+    assert "RMSE" not in Parsed(loops_page(found, optimized=optimized)).texts["Corrected"]
+    monkeypatch.setattr(figures, "can_draw", lambda: False)
+    assert "optimized 0.00 m" in Parsed(loops_page(known, optimized=optimized)).texts["Corrected"]
 
 
 def test_without_matplotlib_there_is_a_table(found, monkeypatch):

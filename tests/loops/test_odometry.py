@@ -28,7 +28,7 @@ def test_every_format_gives_the_same_poses(tmp_path, poses):
     [
         ("", "auto", "found an empty file"),
         ("1 2 3\n", "auto", "found 3 numbers a line"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "auto", "12 numbers a line with --pose-format kitti"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "auto", "12 numbers a line and their axes named, kitti"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n", "lidar", "expected a rotation and a translation in row 1"),
         ("", "kitti", "expected at least one pose, found none"),
         ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1\n", "g2o", "expected vertices 0, 1, 2"),

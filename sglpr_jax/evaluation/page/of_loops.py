@@ -11,23 +11,29 @@ from sglpr_jax.files import write_text
 from sglpr_jax.loops.candidates import square_image
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.optimization import OptimizedTrajectory, trajectory_error
 from sglpr_jax.loops.overlay import overlaid
+from sglpr_jax.loops.reliability import reliability_of
+from sglpr_jax.loops.upright import upright_odometry, upright_poses
 
 PAGE = "index.html"
 SHOWN_PAIRS = 9
 SHOWN_ROWS = 40
 
 
-def write_loops_page(found: FoundLoops, folder: Path) -> Path:
+def write_loops_page(found: FoundLoops, folder: Path, *, optimized: OptimizedTrajectory | None = None) -> Path:
     """Write the page into `folder`, whole or not at all; without matplotlib (extra `viz`) it has no pictures."""
-    write_text(folder / PAGE, loops_page(found))
+    write_text(folder / PAGE, loops_page(found, optimized=optimized))
     return folder / PAGE
 
 
-def loops_page(found: FoundLoops) -> str:
-    """The page as HTML that stands alone."""
+def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> str:
+    """The page as HTML that stands alone; with an `optimized` trajectory it shows that beside the odometry."""
     about = "with odometry" if found.odometry is not None else "without odometry"
-    sections = [Section("Where", _where(found)), Section("Pairs", _pairs(found)), Section("Loops", _table(found))]
+    sections = [Section("Where", _where(found))]
+    if optimized is not None:
+        sections.append(Section("Corrected", _corrected(found, optimized)))
+    sections += [Section("Pairs", _pairs(found)), Section("Loops", _table(found)), Section("Sure of it?", _sure(found))]
     return document(f"Loops of {found.recording.name}", f"{found}; {about}.", sections)
 
 
@@ -36,7 +42,9 @@ def _where(found: FoundLoops) -> str:
         return missing("The drawing needs matplotlib: pip install 'sglpr-jax[viz]'.")
     if not found.frames:
         return missing("No scan was looked at.")
-    positions = found.recording.positions if found.odometry is None else found.odometry[:, :3, 3]
+    positions = found.recording.positions
+    if found.odometry is not None:
+        positions = upright_odometry(found.odometry, found.recording.mounting)[:, :3, 3]
     parts = []
     if positions is not None:
         what = "as the odometry has it" if found.odometry is not None else f"by {found.recording.pose_source}"
@@ -48,6 +56,44 @@ def _where(found: FoundLoops) -> str:
     order = figures.loops_in_time([(one.query, one.match, one.probability) for one in found.loops], found.frames)
     parts.append(figure_html(order, "The loops in time", caption="Which frame comes back to which."))
     return "\n".join(parts)
+
+
+def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
+    """Before and after the graph was solved and, where true positions are known, how far each is off."""
+    assert found.odometry is not None
+    both = {"odometry": found.odometry[: found.frames], "optimized": optimized.poses}
+    believed = int(optimized.believed.sum())
+    others = "" if believed == len(found.loops) else "; the others do not fit these"
+    about = f"Corrected by {believed} of {len(found.loops)} loops{others}."
+    true = found.recording.positions
+    if true is not None and found.frames > 2:
+        errors = (f"{name} {trajectory_error(poses, true[: found.frames]):.2f} m" for name, poses in both.items())
+        about += f" Off by (RMSE after alignment, by {found.recording.pose_source}): {', '.join(errors)}."
+    if not figures.can_draw():
+        return missing(about)
+    level = {name: upright_odometry(poses, found.recording.mounting)[:, :3, 3] for name, poses in both.items()}
+    return figure_html(figures.trajectories(level), "The trajectory before and after", caption=about)
+
+
+def _sure(found: FoundLoops) -> str:
+    """How many of the pairs of each probability are loops, where true positions are known."""
+    if found.recording.positions is None or found.model is None:
+        return missing("How many of the pairs are loops is not known: the recording has no poses.")
+    bins = reliability_of(found.candidates, found.model, found.recording.positions)
+    if not bins:
+        return missing("No pair was looked at.")
+    header = ("probability", "pairs", "loops", "share", "said")
+    cells = ((f"{b.low:g} to {b.high:g}", b.pairs, b.loops, f"{b.share:.3f}", f"{b.said:.3f}") for b in bins)
+    rows = [tuple(map(str, row)) for row in cells]
+    caption = (
+        f"All candidates, before neighbours and odometry speak: how many are loops (up to 10 m apart by "
+        f"{found.recording.pose_source}; 10 to 20 m count as neither). The numbers are counts of pairs."
+    )
+    table = html_table(header, rows, numbers=header[1:])
+    if not figures.can_draw():
+        return table
+    drawn = figures.reliability([(one.said, one.share, one.pairs) for one in bins])
+    return figure_html(drawn, "Share of loops over probability", caption=caption) + table
 
 
 def _pairs(found: FoundLoops) -> str:
@@ -63,7 +109,7 @@ def _pairs(found: FoundLoops) -> str:
 
 def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
     query, match = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
-    return overlaid(query, match, loop.match_from_query)
+    return overlaid(query, match, upright_poses(loop.match_from_query, found.recording.mounting))
 
 
 def _title(loop: Loop) -> str:

@@ -1,0 +1,160 @@
+"""What a search for loops has seen so far, in a folder: a run that was killed goes on there and ends as if it had not.
+
+All that takes time is kept: descriptors, images, and how those of the candidates lie to each other. A file holds some
+frames, is called by the first of them, and is written whole or not at all; the frames after the last file are looked at
+again. What was seen with other settings is thrown away.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.warning import warn
+from sglpr_jax.files import read_json, remove_half_written, replacing, write_json
+from sglpr_jax.loops.candidates import Candidate, Seen
+from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.verification import Alignment
+from sglpr_jax.retrieval.index import Index
+from sglpr_jax.retrieval.reuse import fingerprint
+
+FORMAT = "sglpr-jax unfinished loops 1"
+SETTINGS = "settings.json"
+ENDING = ".safetensors"
+ALIGNMENT_NUMBERS = 14
+"""x, y, yaw, nine of the covariance, correlation, second."""
+FRAMES = 50
+"""In a file."""
+
+
+def settings(
+    recording: Recording, detector: LoopDetector, odometry: Float[np.ndarray, "n 4 4"] | None
+) -> dict[str, Any]:
+    """All that decides what is seen of a recording's scans, as JSON has it."""
+    finder = detector.finder
+    found = {
+        "format": FORMAT,
+        "recording": fingerprint(recording),
+        "sensor": None if recording.mounting is None else dataclasses.asdict(recording.mounting),
+        "times": _digest(recording.times),
+        "odometry": _digest(odometry),
+        "weights": finder.index.weights_hash,
+        "candidates": dataclasses.asdict(finder.config),
+        "verification": dataclasses.asdict(finder.verification),
+    }
+    return json.loads(json.dumps(found))
+
+
+def _digest(values: np.ndarray | None) -> str | None:
+    return None if values is None else hashlib.sha256(values.tobytes()).hexdigest()[:16]
+
+
+@dataclasses.dataclass
+class Unfinished:
+    """The folder of a search that goes on."""
+
+    folder: Path
+    kept: int = 0
+    """So many frames are in it."""
+
+    @classmethod
+    def opened(cls, folder: Path, wanted: dict[str, Any]) -> "Unfinished":
+        """The folder, emptied where other settings filled it, which is told. Raises WriteError."""
+        path = folder / SETTINGS
+        if folder.exists():
+            try:
+                other = [name for name, value in wanted.items() if read_json(path).get(name) != value]
+            except (ValueError, OSError, AttributeError):
+                other = ["format"]
+            if other:
+                warn(f"{folder}: expected what a run with the same settings has kept, found another {', '.join(other)}")
+                remove(folder)
+        write_json(path, wanted)
+        return cls(folder)
+
+    def recall(
+        self,
+        detector: LoopDetector,
+        mounting: Mounting | None,
+        given: Callable[[int], dict[str, Any]],
+        *,
+        missing: bool,
+    ) -> None:
+        """Add what is kept to an empty detector; `given` has time and odometry of a frame.
+
+        Ends at the first file that is not there or damaged and, unless scans may be `missing`, at the first frame whose
+        scan could not be read.
+        """
+        while self._path.is_file():
+            try:
+                frames, more = Index.load_with(self._path, weights_hash=detector.finder.index.weights_hash)
+            except ValueError:
+                return
+            shown, images = set(more["shown"].tolist()), iter(more["images"])
+            candidates = _candidates(more)
+            for row, descriptor in enumerate(frames.descriptors, start=self.kept):
+                seen = Seen(np.array(descriptor), next(images), mounting) if row in shown else None
+                if seen is None and not missing:
+                    return
+                found = [one for one in candidates if one.query == row]
+                detector.add_seen(seen, **given(row), candidates=found)
+            self.kept = len(detector)
+
+    def keep(self, detector: LoopDetector, *, all: bool = False) -> None:
+        """Write the frames that are not kept, as soon as they fill a file, or `all` of them. Raises WriteError."""
+        finder, first, end = detector.finder, self.kept, len(detector)
+        if end - first < (1 if all else FRAMES):
+            return
+        frames = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
+        frames.add(finder.index.descriptors[first:end])
+        shown = sorted(set(range(first, end)) - set(finder.missing))
+        images = [finder.images[row] for row in shown]
+        more = {"shown": np.array(shown, np.int64), "images": np.stack(images) if images else np.zeros(0, np.uint8)}
+        content = frames.to_bytes(more | _columns([one for one in detector.candidates if one.query >= first]))
+        with replacing(self._path) as temporary:
+            temporary.write_bytes(content)
+        self.kept = end
+
+    @property
+    def _path(self) -> Path:
+        """The file of the frames that come next."""
+        return self.folder / f"{self.kept:06d}{ENDING}"
+
+
+def remove(folder: Path) -> None:
+    """Remove what is kept in a folder, and the folder where nothing else is in it."""
+    (folder / SETTINGS).unlink(missing_ok=True)  # first, so that what a kill here leaves is of no settings
+    for path in folder.glob(f"[0-9]*{ENDING}"):
+        path.unlink()
+    remove_half_written(folder)
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def _columns(candidates: list[Candidate]) -> dict[str, np.ndarray]:
+    alignments = [np.concatenate([np.reshape(value, -1) for value in one.alignment]) for one in candidates]
+    return {
+        "pairs": np.array([(one.query, one.match) for one in candidates], np.int64).reshape(-1, 2),
+        "alignments": np.array(alignments, np.float64).reshape(-1, ALIGNMENT_NUMBERS),
+        "evidence": np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(Evidence._fields)),
+    }
+
+
+def _candidates(columns: dict[str, np.ndarray]) -> list[Candidate]:
+    found = []
+    for (query, match), values, evidence in zip(
+        columns["pairs"].tolist(), columns["alignments"], columns["evidence"], strict=True
+    ):
+        fields: list[Any] = [*values[:3], values[3:12].reshape(3, 3), *values[12:]]
+        alignment = Alignment(*fields)
+        found.append(Candidate(query, match, alignment, Evidence(*map(np.asarray, evidence))))
+    return found

@@ -1,0 +1,61 @@
+"""bin/loops that is killed again and again ends with the same files, to the byte, as one that was not."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sglpr_jax.sim import Sensor, write_dataset
+
+pytestmark = pytest.mark.slow
+SCANS = 130
+SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 16)), azimuth_steps=120)
+TIMEOUT_S = 300
+
+
+@pytest.fixture(scope="module")
+def arguments(tmp_path_factory) -> tuple[object, ...]:
+    """Those of a run over a simulated drive."""
+    folder = tmp_path_factory.mktemp("drive")
+    write_dataset(folder / "town", names=("08",), scans=SCANS, sensor=SENSOR)
+    return (folder / "town", "--min-probability", "0.5")
+
+
+def start(arguments: tuple[object, ...], out: Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", "sglpr_jax.cli.loops", *arguments, "--out", out]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    with (out.parent / "errors.txt").open("w") as errors:
+        return subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=errors, env=environment)
+
+
+def finish(arguments: tuple[object, ...], out: Path) -> dict[str, bytes]:
+    assert start(arguments, out).wait(TIMEOUT_S) == 0, (out.parent / "errors.txt").read_text()
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+def wait_for(process: subprocess.Popen, path: Path) -> None:
+    end = time.monotonic() + TIMEOUT_S
+    while not path.exists() and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.002)
+    assert process.poll() is None
+
+
+def test_a_run_killed_again_and_again_ends_like_one_that_was_not(arguments, tmp_path):
+    whole, out = finish(arguments, tmp_path / "whole"), tmp_path / "killed"
+    rng = np.random.default_rng(0)
+    written = set()
+    for name in ("000000.safetensors", "000050.safetensors"):
+        process = start(arguments, out)
+        wait_for(process, out / "unfinished" / name)
+        time.sleep(rng.uniform(0, 0.3))
+        process.kill()
+        process.wait()
+        written.add((out / "unfinished" / "000000.safetensors").stat().st_mtime_ns)
+    assert len(written) == 1  # what was seen is not seen again
+    found = finish(arguments, out)
+    assert found == whole
+    assert len(whole["loops.jsonl"].splitlines()) > 3

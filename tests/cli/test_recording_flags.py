@@ -1,0 +1,41 @@
+"""One set of flags opens a recording, whatever the command."""
+
+from pathlib import Path
+
+import pytest
+import tyro
+
+from sglpr_jax.cli.embed import EmbedCommand
+from sglpr_jax.cli.loops import LoopsCommand
+from sglpr_jax.cli.map import MapCommand
+from sglpr_jax.cli.recording import PosedRecordingOptions, RecordingOptions
+from sglpr_jax.cli.stress import StressCommand
+
+POSED = {
+    EmbedCommand: ("--data", "scans", "--out", "a.npz"),
+    StressCommand: ("--data", "scans", "--out", "a"),
+    LoopsCommand: ("scans", "--out", "a"),
+}
+MAP = ("scans", "--out", "a.safetensors", "--poses", "poses.tum")
+
+
+@pytest.mark.parametrize("command", POSED, ids=lambda command: command.__name__)
+def test_commands_share_the_flags_of_a_recording_and_its_poses(command):
+    assert tyro.cli(command, args=POSED[command]).source == PosedRecordingOptions()
+    flags = ("--seq", "07", "--pose-source", "kitti", "--format", "nclt", "--sensor-height", "2.5")
+    flags += ("--poses", "p.csv", "--pose-format", "csv", "--times", "t.txt")
+    found = tyro.cli(command, args=(*POSED[command], *flags)).source
+    assert found == PosedRecordingOptions("07", "kitti", "nclt", 2.5, Path("p.csv"), "csv", Path("t.txt"))
+
+
+def test_a_maps_poses_are_its_own():
+    found = tyro.cli(MapCommand, args=(*MAP, "--seq", "08", "--sensor-height", "estimate"))
+    assert found.source == RecordingOptions("08", sensor_height="estimate") and found.poses == Path("poses.tum")
+
+
+def test_the_recording_is_opened_as_they_say_and_described(town, capsys):
+    recording = RecordingOptions("08", sensor_height=2.0).open(town)
+    assert recording.name == "08" and recording.mounting.height_m == 2
+    assert "sensor: 2.00 m above the ground, as said" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"p\.csv: expected poses named for a plain folder"):
+        PosedRecordingOptions("08", poses=Path("p.csv")).open(town)

@@ -1,0 +1,122 @@
+"""A drifted drive of known truth is corrected by its loops; wrong loops do not bend it; gtsam reads our g2o."""
+
+import sys
+
+import numpy as np
+import pytest
+from recordings import of_images
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.loops.find import FoundLoops
+from sglpr_jax.loops.graph_files import read_g2o, write_g2o
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.optimization import optimize_trajectory, optimized, trajectory_error
+from sglpr_jax.loops.transforms import from_quaternions, inverse, transform
+
+FRAMES = 120
+COVARIANCE = np.diag([0.1, 0.1, 0.5, *np.radians([2, 2, 0.3])]) ** 2
+
+
+@pytest.fixture(scope="module")
+def twice_around() -> np.ndarray:
+    """True poses on an ellipse that is driven around twice, up and down a hill."""
+    angle = np.linspace(0, 4 * np.pi, FRAMES)
+    yaw = np.arctan2(60 * np.cos(angle), -90 * np.sin(angle))
+    poses = np.stack([transform(90 * np.cos(a), 60 * np.sin(a), y) for a, y in zip(angle, yaw, strict=True)])
+    poses[:, 2, 3] = 3 * np.sin(angle)
+    return poses
+
+
+@pytest.fixture(scope="module")
+def odometry(twice_around) -> np.ndarray:
+    """1 % too long, turned by half a degree a frame, with noise."""
+    rng = np.random.default_rng(0)
+    steps = inverse(twice_around[:-1]) @ twice_around[1:]
+    found = [twice_around[0]]
+    for step in steps:
+        noise = np.eye(4)
+        noise[:3, :3] = Rotation.from_rotvec(np.radians([0, 0, 0.05]) + rng.normal(scale=1e-3, size=3)).as_matrix()
+        noise[:3, 3] = 0.01 * step[:3, 3]
+        found.append(found[-1] @ step @ noise)
+    return np.stack(found)
+
+
+@pytest.fixture(scope="module")
+def loops(twice_around) -> tuple[Loop, ...]:
+    """The second time around sees the first, to a decimetre."""
+    rng = np.random.default_rng(1)
+    found = []
+    for query in range(64, FRAMES, 4):
+        match = int(np.linalg.norm(twice_around[:50, :3, 3] - twice_around[query, :3, 3], axis=1).argmin())
+        pose = inverse(twice_around[match]) @ twice_around[query] @ transform(*rng.normal(scale=0.05, size=2), 0.002)
+        found.append(Loop(query, match, pose, COVARIANCE, 0.99))
+    return tuple(found)
+
+
+def test_the_error_of_a_drifted_drive_falls(twice_around, odometry, loops):
+    true = twice_around[:, :3, 3]
+    before = trajectory_error(odometry, true)
+    found = optimized(odometry, loops)
+    assert found.believed.all() and len(found.believed) == len(loops)
+    assert before > 2 and trajectory_error(found.poses, true) < 0.4 * before
+    np.testing.assert_allclose(found.poses[0], odometry[0], atol=1e-6)
+    for loop in loops:
+        error = inverse(inverse(found.poses[loop.match]) @ found.poses[loop.query]) @ loop.match_from_query
+        assert np.linalg.norm(error[:3, 3]) < 1
+
+
+def test_wrong_loops_do_not_bend_it(twice_around, odometry, loops):
+    true = twice_around[:, :3, 3]
+    wrong = tuple(Loop(100 + k, 20 + k, transform(1.0, 0.0, 0.1), COVARIANCE, 1.0) for k in range(3))
+    found = optimized(odometry, (*wrong, *loops))
+    assert not found.believed[:3].any() and found.believed[3:].all()
+    assert trajectory_error(found.poses, true) == pytest.approx(
+        trajectory_error(optimized(odometry, loops).poses, true), abs=0.05
+    )
+
+
+def test_of_a_recording_the_frames_that_were_looked_at(odometry, loops, tmp_path, monkeypatch):
+    images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(FRAMES)}
+    early = tuple(loop for loop in loops if loop.query < 90)
+    found = FoundLoops(of_images(images), 90, early, (), odometry)
+    corrected = optimize_trajectory(found)
+    assert corrected.poses.shape == (90, 4, 4)
+    np.testing.assert_array_equal(corrected.poses, optimized(odometry[:90], early).poses)
+    with pytest.raises(ValueError, match="08: expected loops found with odometry to correct, found none"):
+        optimize_trajectory(FoundLoops(of_images(images), 90, early, (), None))
+    none = optimize_trajectory(FoundLoops(of_images(images), 90, (), (), odometry))
+    np.testing.assert_array_equal(none.poses, odometry[:90])
+    assert none.believed.shape == (0,)
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(ImportError, match=r"gtsam: pip install 'sglpr-jax\[gtsam\]'"):
+        optimize_trajectory(found)
+
+
+def test_gtsam_reads_the_graph_that_we_write(odometry, loops, tmp_path):
+    import gtsam
+
+    path = tmp_path / "loops.g2o"
+    write_g2o(path, loops, odometry)
+    graph, start = gtsam.readG2o(str(path), True)
+    assert start.size() == FRAMES and graph.size() == FRAMES - 1 + len(loops)
+    read = np.stack([start.atPose3(frame).matrix() for frame in range(FRAMES)])
+    np.testing.assert_allclose(read, odometry, atol=1e-5)
+    ours = read_g2o(path)
+    for k, (first, second, pose, information) in enumerate(ours.edges):
+        factor = graph.at(k)
+        assert (first, second) == tuple(factor.keys())
+        np.testing.assert_allclose(factor.measured().matrix(), pose, atol=1e-6)
+        theirs = factor.noiseModel().information()  # rotation first
+        order = np.array([3, 4, 5, 0, 1, 2])
+        np.testing.assert_allclose(theirs, information[np.ix_(order, order)], rtol=1e-6, atol=1e-6)
+
+
+def test_the_error_does_not_mind_where_a_trajectory_lies():
+    rng = np.random.default_rng(0)
+    true = rng.normal(scale=20, size=(50, 3))
+    rotations = Rotation.random(50, rng=rng).as_quat()
+    world = transform(5.0, -3.0, 2.0) @ from_quaternions(np.zeros((1, 3)), Rotation.random(rng=rng).as_quat()[None])[0]
+    poses = world @ from_quaternions(true, rotations)
+    assert trajectory_error(poses, true) == pytest.approx(0, abs=1e-9)
+    noise = rng.normal(size=(50, 3))
+    assert trajectory_error(from_quaternions(true + noise, rotations), true) == pytest.approx(np.sqrt(3), rel=0.15)

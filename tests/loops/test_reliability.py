@@ -1,0 +1,43 @@
+"""Bins of probability against counts by hand; every pair is in one bin."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.loops.reliability import EDGES, reliability, reliability_of
+
+
+def test_bins_are_counted():
+    probability = np.array([0.0, 0.005, 0.2, 0.99, 1.0, 0.985])
+    is_loop = np.array([False, False, True, True, True, False])
+    found = reliability(probability, is_loop)
+    assert [(b.low, b.high, b.pairs, b.loops) for b in found] == [
+        (0.0, 0.01, 2, 0),
+        (0.1, 0.3, 1, 1),
+        (0.9, 0.99, 1, 0),
+        (0.99, 1.0, 2, 2),
+    ]
+    assert found[-1].said == pytest.approx(0.995) and found[-1].share == 1 and found[1].said == pytest.approx(0.2)
+
+
+@given(st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=60))
+def test_every_pair_is_in_one_bin(pairs):
+    probability, is_loop = np.array([p for p, _ in pairs]), np.array([loop for _, loop in pairs], bool)
+    found = reliability(probability, is_loop)
+    assert sum(b.pairs for b in found) == len(pairs) and sum(b.loops for b in found) == is_loop.sum()
+    assert all(b.low <= b.said <= b.high and b.pairs for b in found)
+    assert {edge for b in found for edge in (b.low, b.high)} <= set(EDGES)
+
+
+def test_candidates_with_true_positions_and_those_in_between_are_left_out():
+    model = LoopModel({"correlation": 1.0}, {"correlation": 0.0}, {"correlation": 1.0}, 0.0, "by hand")
+    positions = np.zeros((6, 3))
+    positions[3:, 0] = 3, 15, 40
+    candidates = [Candidate(q, 0, None, Evidence.of(0.0, 0.0, c, 0.0)) for q, c in ((3, 6.0), (4, 6.0), (5, -6.0))]
+    low, high = reliability_of(candidates, model, positions)
+    assert (low.pairs, low.loops, high.pairs, high.loops) == (1, 0, 1, 1)
+    assert high.said == pytest.approx(1 / (1 + np.exp(-6)))
+    assert reliability_of([], model, positions) == () == reliability_of(candidates[1:2], model, positions)

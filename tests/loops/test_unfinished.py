@@ -1,0 +1,159 @@
+"""A search that was stopped anywhere goes on and ends like one that was not; scans that cannot be read are left out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from recordings import with_points
+
+import sglpr_jax
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops import unfinished
+from sglpr_jax.loops.candidates import CandidateConfig
+from sglpr_jax.loops.detector import DetectorConfig
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.folder import write_found
+
+ROWS = (*range(0, 24, 2), *range(1, 24, 2))
+"""A drive that is driven twice."""
+CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=8, exclude_s=0.5))
+
+
+@pytest.fixture(scope="module")
+def params():
+    return sglpr_jax.load("rings")
+
+
+@pytest.fixture(scope="module")
+def twice(drive):
+    """The recording, and its odometry."""
+    parts = {name: tuple(getattr(drive, name)[i] for i in ROWS) for name in ("ids", "paths")}
+    recording = dataclasses.replace(
+        drive, **parts, label_paths=(), positions=drive.positions[list(ROWS)], times=np.arange(24.0) / 10
+    )
+    clouds = {path: drive.points(drive.paths.index(path)) for path in parts["paths"]}
+    return with_points(recording, clouds.__getitem__), drive.poses.world_from_lidar[list(ROWS)]
+
+
+@pytest.fixture(autouse=True)
+def _small_files(monkeypatch):
+    monkeypatch.setattr(unfinished, "FRAMES", 5)
+
+
+@pytest.fixture(scope="module")
+def whole(twice, params, tmp_path_factory):
+    """What a run finds that is not stopped, and its files."""
+    found = find_loops(twice[0], params, odometry=twice[1], config=CONFIG)
+    return found, contents(found, tmp_path_factory.mktemp("whole"))
+
+
+def contents(found, folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in write_found(found, folder)}
+
+
+def stopping_after(frames: int, asked: list):
+    def should_stop():
+        asked.append(None)
+        return len(asked) > frames
+
+    return should_stop
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice, params, whole, tmp_path):
+    recording, odometry = twice
+    expected, files = whole
+    assert len(expected.loops) >= 8
+    options = {"odometry": odometry, "config": CONFIG, "kept_in": tmp_path / "kept"}
+    reached = []
+    for frames in (3, 4, 9, 100):
+        done = []
+        found = find_loops(
+            recording, params, **options, should_stop=stopping_after(frames, []), on_progress=done.append
+        )
+        reached.append(found.frames)
+        assert done[0] == (reached[-2] if len(reached) > 1 else 1)
+    assert reached == [3, 7, 16, 24]
+    assert contents(found, tmp_path / "found") == files
+    (tmp_path / "kept" / ".000024.safetensors.1.tmp").write_bytes(b"half")
+    unfinished.remove(tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+@pytest.mark.slow
+def test_what_is_damaged_is_seen_again_and_what_others_made_is_thrown_away(twice, params, whole, tmp_path):
+    recording, odometry = twice
+    kept = tmp_path / "kept"
+    options = {"config": CONFIG, "kept_in": kept}
+    find_loops(recording, params, odometry=odometry, **options, should_stop=stopping_after(16, []))
+    files = sorted(path.name for path in kept.iterdir())
+    assert files == [f"{first:06d}.safetensors" for first in (0, 5, 10, 15)] + ["settings.json"]
+    content = (kept / "000010.safetensors").read_bytes()
+    (kept / "000010.safetensors").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    done = []
+    found = find_loops(recording, params, odometry=odometry, **options, on_progress=done.append)
+    assert done[0] == 10 and contents(found, tmp_path / "found") == whole[1]
+
+    (kept / "mine.txt").write_text("not to be removed")
+    for change in ({"odometry": odometry + 0.0, "words": ""}, {"odometry": None, "words": "odometry"}):
+        done, words = [], change.pop("words")
+        if words:
+            with pytest.warns(DataWarning, match=f"the same settings has kept, found another {words}"):
+                find_loops(recording, params, **change, **options, on_progress=done.append)
+        else:
+            find_loops(recording, params, **change, **options, on_progress=done.append)
+        assert done[0] == (1 if words else 24)
+    (kept / "settings.json").write_text("[]")
+    with pytest.warns(DataWarning, match="found another format"):
+        find_loops(recording, params, **options, should_stop=lambda: True)
+    assert sorted(path.name for path in kept.iterdir()) == ["mine.txt", "settings.json"]
+
+
+@pytest.mark.slow
+def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(twice, params, whole, tmp_path):
+    recording, odometry = twice
+    broken = {recording.paths[row] for row in (0, 6, 17)}
+
+    def points_of(path):
+        if path in broken:
+            raise ValueError("expected a whole scan, found half of one")
+        return recording.read(path, None, False).points
+
+    bad = with_points(recording, points_of)
+    options = {"odometry": odometry, "config": CONFIG, "kept_in": tmp_path / "kept"}
+    with pytest.raises(ValueError, match="found half of one"):
+        find_loops(bad, params, **options)
+    said = []
+    options["on_bad_scan"] = lambda scan, error: said.append((scan, str(error)))
+    first = find_loops(bad, params, **options, should_stop=stopping_after(9, []))
+    assert first.frames == 9
+    found = find_loops(bad, params, **options)
+    ids = tuple(recording.ids[row] for row in (0, 6, 17))
+    assert found.skipped == ids and [scan for scan, _ in said] == list(ids)
+    assert str(found).endswith("3 scans skipped")
+    frames = {frame for loop in found.loops for frame in (loop.query, loop.match)}
+    assert len(found.loops) >= 5 and not frames & {0, 6, 17}
+    for loop in found.loops:
+        assert np.linalg.norm(recording.positions[loop.query] - recording.positions[loop.match]) < 12
+    with pytest.raises(ValueError, match="found half of one"):  # without leave to skip, the scan is read again
+        find_loops(bad, params, odometry=odometry, config=CONFIG, kept_in=tmp_path / "kept")
+    broken |= set(recording.paths)
+    with pytest.raises(ValueError, match="expected at least one readable scan, found none"):
+        find_loops(bad, params, config=CONFIG, on_bad_scan=lambda scan, error: None)
+
+
+def test_settings_tell_all_that_changes_what_is_seen(twice, params):
+    recording, odometry = twice
+    detector = sglpr_jax.LoopDetector(params, config=CONFIG)
+    base = unfinished.settings(recording, detector, odometry)
+    tilted = dataclasses.replace(recording, mounting=Mounting(2.0))
+    others = (
+        unfinished.settings(tilted, detector, odometry),
+        unfinished.settings(recording, detector, odometry + 1e-9),
+        unfinished.settings(recording, detector, None),
+        unfinished.settings(recording, sglpr_jax.LoopDetector(params), odometry),
+        unfinished.settings(dataclasses.replace(recording, times=recording.times + 1), detector, odometry),
+    )
+    assert base == unfinished.settings(recording, detector, odometry.copy())
+    assert all(other != base for other in others)

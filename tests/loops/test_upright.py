@@ -1,0 +1,185 @@
+"""A sensor that is tilted or hangs upside down: poses handed out are those of its own frame, as its points are."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from recordings import reading_scans
+from scipy.spatial.transform import Rotation
+
+import sglpr_jax
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.record import Record
+from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder
+from sglpr_jax.loops.consistency import agree
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.loop import planar_loop
+from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, transformed
+from sglpr_jax.loops.upright import lidar_pose, upright_from_lidar, upright_odometry, upright_poses
+from sglpr_jax.loops.verification import Alignment
+
+TILTS = {"forward": (0.0, 25.0, 0.0), "sideways": (20.0, 10.0, 0.0), "upside down": (170.0, 5.0, 0.0)}
+
+
+@pytest.fixture(scope="module")
+def params():
+    return sglpr_jax.load("rings")
+
+
+def tilted_from_level(degrees) -> np.ndarray:
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    return found
+
+
+def mounting_of(tilted: np.ndarray, height_m: float = MODEL_HEIGHT_M) -> Mounting:
+    return Mounting(height_m, tuple(tilted[:3, 2].tolist()))
+
+
+def tilted_drive(drive, degrees):
+    """The drive as a sensor tilted so sees it, and the poses of that sensor in the world."""
+    tilted = tilted_from_level(degrees)
+
+    def points_of(path):
+        return transformed(tilted, drive.points(drive.paths.index(path))).astype(np.float32)
+
+    recording = dataclasses.replace(
+        drive, read=reading_scans(points_of), label_paths=(), mounting=mounting_of(tilted), on_disk=False
+    )
+    return recording, drive.poses.world_from_lidar @ inverse(tilted)
+
+
+def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    apart = inverse(expected) @ found
+    return float(np.linalg.norm(apart[:3, 3])), float(np.degrees(Rotation.from_matrix(apart[:3, :3]).magnitude()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", TILTS.values(), ids=TILTS)
+def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params, degrees):
+    recording, poses = tilted_drive(drive, degrees)
+    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=0))
+    query, match = revisit
+    finder.add(recording.record(match))
+    (found,) = finder.add(recording.record(query))
+    mountings = dict.fromkeys(("query_mounting", "match_mounting"), recording.mounting)
+    loop = planar_loop(1, 0, found.alignment, probability=1.0, **mountings)
+    expected = inverse(poses[match]) @ poses[query]
+    metres, turned = error_of(loop.match_from_query, expected)
+    assert metres < 1.0 and turned < 4  # the road's own tilt and height are not seen
+    registered = register(recording.points(query), recording.points(match), initial=loop.match_from_query)
+    metres, turned = error_of(registered.match_from_query, expected)
+    assert metres < 0.1 and turned < 0.3 and registered.overlap > 0.6
+
+
+@pytest.mark.slow
+def test_the_loops_of_a_tilted_recording_are_registered_and_agree_with_odometry_that_begins_with_the_identity(
+    drive, params
+):
+    every_second = range(0, len(drive), 2)
+    parts = {name: tuple(getattr(drive, name)[i] for i in every_second) for name in ("ids", "paths")}
+    arrays = {name: getattr(drive, name)[::2] for name in ("positions", "times")}
+    recording, poses = tilted_drive(drive, TILTS["sideways"])
+    recording, poses = dataclasses.replace(recording, **parts, **arrays), poses[::2]
+    found = find_loops(recording, params, odometry=inverse(poses[0]) @ poses, registered=True)
+    assert len(found.loops) > 12 and len(found.refused) <= 2
+    for loop in found.loops:
+        metres, degrees = error_of(loop.match_from_query, inverse(poses[loop.match]) @ poses[loop.query])
+        assert metres < 0.5 and degrees < 1
+
+
+@pytest.mark.slow
+def test_scans_of_a_tilted_and_of_an_upright_sensor_find_themselves_in_one_map(drive, params, tmp_path):
+    recording, poses = tilted_drive(drive, TILTS["upside down"])
+    few = {name: getattr(recording, name)[:8] for name in ("ids", "paths", "times", "positions")}
+    PlaceMap.of(dataclasses.replace(recording, **few), params, poses[:8]).save(tmp_path / "map.safetensors")
+    places = PlaceMap.load(tmp_path / "map.safetensors")
+    assert places.mounting() == recording.mounting
+    for record, world_from_lidar in (
+        (recording.record(5), poses[5]),
+        (drive.record(5), drive.poses.world_from_lidar[5]),
+    ):
+        metres, degrees = error_of(places.relocate(params, record)[0].world_from_query, world_from_lidar)
+        assert metres < 0.7 and degrees < 3
+
+
+@pytest.mark.parametrize("degrees", TILTS.values(), ids=TILTS)
+def test_poses_go_there_and_back_and_points_with_them(degrees):
+    tilted = tilted_from_level(degrees)
+    mounting = mounting_of(tilted, height_m=2.5)
+    cloud = np.random.default_rng(0).normal(scale=9, size=(50, 3)).astype(np.float32)
+    level = transformed(upright_from_lidar(mounting), cloud)
+    np.testing.assert_allclose(level, mounting.level(cloud), atol=1e-5)
+    pose = transform(3.0, -2.0, 0.7)
+    of_lidar = lidar_pose(pose, query=mounting, match=mounting)
+    np.testing.assert_allclose(upright_poses(of_lidar, mounting), pose, atol=1e-12)
+    in_match = transformed(of_lidar, cloud)
+    np.testing.assert_allclose(mounting.level(in_match.astype(np.float32)), transformed(pose, level), atol=1e-4)
+    np.testing.assert_array_equal(upright_from_lidar(None), np.eye(4))
+
+
+def test_odometry_of_a_tilted_sensor_is_laid_level_whatever_its_world():
+    level = np.stack([transform(2.0 * k, 0.1 * k**2, 0.2 * k) for k in range(20)])
+    tilted = tilted_from_level(TILTS["forward"])
+    mounting = mounting_of(tilted)
+    of_lidar = level @ inverse(tilted)
+    for odometry in (of_lidar, inverse(of_lidar[0]) @ of_lidar):
+        found = upright_odometry(odometry, mounting)
+        steps, expected = inverse(found[:-1]) @ found[1:], inverse(level[:-1]) @ level[1:]
+        np.testing.assert_allclose(np.linalg.norm(steps[:, :3, 3], axis=1), np.linalg.norm(expected[:, :3, 3], axis=1))
+        np.testing.assert_allclose(steps[:, 2, 3], 0, atol=1e-12)
+        np.testing.assert_allclose(found[:, :3, 2], np.tile([0, 0, 1.0], (20, 1)), atol=1e-12)
+    assert upright_odometry(of_lidar, Mounting(2.5)) is of_lidar and upright_odometry(of_lidar, None) is of_lidar
+
+
+def test_loops_of_a_tilted_sensor_agree_as_those_of_an_upright_one():
+    rng = np.random.default_rng(0)
+    level = np.stack([transform(20 * np.cos(a), 20 * np.sin(a), a) for a in np.linspace(0, 12, 120)])
+    tilted = tilted_from_level(TILTS["sideways"])
+    mounting = mounting_of(tilted)
+    pairs = [(70, 7), (75, 12), (90, 27), (100, 5), (110, 47)]
+
+    def loops(sensor):
+        spread = np.diag([0.05, 0.05, 0.002]).astype(np.float32)
+        found = []
+        for query, match in pairs:
+            pose = inverse(level[match]) @ level[query] @ transform(*rng.normal(scale=0.05, size=2), 0.0)
+            yaw = np.arctan2(pose[1, 0], pose[0, 0])
+            alignment = Alignment(pose[0, 3], pose[1, 3], yaw, spread, 1.0, 0.0)
+            options = {"query_mounting": sensor, "match_mounting": sensor}
+            found.append(planar_loop(query, match, alignment, probability=1.0, **options))
+        wrong = loop_of(found[0], transform(9.0, 4.0, 1.0))
+        return [*found, wrong]
+
+    def loop_of(loop, pose):
+        return dataclasses.replace(loop, match_from_query=loop.match_from_query @ pose)
+
+    expected = agree(loops(None), level)
+    assert expected[:5, :5].all() and not expected[5, :5].any()
+    of_lidar = level @ inverse(tilted)
+    for odometry in (of_lidar, inverse(of_lidar[0]) @ of_lidar):
+        np.testing.assert_array_equal(agree(loops(mounting), odometry, mounting=mounting), expected)
+
+
+def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
+    rng = np.random.default_rng(0)
+    mounting = mounting_of(tilted_from_level(TILTS["sideways"]), height_m=3.0)
+    lidar = inverse(upright_from_lidar(mounting))
+    root = rng.normal(size=(6, 6)) * 1e-3
+    drawn = rng.normal(size=(20_000, 6)) @ root.T
+    motions = np.tile(np.eye(4), (len(drawn), 1, 1))
+    motions[:, :3, :3], motions[:, :3, 3] = Rotation.from_rotvec(drawn[:, 3:]).as_matrix(), drawn[:, :3]
+    moved = lidar @ motions @ inverse(lidar)
+    seen = np.concatenate([moved[:, :3, 3], Rotation.from_matrix(moved[:, :3, :3]).as_rotvec()], axis=1)
+    expected = moved_covariance(root @ root.T, lidar)
+    np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.05 * expected.diagonal().max())
+
+
+def test_a_stream_of_sensors_mounted_otherwise_is_refused(drive, params):
+    finder = CandidateFinder(params)
+    finder.add(Record(points=drive.points(0)))
+    with pytest.raises(ValueError, match=r"expected one sensor, mounted None, found 2\.50 m above the ground"):
+        finder.add(Record(points=drive.points(1), mounting=Mounting(2.5)))
