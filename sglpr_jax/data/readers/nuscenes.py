@@ -8,8 +8,7 @@ Tables refer to each other by tokens. Positions are the LiDAR's, in the map's fr
 car is 0 throughout). Points are turned to x forward.
 """
 
-import json
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +17,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.bin_records import described
+from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows
 from sglpr_jax.data.formats.pose_files import check_quaternions
 from sglpr_jax.data.formats.scan_files import scan_id
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import in_short
 
 CHANNEL = "LIDAR_TOP"
-Rows = list[dict[str, Any]]
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -42,17 +40,19 @@ def open_recording(root: Path, name: str) -> Recording:
     """
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
-    samples = set(_column(tables / "sample.json", _rows(tables / "sample.json", "scene_token", {scene}), "token"))
+    samples = set(
+        column_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token")
+    )
     table = tables / "sample_data.json"
-    listed = _rows(table, "sample_token", samples)
-    files = [root / str(file) for file in _column(table, listed, "filename")]
+    listed = table_rows(table, "sample_token", samples)
+    files = [root / str(file) for file in column_of(table, listed, "filename")]
     scans = [(file, row) for file, row in zip(files, listed, strict=True) if file.parent.name == CHANNEL]
     there = [(file, row) for file, row in scans if file.is_file()]
     if not there:
         raise FileNotFoundError(
             f"{root}: expected scans of {name} in samples/{CHANNEL}, found none of the {len(scans)} that {table} lists"
         )
-    ticks = np.array(_column(table, [row for _, row in there], "timestamp"), np.int64)
+    ticks = numbers_of(table, [row for _, row in there], "timestamp", 1)[:, 0]  # microseconds
     order = np.argsort(ticks, kind="stable")
     paths, rows = zip(*(there[i] for i in order), strict=True)
     keys = sum(path.parent.parent.name == "samples" for path in paths)
@@ -80,8 +80,8 @@ def _versions(root: Path) -> tuple[Path, ...]:
 def _scenes(tables: Path) -> dict[str, str]:
     """The tokens of the scenes by their names."""
     path = tables / "scene.json"
-    rows = _rows(path)
-    return dict(zip(_column(path, rows, "name"), _column(path, rows, "token"), strict=True))
+    rows = table_rows(path)
+    return dict(zip(column_of(path, rows, "name"), column_of(path, rows, "token"), strict=True))
 
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
@@ -93,55 +93,15 @@ def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray
 
 def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> tuple[Rotation, Float[np.ndarray, "n 3"]]:
     """The rotations and translations in a table that a column of `rows` refers to."""
-    tokens = _column(path.with_name("sample_data.json"), rows, column)
-    found = {row["token"]: row for row in _rows(path, "token", set(tokens))}
+    tokens = column_of(path.with_name("sample_data.json"), rows, column)
+    found = {row["token"]: row for row in table_rows(path, "token", set(tokens))}
     lost = [token for token in tokens if token not in found]
     if lost:
         raise ValueError(f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} such rows)")
     named = [found[token] for token in tokens]
-    quaternions = _numbers(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
+    quaternions = numbers_of(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
     check_quaternions(path, quaternions)
-    return Rotation.from_quat(quaternions), _numbers(path, named, "translation", 3)
-
-
-def _numbers(path: Path, rows: Sequence[dict[str, Any]], column: str, size: int) -> Float[np.ndarray, "n k"]:
-    values = _column(path, rows, column)
-    try:
-        numbers = np.array(values, np.float64).reshape(len(rows), size)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected {size} numbers as {column}, found others ({in_short(error)})") from error
-    strange = ~np.isfinite(numbers).all(axis=1)
-    if strange.any():
-        raise ValueError(f"{path}: expected {size} finite numbers as {column}, found {values[int(strange.argmax())]}")
-    return numbers
-
-
-def _column(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
-    """One value of each row. Raises ValueError where a row has none."""
-    lacking = next((row for row in rows if name not in row), None)
-    if lacking is not None:
-        raise ValueError(f"{path}: expected {name!r} in every row, found a row with {', '.join(lacking) or 'nothing'}")
-    return [row[name] for row in rows]
-
-
-def _rows(path: Path, column: str = "", among: Container[Any] = ()) -> Rows:
-    """The rows of a table; with `column`, those whose value is one of `among`.
-
-    The others are dropped while the table is read: some have millions. Raises FileNotFoundError, and ValueError where
-    it is no list of rows.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a table of nuScenes, found none")
-    try:
-        rows = json.loads(
-            path.read_bytes(), object_hook=lambda row: row if not column or row.get(column) in among else None
-        )
-        kept = [row for row in rows if row is not None]
-    except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path}: expected a table, a list in JSON, found none ({in_short(error)})") from error
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in kept):
-        raise ValueError(f"{path}: expected a list of rows, found {type(rows).__name__}, or rows of another kind")
-    return kept
+    return Rotation.from_quat(quaternions), numbers_of(path, named, "translation", 3)
 
 
 READER = Reader(

@@ -31,7 +31,7 @@ def refuse(root: Path, name: str, options: ReadOptions) -> Recording:
     """Raise ValueError, which says why."""
     raise ValueError(
         f"{root}: expected scans in metres, found submaps ({name}, PointNetVLAD's benchmark): each is scaled into"
-        " [-1, 1] by a factor that is not kept, and has neither a sensor nor the ground; open the dataset's own scans instead"
+        " [-1, 1] by a factor that is not kept, and has neither a sensor nor the ground; open the dataset's own scans"
     )
 
 
