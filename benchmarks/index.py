@@ -49,9 +49,7 @@ def main(
             "FleetIndex": Contender("FleetIndex", job, _fleet, *sizes, threads=threads) if _there("lancedb") else None,
         }
         (found, megabytes), _ = ours.run()
-        print(
-            f"Index: {megabytes:.0f} MB for {rows:,} places of {width} numbers ({4e-6 * rows * width:.0f} MB of float32)"
-        )
+        print(f"Index: {megabytes:.0f} MB for {rows:,} places, {4e-6 * rows * width:.0f} MB of them float32")
         for name, other in others.items():
             if other is None:
                 print(
