@@ -3,10 +3,10 @@
     python benchmarks/map_closures.py --environment peers
 
 MapClosures asks for another numpy, so it runs in an environment of its own, which is made on first use
-(benchmarks/peers/requirements.txt). It closes loops between local maps of 100 m of driving, ours between scans. A closure
-of maps is right where a scan of one was taken within `LOOP_M` of a scan of the other, and its pose is that between the
-first scans of the maps. Fewer than 10 scans a second (600 in a minute, the shortest drive) are too few for kiss-icp.
-The milliseconds of ours hold the compiling.
+(benchmarks/peers/requirements.txt). It closes loops between local maps of 100 m of driving, ours between scans. A
+closure of maps is right where a scan of one was taken within `LOOP_M` of a scan of the other, and its pose is that
+between the first scans of the maps. Fewer than 10 scans a second (600 in a minute, the shortest drive) are too few for
+kiss-icp. The milliseconds of ours hold the compiling.
 """
 
 import dataclasses

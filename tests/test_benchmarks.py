@@ -6,15 +6,17 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from recordings import of_scans
 
 from sglpr_jax.models.backbones.swin_layers import SwinBlock
 from sglpr_jax.sim import Sensor, write_dataset
+from sglpr_jax.sim.drive import TimedPoses
+from sglpr_jax.sim.recording import SimulatedRecording
 
 pytestmark = pytest.mark.slow
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -226,10 +228,8 @@ def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
     poses[:, 0, 3] = 5.0 * np.r_[np.arange(40), np.arange(40)[::-1]]
     poses[40:, :2, :2] *= -1  # the other way round
     times = np.arange(80.0)
-    drive = SimpleNamespace(
-        poses=SimpleNamespace(world_from_lidar=poses), positions=poses[:, :3, 3], times=times, __len__=lambda: 80
-    )
-    drive = type("Drive", (), {**vars(drive), "__len__": lambda self: 80})()
+    drive = of_scans({Path(str(i)): np.ones((1, 3)) for i in range(80)}, times=times)
+    drive = SimulatedRecording(**vars(drive), poses=TimedPoses(poses, times), render=lambda i: (np.ones((1, 4)), times))
     right = np.linalg.inv(poses[60]) @ poses[0]
     peer = {
         "maps": [[0, 20], [20, 40], [40, 60], [60, 80]],
