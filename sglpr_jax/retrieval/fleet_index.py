@@ -75,7 +75,7 @@ class FleetIndex:
     @property
     def positions(self) -> Float[np.ndarray, "n 3"] | None:
         """Metres, z up, of all places, or None where they have none."""
-        return np.stack(self._column("position")) if "position" in self._names() else None
+        return np.stack(list(self._column("position"))) if "position" in self._names() else None
 
     def add(
         self,
@@ -135,8 +135,7 @@ class FleetIndex:
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
         """Which places show where a query still is; see `Index.recent`."""
-        times = None if now is None else self.times
-        if times is not None:
+        if now is not None and (times := self.times) is not None:
             return times > now - seconds
         return np.arange(len(self)) >= len(self) - frames
 

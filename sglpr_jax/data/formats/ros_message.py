@@ -48,8 +48,9 @@ class RosMessage:
         packed = np.dtype([(name, f"{self._order}{kind}") for name, kind in fields.items()])
         padding = -packed.itemsize % 4 if self._cdr else 0
         names, offsets = list(fields), [packed.fields[name][1] for name in fields]  # pyright: ignore
-        padded = {"names": names, "formats": [packed[name] for name in names], "offsets": offsets}
-        found = self._next(np.dtype({**padded, "itemsize": packed.itemsize + padding}), max(count - 1, 0))
+        formats, size = [packed[name] for name in names], packed.itemsize + padding
+        padded = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+        found = self._next(padded, max(count - 1, 0))  # behind the last one there is no padding
         return np.concatenate([found, self._next(packed, min(count, 1)).astype(found.dtype)])
 
     def _next(self, kind: np.dtype, count: int) -> np.ndarray:
