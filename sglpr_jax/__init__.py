@@ -7,7 +7,8 @@
 - describe a place: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`; under jit, vmap and grad
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
   `estimate_mounting`
-- find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index`; score that: `evaluate`
+- find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index` (of a fleet: `FleetIndex`); score
+  that: `evaluate`
 - close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans; `read_odometry`,
   `optimize_trajectory`; `PlaceMap` for scans of another day
 - train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from sglpr_jax.models.weights_file import load, save
     from sglpr_jax.retrieval.descriptor_file import DescriptorFile
     from sglpr_jax.retrieval.embed import embed, scan_image
+    from sglpr_jax.retrieval.fleet_index import FleetIndex
     from sglpr_jax.retrieval.index import Index
     from sglpr_jax.retrieval.nearest import Nearest, nearest
     from sglpr_jax.sim.simulation import simulate
@@ -79,6 +81,7 @@ _HOMES = {
     "models.weights_file": ("load", "save"),
     "retrieval.descriptor_file": ("DescriptorFile",),
     "retrieval.embed": ("embed", "scan_image"),
+    "retrieval.fleet_index": ("FleetIndex",),
     "retrieval.index": ("Index",),
     "retrieval.nearest": ("Nearest", "nearest"),
     "sim.simulation": ("simulate",),
@@ -108,6 +111,7 @@ __all__ = [
     "MODELS",
     "DescriptorFile",
     "Evaluation",
+    "FleetIndex",
     "Grid",
     "HeadConfig",
     "Index",

@@ -1,6 +1,7 @@
 """The benchmarks run for real; those against PyTorch say so where it is not installed."""
 
 import importlib
+import importlib.util
 import json
 import subprocess
 import sys
@@ -10,10 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from recordings import of_scans
 
 from sglpr_jax.models.backbones.swin_layers import SwinBlock
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.sim import Sensor, write_dataset
+from sglpr_jax.sim.drive import TimedPoses
+from sglpr_jax.sim.recording import SimulatedRecording
 
 pytestmark = pytest.mark.slow
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -264,3 +268,43 @@ def test_mounting():
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells[:3] == ["vlp16", "1", "10"] and cells[5] == "0 of 24"
     assert float(cells[3]) < 0.1 and float(cells[6]) < 0.1
+
+
+def test_index_is_timed_beside_others():
+    output = printed("index.py", "--rows", "3000", "--width", "16", "--repeats", "2")
+    assert "Index: " in output and "MB for 3,000 places" in output
+    assert "FleetIndex: " in output and "100.00% of the answers are those of Index" in output
+    assert "Below 1 Index is faster" in output
+    if importlib.util.find_spec("faiss") is None:
+        assert "faiss: not installed (faiss: pip install -r benchmarks/index.txt" in output
+
+
+def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
+    """A drive out and back along a line: the way back is revisited, and one closure in each list is wrong."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    closures = importlib.import_module("map_closures")
+    poses = np.tile(np.eye(4), (80, 1, 1))
+    poses[:, 0, 3] = 5.0 * np.r_[np.arange(40), np.arange(40)[::-1]]
+    poses[40:, :2, :2] *= -1  # the other way round
+    times = np.arange(80.0)
+    drive = of_scans({Path(str(i)): np.ones((1, 3)) for i in range(80)}, times=times)
+    drive = SimulatedRecording(**vars(drive), poses=TimedPoses(poses, times), render=lambda i: (np.ones((1, 4)), times))
+    right = np.linalg.inv(poses[60]) @ poses[0]
+    peer = {
+        "maps": [[0, 20], [20, 40], [40, 60], [60, 80]],
+        "closures": [
+            {"source": 0, "target": 3, "target_from_source": right.tolist()},
+            {"source": 0, "target": 2, "target_from_source": np.eye(4).tolist()},
+        ],
+        "seconds": {"odometry": 1.0, "maps and closures": 8.0},
+    }
+    maps = closures.score_maps(peer, drive)
+    assert maps.apart.tolist() == [0, 5] and maps.found == set(range(60, 80)) | {58, 59}
+    assert np.linalg.norm(maps.errors[0, :3, 3]) < 1e-9 and np.linalg.norm(maps.errors[1, :3, 3]) > 100
+    assert maps.seconds == 0.1
+    pairs = [(70, 9), (75, 40)]
+    scans = closures.score(pairs, [np.linalg.inv(poses[9]) @ poses[70], np.eye(4)], drive, 8.0)
+    assert scans.apart.tolist() == [0, 175] and scans.found == {70} and np.linalg.norm(scans.errors[0, :3, 3]) < 1e-9
+    closures.print_table("a line", {"maps": maps, "scans": scans}, drive)
+    table = capsys.readouterr().out
+    assert "0.500" in table and "maps" in table

@@ -5,7 +5,8 @@ import sglpr_jax
 GROUPS = {
     "From a scan to a descriptor": ["load", "read_scan", "scan_image", "describe", "segment", "forward", "Outputs"],
     "Recordings": ["open_recording", "recording_names", "Recording", "Record"],
-    "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "Index", "evaluate", "Evaluation"],
+    "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "Index", "FleetIndex"],
+    "Scores": ["evaluate", "Evaluation"],
     "Loops": ["find_loops", "LoopDetector", "Loop"],
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],

@@ -27,7 +27,7 @@ class Reader:
     """One layout of a dataset on disk."""
 
     layout: str
-    """How to recognise it, for a message: "sequences/NN/velodyne/*.bin (KITTI)"."""
+    """How to recognise it, for a message: "sequences/NN/velodyne/*.bin (KITTI)"; empty where it is always refused."""
     recording_names: Callable[[Path], tuple[str, ...]]
     """The names of the recordings in a folder, in order; none where the folder has another layout."""
     open: Callable[[Path, str, ReadOptions], Recording]

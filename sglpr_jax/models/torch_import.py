@@ -1,14 +1,18 @@
-"""Weights of the published PyTorch Swin-Unet and Swin-T, by their names."""
+"""Weights of the published PyTorch Swin-Unet and Swin-T, by their names, from safetensors."""
 
 import dataclasses
 import re
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import safetensors
+import safetensors.numpy
 
+from sglpr_jax.files import in_short
 from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
@@ -43,6 +47,9 @@ _BUFFERS = ("relative_position_index", "attn_mask")
 _PREFIXES = ("module.", "swin_unet.")
 """Of a data-parallel model, and of Swin-Unet's outer class."""
 
+PICKLES = (".pth", ".pt", ".bin", ".ckpt")
+"""Endings of PyTorch's own checkpoints."""
+
 _SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsample)\..+")
 """What ImageNet's Swin-T has and a Swin-Unet may lack: the classifier, and a deeper third stage."""
 
@@ -62,7 +69,7 @@ class SwinTImport(NamedTuple):
 def import_swin_unet(params: Params, path: Path | str) -> Params:
     """`params` with backbone, expansion and segmentation head from a Swin-Unet checkpoint; the place head stays.
 
-    Raises ImportError without PyTorch, FileNotFoundError, or ValueError where names or shapes are not the model's.
+    Raises FileNotFoundError, or ValueError where the file is no safetensors, or names or shapes are not the model's.
     """
     try:
         weights = from_torch_names(read_checkpoint(path), params.config)
@@ -75,7 +82,7 @@ def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
     """`params` with the encoder from an ImageNet Swin-T, its blocks copied to the mirrored decoder stages as well.
 
     So Swin-Unet's own code does it. Weights of another shape, and those Swin-T has no counterpart of, stay as they
-    were. Raises ImportError without PyTorch, FileNotFoundError, or ValueError where nothing fits.
+    were. Raises FileNotFoundError, or ValueError where the file is no safetensors, or nothing fits.
     """
     try:
         return from_swin_t(read_checkpoint(path), params)
@@ -84,24 +91,21 @@ def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
-    """The weights of a `.pth` file by name, without buffers, wrapper keys and prefixes."""
-    try:
-        import torch  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError("reading a .pth file needs PyTorch: pip install 'sglpr-jax[torch]'") from error
-    if not Path(path).is_file():
+    """The weights of a .safetensors file by name, float32, without buffers and prefixes.
+
+    A .pth is a pickle, which is a program: none is opened. Raises FileNotFoundError, or ValueError for other files.
+    """
+    path = Path(path)
+    if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises a different type for each way a file can be damaged
-        reason = str(error).split(". ")[0]
-        raise ValueError(f"expected a PyTorch checkpoint of plain tensors ({reason})") from error
-    for wrapper in ("model", "state_dict"):
-        content = content.get(wrapper, content) if isinstance(content, Mapping) else content
-    if not isinstance(content, Mapping) or not all(hasattr(value, "numpy") for value in content.values()):
-        raise ValueError("expected a PyTorch checkpoint with a dictionary of tensors")
-    named = {_without_prefixes(name): value.numpy() for name, value in content.items()}
-    return {name: value for name, value in named.items() if not name.endswith(_BUFFERS)}
+        content = safetensors.numpy.load_file(path)
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        pickled = path.suffix in PICKLES or zipfile.is_zipfile(path)
+        found = "a pickle of PyTorch's, which this project does not open" if pickled else f"none ({in_short(error)})"
+        raise ValueError(f"expected a .safetensors file, found {found}; docs/guides/weights.md has the way") from error
+    named = {_without_prefixes(name): value for name, value in content.items() if not name.endswith(_BUFFERS)}
+    return {name: value.astype(np.float32) for name, value in named.items()}
 
 
 def from_torch_names(

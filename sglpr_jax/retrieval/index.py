@@ -9,36 +9,35 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import safetensors
 import safetensors.numpy
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from sglpr_jax.files import replacing
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.retrieval.index_rows import (
+    COLUMNS,
+    Found,
+    check_asked,
+    check_weights,
+    checked_rows,
+    nearest_of,
+    new_places,
+)
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
 FORMAT = "sglpr-jax index 1"
 """Stands in every file."""
-COLUMNS = ("descriptors", "times", "positions")
 FIRST_ROOM = 256
 """Rows that an empty index has room for."""
 SPARE = 16
 """So many rows more than asked for are compared in float64: float32 may swap those that are almost equally near."""
 BLOCK = 64
 """Queries compared with all rows at a time."""
-
-
-class Found(NamedTuple):
-    """The nearest k rows of each query, nearest first."""
-
-    rows: Int[np.ndarray, "*q k"]
-    """-1 where fewer than k may be answers."""
-    distances: Float[np.ndarray, "*q k"]
-    """Of the descriptors; infinite there."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -61,6 +60,8 @@ class Index:
     ids: list[str]
     """The names of the places."""
     _columns: dict[str, np.ndarray]
+    _lengths: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, np.float32), repr=False)
+    """Squared; of the places that were there when the index was last asked."""
 
     @classmethod
     def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2") -> "Index":
@@ -109,19 +110,9 @@ class Index:
         Either all places have times (seconds) or none, and positions (metres, z up) likewise. Raises ValueError for
         descriptors of another width or, by `weights_hash`, of another model, and for values that are not finite.
         """
-        rows = self._checked(descriptors, weights_hash)
-        n = len(self)
-        names = [f"{row:06d}" for row in range(n, n + len(rows))] if ids is None else ids
-        names = [names] if isinstance(names, str) else [str(name) for name in names]
-        if len(names) != len(rows):
-            raise ValueError(f"expected {len(rows)} ids, one a descriptor, found {len(names)}")
-        new = {"descriptors": rows}
-        if times is not None:
-            new["times"] = _finite("times", np.reshape(times, -1), (len(rows),))
-        if positions is not None:
-            new["positions"] = _finite("positions", np.reshape(positions, (-1, 3)), (len(rows), 3))
-        if n and set(new) != set(self._columns):
-            raise ValueError(f"expected places with {', '.join(self._columns)}, as before, found {', '.join(new)}")
+        check_weights(self.weights_hash, weights_hash)
+        n, about = len(self), {"ids": ids, "times": times, "positions": positions}
+        names, new = new_places(descriptors, width=self.width, first=n, before=list(self._columns), **about)
         for name, values in new.items():
             self._columns[name] = _appended(self._columns.get(name), values, n)
         self.ids += names
@@ -146,15 +137,13 @@ class Index:
         `exclude` says of each place whether it is left out (see `recent`). Equally near places come in the order they
         were added. Raises ValueError for descriptors of another width or, by `weights_hash`, of another model.
         """
-        queries = self._checked(descriptors, weights_hash)
-        if k < 1:
-            raise ValueError(f"expected k of 1 or more, found {k}")
-        if exclude is not None and exclude.shape != (len(self),):
-            raise ValueError(f"expected one flag for each of {len(self)} places to exclude, found {exclude.shape}")
-        allowed = np.arange(len(self)) if exclude is None else np.flatnonzero(~exclude)
+        check_weights(self.weights_hash, weights_hash)
+        queries = checked_rows(descriptors, self.width)
+        check_asked(k, exclude, places=len(self))
+        allowed = np.ones(len(self), bool) if exclude is None else ~exclude
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
-        there = min(k, len(allowed))
+        there = min(k, int(allowed.sum()))
         if there:
             for start in range(0, len(queries), BLOCK):
                 block = slice(start, start + BLOCK)
@@ -204,39 +193,33 @@ class Index:
         columns = {name: arrays.pop(name) for name in COLUMNS if name in arrays}
         index = cls(about["width"], about["weights_hash"], about["distance"], about["ids"], columns)
         try:
-            index._check_weights(weights_hash)
+            check_weights(index.weights_hash, weights_hash)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         return index, arrays
 
     def _nearest(
-        self, queries: Float[np.ndarray, "q d"], allowed: Int[np.ndarray, " n"], k: int
-    ) -> tuple[Int[np.ndarray, "q k"], Float[np.ndarray, "q k"]]:
-        """The nearest k of the rows `allowed`, of which there are k or more."""
+        self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The rows and distances (q, k) of the nearest k that are `allowed`, of which there are k or more."""
         if self.distance != "l2":
-            every = distance_function(self.distance)(queries, self.descriptors[allowed])
+            rows = np.flatnonzero(allowed)
+            every = distance_function(self.distance)(queries, self.descriptors[rows])
             order = np.argsort(every, axis=1, kind="stable")[:, :k]
-            return allowed[order], np.take_along_axis(every, order, axis=1)
-        first_ones = allowed[-1] == len(allowed) - 1  # which need no copy
-        database = self.descriptors[: len(allowed)] if first_ones else self.descriptors[allowed]
-        rough = np.einsum("nd,nd->n", database, database)[None] - 2 * queries @ database.T
-        few = min(k + SPARE, len(allowed))
-        near = np.sort(np.argpartition(rough, few - 1, axis=1)[:, :few], axis=1)
-        apart = np.linalg.norm(queries[:, None].astype(np.float64) - database[near], axis=2)
-        order = np.argsort(apart, axis=1, kind="stable")[:, :k]
-        return allowed[np.take_along_axis(near, order, axis=1)], np.take_along_axis(apart, order, axis=1)
+            return rows[order], np.take_along_axis(every, order, axis=1)
+        rough = self._squares()[None] - 2 * queries @ self.descriptors.T
+        rough[:, ~allowed] = np.inf
+        few = min(k + SPARE, int(allowed.sum()))
+        near = np.argpartition(rough, few - 1, axis=1)[:, :few]
+        found = [nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
+        return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
 
-    def _checked(self, descriptors: Any, weights_hash: str | None) -> Float[np.ndarray, "n d"]:
-        self._check_weights(weights_hash)
-        rows = np.atleast_2d(np.asarray(descriptors, np.float32))
-        return _finite("descriptors", rows, (len(rows), self.width)).astype(np.float32)
-
-    def _check_weights(self, weights_hash: str | None) -> None:
-        if weights_hash is not None and weights_hash != self.weights_hash:
-            raise ValueError(
-                f"expected descriptors of the weights {self.weights_hash[:12] or '(none)'}, "
-                f"found those of {weights_hash[:12] or '(none)'}: models cannot read each other's"
-            )
+    def _squares(self) -> Float[np.ndarray, " n"]:
+        """The squared lengths of all descriptors, those of new places taken now."""
+        new = self.descriptors[len(self._lengths) :]
+        if len(new):
+            self._lengths = np.concatenate([self._lengths, np.einsum("nd,nd->n", new, new)])
+        return self._lengths
 
 
 def _appended(old: np.ndarray | None, new: np.ndarray, n: int) -> np.ndarray:
@@ -250,15 +233,6 @@ def _appended(old: np.ndarray | None, new: np.ndarray, n: int) -> np.ndarray:
         old = grown
     old[n : n + len(new)] = new
     return old
-
-
-def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    values = np.asarray(values, np.float64 if name != "descriptors" else np.float32)
-    if values.shape != shape:
-        raise ValueError(f"expected {name} of shape {shape}, found {values.shape}")
-    if not np.isfinite(values).all():
-        raise ValueError(f"expected finite {name}, found others")
-    return values
 
 
 def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:

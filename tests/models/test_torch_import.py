@@ -1,17 +1,20 @@
 """Import of PyTorch weights by name. The numbers of imported models are the parity tests' subject."""
 
-import sys
-from types import SimpleNamespace
+import pickle
+from pathlib import Path
 
 import flax.traverse_util
 import jax
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import Params
+from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.torch_import import from_swin_t, from_torch_names, import_swin_t, import_swin_unet, torch_name
+from sglpr_jax.models.weights import as_tree, weight_shapes
 
 
 @pytest.fixture
@@ -30,40 +33,27 @@ def params(golden, model_config) -> Params:
 
 
 @pytest.fixture
-def checkpoint(tmp_path, monkeypatch):
-    """Stands in for PyTorch, which is an optional extra: `torch.load` returns the saved object's tensors."""
-    contents = {}
+def checkpoint(tmp_path):
+    """Writes a checkpoint's weights as safetensors."""
 
-    def load(path, *, map_location, weights_only):
-        assert map_location == "cpu" and weights_only
-        if path not in contents:
-            raise RuntimeError("PytorchStreamReader failed reading zip archive")
-        return contents[path]
-
-    def save(content):
-        path = tmp_path / "model.pth"
-        path.touch()
-        contents[path] = content
+    def save(weights):
+        path = tmp_path / "model.safetensors"
+        safetensors.numpy.save_file({name: np.ascontiguousarray(value) for name, value in weights.items()}, path)
         return path
 
-    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(load=load))
     return save
-
-
-def tensors(state):
-    return {name: SimpleNamespace(numpy=lambda value=value: value) for name, value in state.items()}
 
 
 def leaves(tree):
     return flax.traverse_util.flatten_dict(tree, sep="/")
 
 
-def test_swin_unet_checkpoint_with_prefix_wrapper_buffers_and_three_channels(state, params, checkpoint):
+def test_swin_unet_checkpoint_with_prefix_buffers_and_three_channels(state, params, checkpoint):
     embedding = state["patch_embed.proj.weight"]
     state["patch_embed.proj.weight"] = np.repeat(embedding / 3, 3, axis=1)
     state["layers.0.blocks.0.attn.relative_position_index"] = np.zeros((16, 16), np.int64)
     state["layers.0.blocks.1.attn_mask"] = np.zeros((4, 16, 16), np.float32)
-    path = checkpoint({"model": tensors({f"module.swin_unet.{name}": value for name, value in state.items()})})
+    path = checkpoint({f"module.swin_unet.{name}": value for name, value in state.items()})
     imported = leaves(import_swin_unet(params, path).weights)
 
     assert imported.keys() == leaves(params.weights).keys()
@@ -99,6 +89,37 @@ def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(st
         assert f"backbone/{name}" in imported.kept and (weights[f"backbone/{name}"] == 0.5).all()
 
 
+@pytest.mark.slow
+def test_imagenets_swin_t_fills_two_thirds_of_the_papers_model():
+    """By the shapes of the published file alone: nothing is computed."""
+    config = model_preset("paper")
+    shapes = weight_shapes(config)
+    params = Params(as_tree({name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}), config)
+    published = {"head.weight": (1000, 768), "head.bias": (1000,), "patch_embed.proj.weight": (96, 3, 4, 4)}
+    vectors = {"patch_embed.proj.bias": 96, "patch_embed.norm.weight": 96, "patch_embed.norm.bias": 96}
+    vectors |= {"norm.weight": 768, "norm.bias": 768}
+    for stage, (blocks, heads) in enumerate(zip((2, 2, 6, 2), (3, 6, 12, 24), strict=True)):
+        c = 96 * 2**stage
+        for block in range(blocks):
+            at = f"layers.{stage}.blocks.{block}."
+            vectors |= {f"{at}norm{i}.{kind}": c for i in (1, 2) for kind in ("weight", "bias")}
+            vectors |= {f"{at}attn.qkv.bias": 3 * c, f"{at}attn.proj.bias": c}
+            vectors |= {f"{at}mlp.fc1.bias": 4 * c, f"{at}mlp.fc2.bias": c}
+            published |= {f"{at}attn.qkv.weight": (3 * c, c), f"{at}attn.proj.weight": (c, c)}
+            published |= {f"{at}mlp.fc1.weight": (4 * c, c), f"{at}mlp.fc2.weight": (c, 4 * c)}
+            published |= {f"{at}attn.relative_position_bias_table": (169, heads)}
+        if stage < 3:
+            vectors |= {f"layers.{stage}.downsample.norm.{kind}": 4 * c for kind in ("weight", "bias")}
+            published |= {f"layers.{stage}.downsample.reduction.weight": (2 * c, 4 * c)}
+    published |= {name: (size,) for name, size in vectors.items()}
+    imported = from_swin_t({name: np.broadcast_to(np.float32(1), shape) for name, shape in published.items()}, params)
+    taken = sum(int(np.prod(shapes[name])) for name in imported.copied)
+    assert taken == 25_079_748 and sum(int(np.prod(shape)) for shape in shapes.values()) == 37_276_333
+    assert {name.partition(".blocks.")[2][:1] for name in imported.unused if "layers.2" in name} == set("2345")
+    fresh = {name.removeprefix("backbone/").partition("/")[0].rstrip("0123456789") for name in imported.kept}
+    assert {"place_head", "expand", "norm_up", "segmentation_head"} <= fresh and not any("encoder" in n for n in fresh)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -121,17 +142,34 @@ def test_a_swin_t_of_another_width_or_with_unknown_names_is_refused(params):
         from_swin_t({"norm.weight": np.ones(64), "layer1.0.conv.weight": np.ones(3)}, params)
 
 
+def test_half_precision_becomes_float32(state, params, checkpoint):
+    path = checkpoint({name: value.astype(np.float16) for name, value in state.items()})
+    imported = leaves(import_swin_unet(params, path).weights)
+    assert {value.dtype for value in imported.values()} == {np.dtype(np.float32)}
+
+
+class Bomb:
+    """What runs when it is unpickled."""
+
+    def __reduce__(self):
+        return (Path.touch, (Path("exploded"),))
+
+
+@pytest.mark.parametrize("content", [pickle.dumps(Bomb()), b"", b"PK\x03\x04"], ids=["a pickle", "empty", "no zip"])
+def test_a_pickle_is_not_opened(params, tmp_path, monkeypatch, content):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.pth").write_bytes(content)
+    for load in (import_swin_unet, import_swin_t):
+        with pytest.raises(ValueError, match=r"model\.pth: .*found a pickle of PyTorch's, .*; docs/guides/weights\.md"):
+            load(params, tmp_path / "model.pth")
+    assert not Path("exploded").exists()
+
+
 def test_files_that_are_not_checkpoints_are_refused_by_name(params, checkpoint, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none.pth: no such checkpoint"):
-        import_swin_unet(params, tmp_path / "none.pth")
-    (tmp_path / "bad.pth").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"bad.pth: expected a PyTorch checkpoint of plain tensors"):
-        import_swin_t(params, tmp_path / "bad.pth")
-    with pytest.raises(ValueError, match=r"model.pth: expected a PyTorch checkpoint with a dictionary of tensors"):
-        import_swin_unet(params, checkpoint([1, 2]))
-
-
-def test_without_pytorch_the_error_names_the_extra(params, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ImportError, match=r"pip install 'sglpr-jax\[torch\]'"):
-        import_swin_unet(params, tmp_path / "model.pth")
+    with pytest.raises(FileNotFoundError, match=r"none.safetensors: no such checkpoint"):
+        import_swin_unet(params, tmp_path / "none.safetensors")
+    (tmp_path / "bad.safetensors").write_bytes(b"bad")
+    with pytest.raises(ValueError, match=r"bad\.safetensors: expected a \.safetensors file, found none"):
+        import_swin_t(params, tmp_path / "bad.safetensors")
+    with pytest.raises(ValueError, match=r"model\.safetensors: not a weight of Swin-Unet: a"):
+        import_swin_unet(params, checkpoint({"a": np.zeros(3, np.float32)}))

@@ -41,6 +41,14 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
         )
 
 
+def check_quaternions(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> None:
+    """Raise ValueError naming the first row of `path` whose qx qy qz qw are no rotation."""
+    wrong = np.flatnonzero(~(np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROTATION_TOLERANCE))
+    if wrong.size:
+        found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
+        raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
+
+
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
     """Return the times (n,) in seconds of a file with one number a line.
 

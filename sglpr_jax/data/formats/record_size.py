@@ -32,6 +32,8 @@ DIRECTIONS_APART = 0.12
 """The most by which the distributions of directions may differ from turn to turn (Kolmogorov-Smirnov)."""
 TIMES_AS_FAR = 8.0
 """The most by which the usual distances may differ from turn to turn."""
+SCALED_M = 1.0
+"""A cloud within this is in no metres."""
 FEWEST = 200
 """So few points, of all files together, tell nothing."""
 MOST = 20_000
@@ -138,6 +140,8 @@ def _strange_range(points: Float[np.ndarray, "n 3"]) -> str:
             return f"{where.mean():.0%} of the points {what}"
     if np.median(np.hypot(*size[finite, :2].T)) > USUAL_M:
         return f"half of the points beyond {USUAL_M:g} m"
+    if size[finite].max() <= SCALED_M:
+        return f"all points within {SCALED_M:g} m, as in clouds that are scaled"
     flat = [axis for axis, spread in zip("xy", np.ptp(points[finite, :2], axis=0), strict=True) if spread < 0.1]
     return f"all points have one {flat[0]}" if flat else ""
 

@@ -1,20 +1,52 @@
 """ROS recordings by rosbags (extra `ros`): .bag, .mcap, and folders of ROS 2."""
 
 import itertools
-import struct
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.livox import CUSTOM_MSG, POINT, read_custom_msg
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
+from sglpr_jax.data.formats.ros_message import RosMessage
+from sglpr_jax.data.formats.ros_poses import POSES
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
+"""Types of messages that are scans."""
+
+
+class Stamps(NamedTuple):
+    """When the messages of a topic were made."""
+
+    recorded: Int64[np.ndarray, " n"]
+    """By the recorder, nanoseconds."""
+    own: Float[np.ndarray, " n"]
+    """By their own headers, seconds."""
+
+    @property
+    def orderly(self) -> bool:
+        """Whether their own times are some, and do not go back."""
+        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all())
+
+    @property
+    def seconds(self) -> Float[np.ndarray, " n"]:
+        """Their own times where these are orderly, else the recorder's."""
+        return self.own if self.orderly else self.recorded / 1e9
+
+
+class Track(NamedTuple):
+    """The positions on a topic of poses."""
+
+    stamps: Stamps
+    positions: Float[np.ndarray, "n 3"]
+    """Metres."""
+    frames: str
+    """What was where: "base_link in odom"."""
 
 
 class RosBag:
@@ -36,49 +68,62 @@ class RosBag:
     def cloud_topics(self) -> tuple[str, ...]:
         """The topics of point clouds. Raises ValueError, with all topics there are, where there is none."""
         topics = self.topics
-        clouds = tuple(sorted(topic for topic, kind in topics.items() if kind == CLOUD))
+        clouds = tuple(sorted(topic for topic, kind in topics.items() if kind in CLOUDS))
         if not clouds:
             found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topics"
-            raise ValueError(f"{self.paths[0]}: expected a topic of point clouds ({CLOUD}), found {found}")
+            raise ValueError(
+                f"{self.paths[0]}: expected a topic of point clouds ({' or '.join(CLOUDS)}), found {found}"
+            )
         return clouds
 
-    def stamps(self, topic: str) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """When the messages of a topic were recorded (ns), and their own times (seconds).
+    @property
+    def pose_topics(self) -> tuple[str, ...]:
+        """The topics of poses."""
+        return tuple(sorted(topic for topic, kind in self.topics.items() if kind in POSES))
 
-        Reads the bag once. Messages whose own times go back have the recorder's. Raises ValueError for a broken bag.
-        """
+    def stamps(self, topic: str) -> Stamps:
+        """When the messages of a topic were made. Reads the bag once. Raises ValueError for a broken one."""
         with self._lock, _broken(self.paths[0]):
-            found = [(time, self._own_time(raw)) for _, time, raw in self._messages(topic)]
-        recorded = np.array([time for time, _ in found], np.int64)
-        own = np.array([time for _, time in found], np.float64)
-        orderly = len(own) and (own > 0).all() and (np.diff(own) >= 0).all()
-        return recorded, own if orderly else recorded / 1e9
+            found = [(time, message.header().time) for time, message in self._messages(topic)]
+        return Stamps(np.array([time for time, _ in found], np.int64), np.array([time for _, time in found], float))
+
+    def track(self, topic: str) -> Track:
+        """The positions on a topic of poses, those that are finite. Reads the bag once."""
+        read = POSES[self.topics[topic]]
+        with self._lock, _broken(self.paths[0]):
+            found = [(time, read(message)) for time, message in self._messages(topic)]
+        finite = [(time, pose) for time, pose in found if np.isfinite(pose.position).all()]
+        stamps = Stamps(np.array([t for t, _ in finite], np.int64), np.array([pose.time for _, pose in finite], float))
+        positions = np.array([pose.position for _, pose in finite], np.float64).reshape(-1, 3)
+        return Track(stamps, positions, finite[0][1].frames if finite else "")
 
     def cloud(self, topic: str, time: int, nth: int) -> Records:
         """The `nth` cloud of a topic among those recorded at this time (ns). Raises ValueError for a broken one."""
         with self._lock, _broken(self.paths[0]):
-            return read_point_cloud2(self._message(topic, time, nth))
+            if self.topics[topic] in CUSTOM_MSG:
+                return read_custom_msg(next(itertools.islice(self._messages(topic, time), nth, None))[1])
+            return read_point_cloud2(self._point_cloud2(topic, time, nth))
 
     def fields(self, topic: str, time: int) -> str:
         """The fields of a cloud, in words."""
+        if self.topics[topic] in CUSTOM_MSG:
+            return f"Livox, {' '.join(POINT)}"
         with self._lock, _broken(self.paths[0]):
-            return described_fields(self._message(topic, time, 0))
+            return described_fields(self._point_cloud2(topic, time, 0))
 
-    def _messages(self, topic: str, start: int | None = None, stop: int | None = None) -> Any:
+    def _messages(self, topic: str, time: int | None = None) -> Iterator[tuple[int, RosMessage]]:
+        """The messages of a topic, or those recorded at one time (ns), with their times."""
+        for _, recorded, raw in self._raw(topic, time):
+            yield recorded, RosMessage(raw, cdr=self._reader.is2)
+
+    def _raw(self, topic: str, time: int | None) -> Any:
         connections = [connection for connection in self._reader.connections if connection.topic == topic]
-        return self._reader.messages(connections=connections, start=start, stop=stop)
+        stop = None if time is None else time + 1
+        return self._reader.messages(connections=connections, start=time, stop=stop)
 
-    def _message(self, topic: str, time: int, nth: int) -> Any:
-        connection, _, raw = next(itertools.islice(self._messages(topic, time, time + 1), nth, None))
+    def _point_cloud2(self, topic: str, time: int, nth: int) -> Any:
+        connection, _, raw = next(itertools.islice(self._raw(topic, time), nth, None))
         return self._reader.deserialize(raw, connection.msgtype)
-
-    def _own_time(self, raw: bytes) -> float:
-        """The time in the header in front of every cloud, seconds."""
-        if self._reader.is2:
-            seconds, nanoseconds = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
-        else:
-            _, seconds, nanoseconds = struct.unpack_from("<III", raw)
-        return seconds + nanoseconds / 1e9
 
 
 class _broken:

@@ -1,10 +1,15 @@
-"""Poses that were measured at other times than the scans: for each scan the nearest one in time."""
+"""Poses that were measured at other times than the scans: for each scan the nearest one, or one between two."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64
+
+WIDEST_S = 1.0
+"""Between poses farther apart in time nothing is interpolated."""
+BEYOND_S = 0.1
+"""A scan may come so much before the first pose, or after the last."""
 
 
 class Matched(NamedTuple):
@@ -51,3 +56,26 @@ def match_times(
             f"{gaps_s.min():g} s away"
         )
     return Matched(kept, rows[kept])
+
+
+class Interpolated(NamedTuple):
+    """Where the scans were taken, by poses of other times."""
+
+    kept: Bool[np.ndarray, " q"]
+    """Which scans have poses near enough in time on both sides."""
+    positions: Float[np.ndarray, "q 3"]
+    """Metres; of the others they mean nothing."""
+
+
+def interpolate(
+    stamps: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " q"]
+) -> Interpolated:
+    """Return the positions at `times` on straight lines between those at `stamps`, all in seconds, in any order."""
+    if len(stamps) < 2:
+        return Interpolated(np.zeros(len(times), bool), np.zeros((len(times), 3)))
+    order = np.argsort(stamps, kind="stable")
+    stamps, positions = stamps[order], positions[order]
+    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    near = stamps[later] - stamps[later - 1] <= WIDEST_S
+    within = (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
+    return Interpolated(near & within, np.stack([np.interp(times, stamps, axis) for axis in positions.T], axis=1))

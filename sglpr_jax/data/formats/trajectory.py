@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.data.choices import PoseFormat
 from sglpr_jax.data.formats.pose_files import (
-    ROTATION_TOLERANCE,
     check_positions,
+    check_quaternions,
     check_times,
     columns_of,
     read_poses,
@@ -139,11 +139,7 @@ def _read_tum(path: Path) -> Trajectory:
     rows = read_rows(path, columns=8)
     check_times(path, rows[:, 0])
     check_positions(path, rows[:, 1:4])
-    lengths = np.linalg.norm(rows[:, 4:], axis=1)
-    wrong = np.flatnonzero(np.abs(lengths - 1) > ROTATION_TOLERANCE)
-    if wrong.size:
-        found = " ".join(f"{value:g}" for value in rows[wrong[0], 4:])
-        raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
+    check_quaternions(path, rows[:, 4:])
     return Trajectory(rows[:, 1:4], rows[:, 0], _said(path, "TUM"))
 
 

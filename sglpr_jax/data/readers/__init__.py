@@ -76,7 +76,7 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
         names = reader.recording_names(root)
         if names:
             return reader, names
-    *layouts, last = (reader.layout for reader in readers())
+    *layouts, last = (reader.layout for reader in readers() if reader.layout)
     if root.is_file():
         scan = (
             "; put scans into a folder, or read one by read_scan"

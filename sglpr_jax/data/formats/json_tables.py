@@ -1,0 +1,54 @@
+"""Tables in JSON: a list of rows, each an object that names its columns."""
+
+import json
+from collections.abc import Container, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.files import in_short
+
+
+def table_rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict[str, Any]]:
+    """Return the rows of a table; with `column`, those whose value there is one of `among`.
+
+    The others are dropped while the table is read: some have millions. Raises FileNotFoundError, and ValueError where
+    it is no list of rows.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a table, found none")
+
+    def wanted(row: dict[str, Any]) -> dict[str, Any] | None:
+        return row if not column or row.get(column) in among else None
+
+    try:
+        rows = json.loads(path.read_bytes(), object_hook=wanted)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: expected a table in JSON, found none that is whole ({in_short(error)})") from error
+    kept = [row for row in rows if row is not None] if isinstance(rows, list) else [rows]
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in kept):
+        raise ValueError(f"{path}: expected a list of rows, each an object, found something else")
+    return kept
+
+
+def column_of(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
+    """Return one value of each row. Raises ValueError, naming the table, where a row has none."""
+    lacking = next((row for row in rows if name not in row), None)
+    if lacking is not None:
+        raise ValueError(f"{path}: expected {name!r} in every row, found a row with {', '.join(lacking) or 'nothing'}")
+    return [row[name] for row in rows]
+
+
+def numbers_of(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -> Float[np.ndarray, "n {size}"]:
+    """Return a column of so many finite numbers a row. Raises ValueError, naming the table, for others."""
+    values = column_of(path, rows, name)
+    try:
+        numbers = np.array(values, np.float64).reshape(len(rows), size)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: expected {size} numbers as {name!r}, found others ({in_short(error)})") from error
+    strange = ~np.isfinite(numbers).all(axis=1)
+    if strange.any():
+        raise ValueError(f"{path}: expected finite numbers as {name!r}, found {values[int(strange.argmax())]}")
+    return numbers

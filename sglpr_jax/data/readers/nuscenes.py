@@ -1,0 +1,113 @@
+"""Scenes of nuScenes: what the 32-beam LiDAR on the roof saw in 20 seconds, a sequence each.
+
+    v1.0-mini/scene.json, sample.json, sample_data.json, ego_pose.json, calibrated_sensor.json
+    samples/LIDAR_TOP/*.pcd.bin    key frames, two a second: float32 x, y, z, intensity, laser
+    sweeps/LIDAR_TOP/*.pcd.bin     those in between, twenty a second in all (optional)
+
+Tables refer to each other by tokens. Positions are the LiDAR's, in the map's frame: east, north, up (the height of the
+car is 0 throughout). Points are turned to x forward.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.data.formats.bin_records import described
+from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows
+from sglpr_jax.data.formats.pose_files import check_quaternions
+from sglpr_jax.data.formats.scan_files import scan_id
+from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.recording import Recording
+
+CHANNEL = "LIDAR_TOP"
+
+
+def recording_names(root: Path) -> tuple[str, ...]:
+    """Return the names of the scenes in all versions in `root`, in order."""
+    return tuple(sorted({name for tables in _versions(root) for name in _scenes(tables)}))
+
+
+def open_recording(root: Path, name: str) -> Recording:
+    """Open a scene: its key frames and sweeps as far as their files are there, in order of time.
+
+    Raises FileNotFoundError where a table is missing or no scan is there, ValueError where a table is malformed or
+    refers to nothing.
+    """
+    tables = next(folder for folder in _versions(root) if name in _scenes(folder))
+    scene = _scenes(tables)[name]
+    samples = set(
+        column_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token")
+    )
+    table = tables / "sample_data.json"
+    listed = table_rows(table, "sample_token", samples)
+    files = [root / str(file) for file in column_of(table, listed, "filename")]
+    scans = [(file, row) for file, row in zip(files, listed, strict=True) if file.parent.name == CHANNEL]
+    there = [(file, row) for file, row in scans if file.is_file()]
+    if not there:
+        raise FileNotFoundError(
+            f"{root}: expected scans of {name} in samples/{CHANNEL}, found none of the {len(scans)} that {table} lists"
+        )
+    ticks = numbers_of(table, [row for _, row in there], "timestamp", 1)[:, 0]  # microseconds
+    order = np.argsort(ticks, kind="stable")
+    paths, rows = zip(*(there[i] for i in order), strict=True)
+    keys = sum(path.parent.parent.name == "samples" for path in paths)
+    missing = f", {len(scans) - len(paths)} more are listed but not there" if len(scans) > len(paths) else ""
+    return Recording(
+        name=name,
+        ids=tuple(map(scan_id, paths)),
+        positions=_positions(tables, rows),
+        times=ticks[order] / 1e6,
+        pose_source=f"{tables.name}/ego_pose.json",
+        paths=paths,
+        read=scan_record,
+        found=(
+            f"format: {described('nuscenes')}, turned to x forward",
+            f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
+        ),
+    )
+
+
+def _versions(root: Path) -> tuple[Path, ...]:
+    """The folders of tables; v1.0-mini, the quickest to read, comes first."""
+    return tuple(sorted(path.parent for path in root.glob("v1.0-*/scene.json")))
+
+
+def _scenes(tables: Path) -> dict[str, str]:
+    """The tokens of the scenes by their names."""
+    path = tables / "scene.json"
+    rows = table_rows(path)
+    return dict(zip(column_of(path, rows, "name"), column_of(path, rows, "token"), strict=True))
+
+
+def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
+    """Where the LiDAR was: its place on the car, by the pose of the car."""
+    world_from_car = _poses(tables / "ego_pose.json", rows, "ego_pose_token")
+    car_from_lidar = _poses(tables / "calibrated_sensor.json", rows, "calibrated_sensor_token")
+    return world_from_car[0].apply(car_from_lidar[1]) + world_from_car[1]
+
+
+def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> tuple[Rotation, Float[np.ndarray, "n 3"]]:
+    """The rotations and translations in a table that a column of `rows` refers to."""
+    tokens = column_of(path.with_name("sample_data.json"), rows, column)
+    found = {row["token"]: row for row in table_rows(path, "token", set(tokens))}
+    lost = [token for token in tokens if token not in found]
+    if lost:
+        raise ValueError(f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} such rows)")
+    named = [found[token] for token in tokens]
+    quaternions = numbers_of(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
+    check_quaternions(path, quaternions)
+    return Rotation.from_quat(quaternions), numbers_of(path, named, "translation", 3)
+
+
+READER = Reader(
+    layout="v1.0-*/scene.json with samples/LIDAR_TOP/*.pcd.bin (nuScenes)",
+    recording_names=recording_names,
+    open=lambda root, name, options: open_recording(root, name),
+    knows_mounting=False,
+    rank=5,
+)

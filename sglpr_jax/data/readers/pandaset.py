@@ -1,0 +1,119 @@
+"""Sequences of PandaSet, once its pickles are converted: a pickle is a program, and this project runs none.
+
+    001/lidar/00.pkl.gz         as it comes: a pickle, not opened
+    001/lidar/00.npy            converted (docs/guides/own-data.md): x, y, z in the world, of the LiDAR on the roof
+    001/lidar/poses.json        position and heading of that LiDAR, a row for each scan
+    001/lidar/timestamps.json   seconds
+
+The LiDAR's own x points right and its y forward: points are turned to x forward. The world has z up.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.data.formats.arrays import read_npy
+from sglpr_jax.data.formats.pose_files import check_positions, check_quaternions, check_times, rows_of
+from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import read_json
+
+PICKLES = ".pkl.gz"
+
+
+def recording_names(root: Path) -> tuple[str, ...]:
+    """Return the names of the sequences in `root`, converted or not; its own where it is one."""
+    if (root / "lidar" / "poses.json").is_file():
+        return (root.resolve().name,)
+    return tuple(sorted(path.parent.parent.name for path in root.glob("*/lidar/poses.json")))
+
+
+def open_recording(root: Path, name: str) -> Recording:
+    """Open a sequence.
+
+    Raises ValueError where its scans are pickles still, or poses or times are malformed or too few; FileNotFoundError
+    where there is no scan or no file of times.
+    """
+    folder = root / "lidar" if (root / "lidar" / "poses.json").is_file() else root / name / "lidar"
+    paths, pickles = files_in(folder, ".npy"), files_in(folder, PICKLES)
+    if not paths and pickles:
+        raise ValueError(
+            f"{folder}: expected scans as .npy, found {len(pickles)} pickles (*{PICKLES}): pickles are programs, and"
+            " this project opens none; docs/guides/own-data.md says how to convert them"
+        )
+    if not paths:
+        raise FileNotFoundError(f"{folder}: expected scans (*.npy), found none")
+    ids = tuple(path.stem for path in paths)
+    rotations, positions = read_poses(folder / "poses.json")
+    rows = rows_of(ids, rows=len(positions), path=folder / "poses.json")
+    times = _times(folder / "timestamps.json")
+    seconds = times[rows_of(ids, rows=len(times), path=folder / "timestamps.json")]
+    check_times(folder / "timestamps.json", seconds)
+    poses = {path: (rotations[row].as_matrix(), positions[row]) for path, row in zip(paths, rows, strict=True)}
+    left = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
+    return Recording(
+        name=name,
+        ids=ids,
+        positions=positions[rows],
+        times=seconds,
+        pose_source="lidar/poses.json",
+        paths=paths,
+        read=partial(_read, poses=poses),
+        found=(f"format: PandaSet as npy, from the world's frame into the LiDAR's, x forward{left}",),
+    )
+
+
+def read_poses(path: Path) -> tuple[Rotation, Float[np.ndarray, "n 3"]]:
+    """Return the rotations (world from LiDAR) and positions (metres) of a file of poses; ValueError for others."""
+    poses = read_json(path)
+    try:
+        turned = np.array([[pose["heading"][axis] for axis in "xyzw"] for pose in poses], np.float64).reshape(-1, 4)
+        positions = np.array([[pose["position"][axis] for axis in "xyz"] for pose in poses], np.float64).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path}: expected a list of poses, each with position (x, y, z) and heading (w, x, y, z), found others"
+        ) from error
+    if not np.isfinite(positions).all():
+        raise ValueError(f"{path}: expected finite positions, found others")
+    check_positions(path, positions)
+    check_quaternions(path, turned)
+    return Rotation.from_quat(turned), positions
+
+
+def _times(path: Path) -> Float[np.ndarray, " n"]:
+    """Seconds, one for each scan."""
+    values: Any = read_json(path)
+    try:
+        times = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        times = np.array([np.nan])
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise ValueError(f"{path}: expected a list of seconds, found {str(values)[:60]}")
+    return times
+
+
+def _read(
+    path: Path,
+    labels: Path | None,
+    lasers: bool,
+    *,
+    poses: dict[Path, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]],
+) -> Record:
+    world_from_lidar, position = poses[path]
+    x, y, z = ((read_npy(path) - position) @ world_from_lidar).T
+    return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))
+
+
+READER = Reader(
+    layout="NNN/lidar/*.npy with NNN/lidar/poses.json (PandaSet)",
+    recording_names=recording_names,
+    open=lambda root, name, options: open_recording(root, name),
+    knows_mounting=False,
+    rank=5,
+)

@@ -1,0 +1,221 @@
+"""An index for more places than one machine's memory: `Index`'s questions, answered by LanceDB (extra `fleet`).
+
+A table lies in a folder or in object storage; no server runs. Its answers are exact too: LanceDB compares all rows in
+float32, and the distances of a few more than asked for are taken again in float64.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sglpr_jax.files import in_short
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.index_rows import (
+    Found,
+    check_asked,
+    check_weights,
+    checked_rows,
+    nearest_of,
+    new_places,
+)
+from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
+
+FORMAT = "sglpr-jax fleet index 1"
+"""Stands in every table."""
+TABLE = "places"
+SPARE = 16
+"""So many rows more than asked for are compared in float64: float32 may swap those that are almost equally near."""
+
+
+class FleetIndex:
+    """Places by their descriptors, in the order they were added: row i is the i-th. Descriptors are compared by L2.
+
+    Any number of processes may ask while one adds: each answer knows all places that were there when it was asked for.
+
+    Example:
+      index = FleetIndex("s3://bucket/town", weights_hash=file.weights_hash)   # or a folder
+      index.add_file(file)
+      rows, distances = index.query(descriptor, 3)
+    """
+
+    distance = "l2"
+
+    def __init__(self, place: Path | str, *, width: int = 256, weights_hash: str | None = None):
+        """Open the table in a folder or at an address of object storage; without one, it is made by the first `add`.
+
+        Raises ImportError without the extra, ValueError where the table is no index, or one of another width or, by
+        `weights_hash`, of other weights.
+        """
+        self.place = str(place)
+        self._connection = _connect(self.place)
+        self.width, self.weights_hash = width, weights_hash or ""
+        self.table: Any = _open(self._connection, self.place)
+        """LanceDB's own, for what it can do beside; None while there are no places."""
+        if self.table is not None:
+            self._check_about(weights_hash)
+
+    def __len__(self) -> int:
+        return 0 if self.table is None else self.table.count_rows()
+
+    @property
+    def ids(self) -> list[str]:
+        """The names of all places: the whole column is read."""
+        return self._column("id").tolist()
+
+    @property
+    def times(self) -> Float[np.ndarray, " n"] | None:
+        """Seconds of all places, or None where they have none."""
+        return self._column("time") if "time" in self._names() else None
+
+    @property
+    def positions(self) -> Float[np.ndarray, "n 3"] | None:
+        """Metres, z up, of all places, or None where they have none."""
+        return np.stack(list(self._column("position"))) if "position" in self._names() else None
+
+    def add(
+        self,
+        descriptors: Float[np.ndarray, "*n d"],
+        *,
+        ids: Sequence[str] | str | None = None,
+        times: Float[np.ndarray, " n"] | float | None = None,
+        positions: Float[np.ndarray, "*n 3"] | None = None,
+        weights_hash: str | None = None,
+    ) -> None:
+        """Add places as `Index.add` does, in one step: all of them or none. Many at a time are quicker than one."""
+        check_weights(self.weights_hash, weights_hash)
+        first = len(self)
+        before = [named for named, stored in _STORED.items() if stored in self._names()]
+        about = {"ids": ids, "times": times, "positions": positions}
+        names, columns = new_places(descriptors, width=self.width, first=first, before=before, **about)
+        rows = self._arrow(first, names, columns)
+        if self.table is None:
+            self.table = self._connection.create_table(TABLE, rows)
+        else:
+            self.table.add(rows)
+
+    def add_file(self, file: DescriptorFile) -> None:
+        """Add the places of a descriptor file. Raises ValueError where another model or method made it."""
+        if file.distance != self.distance:
+            raise ValueError(f"expected descriptors compared by {self.distance}, found {file.distance}")
+        about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
+        self.add(file.descriptors, ids=file.ids, **about)
+
+    def query(
+        self,
+        descriptors: Float[np.ndarray, "*q d"],
+        k: int = 1,
+        *,
+        exclude: Bool[np.ndarray, " n"] | None = None,
+        weights_hash: str | None = None,
+    ) -> Found:
+        """Find the nearest `k` places of one descriptor (d,) or of several (q, d) as `Index.query` does.
+
+        Few runs of places to `exclude`, as those of `recent`, cost little; thousands of runs are slow.
+        """
+        check_weights(self.weights_hash, weights_hash)
+        queries = checked_rows(descriptors, self.width)
+        if exclude is not None or k < 1:
+            check_asked(k, exclude, places=len(self))
+        rows = np.full((len(queries), k), -1)
+        distances = np.full((len(queries), k), np.inf)
+        where = "" if exclude is None else _without(exclude)
+        for i, query in enumerate(queries if self.table is not None else ()):
+            near, vectors = self._candidates(query, k + SPARE, where)
+            found, apart = nearest_of(query, vectors, near, k)
+            rows[i, : len(found)], distances[i, : len(found)] = found, apart
+        shape = (*np.shape(descriptors)[:-1], k)
+        return Found(rows.reshape(shape), distances.reshape(shape))
+
+    def recent(
+        self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
+    ) -> Bool[np.ndarray, " n"]:
+        """Which places show where a query still is; see `Index.recent`."""
+        if now is not None and (times := self.times) is not None:
+            return times > now - seconds
+        return np.arange(len(self)) >= len(self) - frames
+
+    def _candidates(self, query: Float[np.ndarray, " d"], k: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+        """The rows and descriptors of the nearest k, by LanceDB, without any approximate index of its own."""
+        search = self.table.search(query).distance_type("l2").bypass_vector_index()
+        search = search.where(where, prefilter=True) if where else search
+        found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
+        vectors = found["descriptor"].combine_chunks().flatten().to_numpy()
+        return found["row"].to_numpy(), vectors.reshape(-1, self.width)
+
+    def _arrow(self, first: int, ids: list[str], columns: dict[str, np.ndarray]) -> Any:
+        """Rows as LanceDB takes them; what the table is about stands in its schema."""
+        import pyarrow
+
+        def vectors(values: np.ndarray) -> Any:
+            return pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.reshape(-1)), values.shape[1])
+
+        stored = {
+            _STORED[name]: vectors(values) if values.ndim > 1 else pyarrow.array(values)
+            for name, values in columns.items()
+        }
+        rows = {"row": pyarrow.array(np.arange(first, first + len(ids))), "id": pyarrow.array(ids, pyarrow.string())}
+        about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash}
+        return pyarrow.table({**rows, **stored}).replace_schema_metadata({"about": json.dumps(about)})
+
+    def _check_about(self, weights_hash: str | None) -> None:
+        """Take over what the table says of itself; ValueError where it is not what was asked for."""
+        try:
+            about = json.loads((self.table.schema.metadata or {}).get(b"about", b"{}"))
+        except ValueError:
+            about = {}
+        if about.get("format") != FORMAT:
+            raise ValueError(f"{self.place}: expected format {FORMAT!r}, found {about.get('format')!r}")
+        if about["width"] != self.width:
+            raise ValueError(f"{self.place}: expected descriptors of {self.width} numbers, found {about['width']}")
+        try:
+            check_weights(about["weights_hash"], weights_hash)
+        except ValueError as error:
+            raise ValueError(f"{self.place}: {error}") from error
+        self.weights_hash = about["weights_hash"]
+
+    def _names(self) -> list[str]:
+        return [] if self.table is None else self.table.schema.names
+
+    def _column(self, name: str) -> np.ndarray:
+        if self.table is None:
+            return np.empty(0)
+        found = self.table.search().select(["row", name]).limit(None).to_arrow()
+        return found[name].to_numpy()[np.argsort(found["row"].to_numpy())]
+
+
+_STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"}
+"""What the columns of `NewPlaces` are called in the table, where a row is one place."""
+
+
+def _without(exclude: Bool[np.ndarray, " n"]) -> str:
+    """A condition that leaves out these rows, run by run."""
+    return " AND ".join(f"NOT (row BETWEEN {first} AND {last})" for first, last in _runs(exclude))
+
+
+def _runs(flags: Bool[np.ndarray, " n"]) -> Iterable[tuple[int, int]]:
+    """The first and last of each run of set flags."""
+    steps = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
+    return zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True)
+
+
+def _connect(place: str) -> Any:
+    try:
+        import lancedb
+    except ImportError as error:
+        raise ImportError(f"{place}: this index needs the extra `fleet` (pip install 'sglpr-jax[fleet]')") from error
+    return lancedb.connect(place, read_consistency_interval=timedelta(0))
+
+
+def _open(connection: Any, place: str) -> Any:
+    """The table, or None where there is none yet."""
+    if TABLE not in connection.list_tables().tables:
+        return None
+    try:
+        return connection.open_table(TABLE)
+    except Exception as error:  # LanceDB raises a dozen kinds for damaged files
+        raise ValueError(f"{place}: expected an index of LanceDB, found a broken one ({in_short(error)})") from error

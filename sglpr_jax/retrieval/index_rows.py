@@ -1,0 +1,97 @@
+"""What every index asks of descriptors and places that come in: shapes, numbers, and the weights that made them."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+COLUMNS = ("descriptors", "times", "positions")
+
+
+class Found(NamedTuple):
+    """The nearest k rows of each query, nearest first."""
+
+    rows: Int[np.ndarray, "*q k"]
+    """-1 where fewer than k may be answers."""
+    distances: Float[np.ndarray, "*q k"]
+    """Of the descriptors; infinite there."""
+
+
+class NewPlaces(NamedTuple):
+    """Places to be added, checked."""
+
+    ids: list[str]
+    columns: dict[str, np.ndarray]
+    """The descriptors (n, d) float32 and, where they are known, times (n,) and positions (n, 3) float64."""
+
+
+def new_places(
+    descriptors: Any,
+    *,
+    width: int,
+    first: int,
+    ids: Sequence[str] | str | None,
+    times: Any,
+    positions: Any,
+    before: Sequence[str],
+) -> NewPlaces:
+    """Check places that are added from row `first` on, after others that have the columns `before`.
+
+    Raises ValueError for descriptors of another width, for values that are not finite, and for other columns than
+    before.
+    """
+    rows = checked_rows(descriptors, width)
+    names = [f"{row:06d}" for row in range(first, first + len(rows))] if ids is None else ids
+    names = [names] if isinstance(names, str) else [str(name) for name in names]
+    if len(names) != len(rows):
+        raise ValueError(f"expected {len(rows)} ids, one a descriptor, found {len(names)}")
+    columns = {"descriptors": rows}
+    if times is not None:
+        columns["times"] = _finite("times", np.reshape(times, -1), (len(rows),))
+    if positions is not None:
+        columns["positions"] = _finite("positions", np.reshape(positions, (-1, 3)), (len(rows), 3))
+    if first and set(columns) != set(before):
+        raise ValueError(f"expected places with {', '.join(before)}, as before, found {', '.join(columns)}")
+    return NewPlaces(names, columns)
+
+
+def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
+    """One descriptor or several as rows of float32. Raises ValueError for another width and what is not finite."""
+    rows = np.atleast_2d(np.asarray(descriptors, np.float32))
+    return _finite("descriptors", rows, (len(rows), width)).astype(np.float32)
+
+
+def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, places: int) -> None:
+    """Raise ValueError for a k below 1 and flags that are not one for each place."""
+    if k < 1:
+        raise ValueError(f"expected k of 1 or more, found {k}")
+    if exclude is not None and exclude.shape != (places,):
+        raise ValueError(f"expected one flag for each of {places} places to exclude, found {exclude.shape}")
+
+
+def check_weights(expected: str, found: str | None) -> None:
+    """Raise ValueError where descriptors are those of other weights; None says nothing."""
+    if found is not None and found != expected:
+        raise ValueError(
+            f"expected descriptors of the weights {expected[:12] or '(none)'}, "
+            f"found those of {found[:12] or '(none)'}: models cannot read each other's"
+        )
+
+
+def nearest_of(
+    query: Float[np.ndarray, " d"], descriptors: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " n"], k: int
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """The nearest k of a few candidates by their distances in float64; equally near ones in the order of their rows."""
+    apart = np.linalg.norm(query.astype(np.float64) - descriptors, axis=1)
+    order = np.lexsort((rows, apart))[:k]
+    return rows[order], apart[order]
+
+
+def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    values = np.asarray(values, np.float64 if name != "descriptors" else np.float32)
+    if values.shape != shape:
+        raise ValueError(f"expected {name} of shape {shape}, found {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"expected finite {name}, found others")
+    return values

@@ -1,0 +1,47 @@
+"""Bags of both ROSes and mcap for the tests: messages of any type at any time."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+LIVOX = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+)
+FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
+"""What a bag of each kind is called."""
+
+
+def typestore(kind: str) -> Any:
+    """The messages of a ROS, and those of both drivers of Livox."""
+    types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    for package in ("livox_ros_driver", "livox_ros_driver2"):
+        types.register(get_types_from_msg(LIVOX_POINT, f"{package}/msg/CustomPoint"))
+        types.register(get_types_from_msg(LIVOX, f"{package}/msg/CustomMsg"))
+    return types
+
+
+def header(kind: str, seconds: float, frame: str) -> Any:
+    """A header at this time."""
+    store = typestore(kind).types
+    stamp = store["builtin_interfaces/msg/Time"](sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
+    return store["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **({"seq": 7} if kind == "ros1" else {}))
+
+
+def write_bag(path: Path, kind: str, messages: Iterable[tuple[str, str, float, Any]]) -> Path:
+    """Write messages (topic, type, seconds at which it was recorded, message) into a bag of a kind of `FILES`."""
+    types = typestore(kind)
+    storage = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    with Writer1(path) if kind == "ros1" else Writer2(path, version=9, storage_plugin=storage) as bag:
+        serialize = types.serialize_ros1 if kind == "ros1" else types.serialize_cdr
+        connections = {}
+        for topic, name, seconds, message in messages:
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, name, typestore=types)
+            bag.write(connections[topic], round(seconds * 1e9), serialize(message, name))
+    return path

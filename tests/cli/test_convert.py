@@ -1,0 +1,111 @@
+"""bin/convert: weights by PyTorch's names become a folder that bin/train begins with."""
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+import sglpr_jax
+from sglpr_jax.models.torch_import import torch_name
+from sglpr_jax.models.weights import by_name, graft
+from sglpr_jax.training.presets import load_preset
+
+from .conftest import assert_one_line_error
+
+MODEL = """
+import dataclasses
+
+from sglpr_jax.bev import Grid
+from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.training.config import TrainConfig
+
+MODEL = dataclasses.replace(
+    model_preset("tiny"),
+    grid=Grid(resolution_m=3.2, height=32, width=32),
+    backbone=SwinConfig(embed_dim=8, depths=(1, 1), heads=(1, 2), window=4),
+    head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4),
+)
+CONFIG = TrainConfig(model=MODEL, steps=1)
+"""
+
+
+@pytest.fixture
+def preset(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(MODEL)
+    return path
+
+
+@pytest.fixture
+def state(preset):
+    """A Swin-Unet by PyTorch's names, every weight full of one number of its own."""
+    shapes = by_name(sglpr_jax.init(jax.random.key(7), config=load_preset(str(preset)).model).weights)
+    ours = {name: leaf for name, leaf in shapes.items() if not name.startswith("place_head/")}
+    return {
+        torch_name(name): _torch_layout(name, np.full(leaf.shape, i / 100))
+        for i, (name, leaf) in enumerate(ours.items())
+    }
+
+
+def _torch_layout(name, values):
+    values = values.astype(np.float32)
+    if name.endswith("kernel"):
+        values = np.moveaxis(values, (-1, -2), (0, 1))
+    return np.ascontiguousarray(values[..., None, None] if name == "segmentation_head/kernel" else values)
+
+
+def written(path, weights):
+    safetensors.numpy.save_file(weights, path)
+    return path
+
+
+def test_a_whole_swin_unet(command, preset, state, tmp_path):
+    file = written(tmp_path / "unet.safetensors", state)
+    ended = command("convert", file, "--network", "swin-unet", "--preset", preset, "--out", tmp_path / "start")
+    assert ended.status == 0, ended.error
+    assert "million numbers" in ended.out and "of unet.safetensors, the rest fresh (seed 0)" in ended.out
+    values = by_name(sglpr_jax.load(tmp_path / "start").weights)
+    for name, value in values.items():
+        if not name.startswith("place_head/"):
+            assert (value == state[torch_name(name)].reshape(-1)[0]).all(), name
+
+
+def test_swin_t_fills_what_it_fits_and_says_what_it_does_not(command, preset, state, tmp_path):
+    encoder = {name: value for name, value in state.items() if name.startswith(("patch_embed.", "layers.", "norm."))}
+    file = written(tmp_path / "t.safetensors", {**encoder, "head.weight": np.zeros((10, 16), np.float32)})
+    ended = command("convert", file, "--preset", preset, "--out", tmp_path / "start")
+    assert ended.status == 0, ended.error
+    assert f"without a place in {preset}: head.weight" in ended.out
+    values = by_name(sglpr_jax.load(tmp_path / "start").weights)
+    expected = state["layers.0.blocks.0.mlp.fc1.weight"].reshape(-1)[0]
+    for place in ("encoder_0", "decoder_1"):
+        assert (values[f"backbone/{place}/block_0/mlp_in/kernel"] == expected).all()
+
+
+def test_a_training_can_begin_with_them(command, preset, state, tmp_path):
+    """What bin/train does with --weights: the place head stays as it was written."""
+    file = written(tmp_path / "unet.safetensors", state)
+    ended = command("convert", file, "--network", "swin-unet", "--preset", preset, "--out", tmp_path / "start")
+    assert ended.status == 0, ended.error
+    given = sglpr_jax.load(tmp_path / "start")
+    begun = graft(given, sglpr_jax.init(jax.random.key(9), config=load_preset(str(preset)).model))
+    jax.tree.map(np.testing.assert_array_equal, begun.weights, given.weights)
+
+
+def test_what_cannot_be_converted_is_one_line(command, preset, state, tmp_path):
+    (tmp_path / "swin.pth").write_bytes(b"a pickle")
+    file = written(tmp_path / "unet.safetensors", {**state, "more.weight": np.zeros(3, np.float32)})
+    for given, message in (
+        ((tmp_path / "swin.pth", "--preset", preset), "found a pickle of PyTorch's"),
+        ((tmp_path / "none.safetensors", "--preset", preset), "no such checkpoint"),
+        ((file, "--network", "swin-unet", "--preset", preset), "not a weight of Swin-Unet: more.weight"),
+        ((file, "--preset", "rings"), "expected a model with the backbone 'swin', found 'rings'"),
+    ):
+        ended = command("convert", *given, "--out", tmp_path / "start")
+        assert_one_line_error(ended, message)
+        assert not (tmp_path / "start").exists()
+    (tmp_path / "start").mkdir()
+    ended = command("convert", file, "--out", tmp_path / "start")
+    assert_one_line_error(ended, "expected a folder that does not exist yet")
