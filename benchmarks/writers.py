@@ -91,9 +91,9 @@ WRITERS = {
     writer.name: writer
     for writer in (
         Writer("embed", f"--weights simulated --data {TOWN} --seq 08 --out {OUT}/08.npz"),
-        Writer("evaluate", f"../{INPUTS}/08.npz --data {TOWN} --out {OUT}/08"),
-        Writer("simulate", f"--out {OUT}/town {DRIVE} --seq 08 --scans 24"),
-        Writer("simulate images", f"--out {OUT}/town {DRIVE} --seq 08 --scans 24 --images"),
+        Writer("evaluate", f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
+        Writer("simulate", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
+        Writer("simulate images", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
         Writer("export", f"--weights simulated --out {OUT}/mine", refuses="does not exist yet"),
         Writer(
             "export stablehlo",
@@ -122,7 +122,7 @@ def make_inputs(folder: Path) -> None:
     inputs.mkdir(parents=True)
     (inputs / "preset.py").write_text(PRESET)
     for line in (
-        f"simulate --out town {DRIVE} --seq 05 08 --scans 60 --rate-hz 1",
+        f"simulate --out town {DRIVE} --seq 05 08 --scans 24 --rate-hz 1",
         "embed --method solid --data town --seq 08 --out 08.npz",
         "map town --seq 08 --poses town/sequences/08/poses.txt --pose-format kitti --out town.safetensors",
     ):

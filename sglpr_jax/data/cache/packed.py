@@ -25,12 +25,10 @@ from sglpr_jax.data.cache.stacked import Stacked, StackWriter, map_stacked, sync
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.record import ReadRecord, Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import half_written, read_json, replacing
+from sglpr_jax.files import ABANDONED_S, half_written, read_json, replacing
 
 FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
-ABANDONED_S = 3600
-"""A half-made pack to which nothing was added for so long is nobody's: its process was killed."""
 
 
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
