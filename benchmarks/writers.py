@@ -104,7 +104,9 @@ WRITERS = {
         Writer("relocalize", f"{TOWN}/{SCANS}/000003.bin --map ../{INPUTS}/town.safetensors --out {OUT}/pose.json"),
         Writer("loops", f"{TOWN} --seq 08 --poses {POSES} --pose-format kitti --out {OUT}/found"),
         Writer("segment", f"--weights sglpr --data {TOWN} --seq 08 --out {OUT}/maps"),
-        Writer("stress", f"--method solid --data {TOWN} --seq 08 --out {OUT}/stress --corruption rotation beams-8"),
+        Writer(
+            "stress", f"--method solid --data {TOWN} --seq 08 --out {OUT}/stress --corruption rotation occlusion-45"
+        ),
         Writer(
             "train",
             f"{TRAINED} --out {OUT}/run --cache {OUT}/packs",
