@@ -1,9 +1,14 @@
 """Files and folders written whole or not at all, JSON and arrays read back, and errors that name their file."""
 
 import contextlib
+import errno
+import fcntl
+import functools
 import json
 import os
+import re
 import shutil
+import time
 import uuid
 import zipfile
 from collections.abc import Iterator
@@ -11,6 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+ABANDONED_S = 3600
+"""What was half-written so long ago, and nobody adds to, is left from a process that was killed."""
 
 
 class WriteError(OSError):
@@ -23,8 +31,8 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
 
     The block writes to the path that it is given, a hidden one beside `path`. At the end of the block this takes the
     place of `path`; after an error it is removed, and what was at `path` stays. Folders missing above `path` are made.
-    With `keep` a folder that somebody else has put at `path` meanwhile stays too. Raises WriteError where `path` cannot
-    be written.
+    With `keep` a folder that somebody else has put at `path` meanwhile stays too. What processes that were killed an
+    hour ago or more have left beside `path` is removed. Raises WriteError where `path` cannot be written.
 
     Example:
       with replacing(path) as temporary:
@@ -34,10 +42,31 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
     try:
         with writing(path, temporary, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
+            _sweep(path.parent.resolve())
             yield temporary
             _put(temporary, path, keep=keep)
     finally:
         _remove(temporary)
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a folder that exists, as far as they ask.
+
+    The lock goes with the process, however that ends, and leaves nothing behind. Raises BlockingIOError where another
+    process has it. On a disk that knows no locks there is none.
+    """
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BlockingIOError(f"{folder}: expected to be alone in it, found another process at work") from error
+        except OSError:  # no locks here
+            pass
+        yield
+    finally:
+        os.close(held)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -130,17 +159,30 @@ def _hidden(path: Path) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # no process id: several hosts share a disk
 
 
+@functools.cache
+def _sweep(folder: Path) -> None:
+    """Remove, once in the life of this process, what others that were killed have left in a folder."""
+    for left in folder.glob(".*.tmp"):
+        with contextlib.suppress(FileNotFoundError):  # another process sweeps too
+            newest = max(path.stat().st_mtime for path in (left, *left.rglob("*")))
+            if re.search(r"\.[0-9a-f]{32}\.tmp$", left.name) and time.time() - newest > ABANDONED_S:
+                _remove(left)
+
+
 def _put(new: Path, path: Path, *, keep: bool) -> None:
-    try:
-        os.replace(new, path)
-    except OSError:
-        if not (new.is_dir() and path.is_dir()):  # a folder replaces none that holds files
-            raise
-        if not keep:
-            old = _hidden(path)
+    """Give `new` the name `path`; another process may be doing the same."""
+    while True:
+        try:
+            return os.replace(new, path)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # a folder replaces none that holds files
+                raise
+        if keep:
+            return
+        old = _hidden(path)
+        with contextlib.suppress(FileNotFoundError):  # the other process was faster
             os.replace(path, old)
-            os.replace(new, path)
-            shutil.rmtree(old)
+        _remove(old)
 
 
 def _remove(path: Path) -> None:

@@ -191,6 +191,57 @@ def test_models_of_loops_are_fitted_and_written(tmp_path):
     assert len(found) == 2 and set(found[""]["weights"]) == {"correlation", "second"}
 
 
+def table(output: str) -> list[list[str]]:
+    """The rows of a printed table."""
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in output.splitlines() if "│" in line]
+
+
+def test_many_scans_are_described_and_the_memory_is_told():
+    rows = table(printed("load.py", "scans", "--quick"))
+    assert [row[0] for row in rows] == [str(50 * i) for i in range(1, 11)]
+    assert all(float(row[3]) > 10 for row in rows)
+
+
+def test_a_command_that_is_killed_leaves_nothing_half_written_and_goes_on(tmp_path):
+    printed("load.py", "kills", "--quick", "--commands", "simulate images", "--out", str(tmp_path / "kills.json"))
+    (row,) = json.loads((tmp_path / "kills.json").read_text())["rows"]
+    assert row["kills"] == 4 and row["files"] > 20
+    assert row["half-written"] == row["next run fails"] == row["other bytes"] == 0
+
+
+def test_two_at_once_and_troubles_with_the_disk_end_well_or_in_one_line(tmp_path):
+    for part in ("together", "disk"):
+        printed("load.py", part, "--quick", "--commands", "export", "--out", str(tmp_path / f"{part}.json"))
+    (row,) = json.loads((tmp_path / "together.json").read_text())["rows"]
+    assert row["both end well"] + row["one is refused"] == 4 and row["fail"] == row["other bytes"] == 0
+    rows = json.loads((tmp_path / "disk.json").read_text())["rows"]
+    assert {row["trouble"]: row["refused in one line"] for row in rows if row["anything else"] == 0} == {
+        "full disk": 1,
+        "read-only folder": 1,
+        "a file vanishes": 0,
+        "a file is half there": 0,
+    }
+    assert not any(row["half-written"] for row in rows)
+
+
+def test_the_readme_is_followed_line_by_line(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    readme = importlib.import_module("readme_on_bare_machine")
+    text = "```bash\nbin/demo    # all of it\nbin/test\n```\n```python\na = 1\n```\ntext\n```python\nprint(a)\n```\n"
+    found = readme.steps(text, Path("python"), of_wheel=False)
+    assert [(step.line, step.command[-1]) for step in found] == [
+        (1, "bin/demo"),
+        (1, "bin/test"),
+        (5, "a = 1\n"),
+        (9, "a = 1\nprint(a)\n"),
+    ]
+    assert [step.shown for step in readme.steps(text, Path("python"), of_wheel=True)] == [
+        "sglpr-demo",
+        "Python, 1 lines",
+        "Python, 1 lines",
+    ]
+
+
 def flops(function, *shapes: tuple[int, ...]) -> int:
     """What the counter of the benchmarks says of a function of arrays of these shapes."""
     count = importlib.import_module("flops").count_flops

@@ -1,11 +1,17 @@
 """A file or folder is written whole or not at all, and errors of writing name it."""
 
+import os
+import time
+import uuid
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from sglpr_jax.files import (
+    ABANDONED_S,
     WriteError,
+    alone_in,
     half_written,
     read_json,
     remove_half_written,
@@ -48,6 +54,51 @@ def test_a_folder_takes_the_place_of_another_unless_that_is_kept(tmp_path, keep,
     with replacing(path, keep=keep) as temporary:
         (temporary / "new").mkdir(parents=True)
     assert names(path) == [left] and names(tmp_path) == ["weights"]
+
+
+def test_several_that_replace_one_folder_at_once_all_end_well(tmp_path, monkeypatch):
+    path, rename = tmp_path / "weights", os.replace
+
+    def rename_and_rest(*names: Path) -> None:
+        rename(*names)
+        time.sleep(1e-3)  # others come in between
+
+    monkeypatch.setattr(os, "replace", rename_and_rest)
+
+    def write(number: int) -> None:
+        with replacing(path) as temporary:
+            temporary.mkdir()
+            for name in ("a", "b"):
+                (temporary / name).write_text(str(number))
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, range(80)))
+    assert names(tmp_path) == ["weights"] and names(path) == ["a", "b"]
+    assert (path / "a").read_text() == (path / "b").read_text()
+
+
+def test_what_was_left_long_ago_is_removed_and_nothing_else(tmp_path):
+    half = [tmp_path / f".08.npz.{uuid.uuid4().hex}.tmp" for _ in range(3)]
+    half[0].write_text("old")
+    (half[1] / "in").mkdir(parents=True)
+    half[2].write_text("new")
+    others = [tmp_path / ".mine.tmp", tmp_path / "08.tmp"]
+    for path in (half[0], half[1] / "in", half[1], *others):
+        path.touch()
+        os.utime(path, (0, path.stat().st_mtime - ABANDONED_S - 1))
+    write_json(tmp_path / "a.json", 1)
+    assert names(tmp_path) == sorted([half[2].name, ".mine.tmp", "08.tmp", "a.json"])
+
+
+def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path):
+    with (
+        alone_in(tmp_path),
+        pytest.raises(BlockingIOError, match=rf"^{tmp_path}: expected .* found another process"),
+        alone_in(tmp_path),
+    ):
+        pass
+    with alone_in(tmp_path):
+        assert names(tmp_path) == []
 
 
 def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):

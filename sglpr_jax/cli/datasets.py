@@ -10,7 +10,7 @@ from sglpr_jax import sim
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Recording, readers
 from sglpr_jax.data import leave_one_out as split
-from sglpr_jax.data.choices import PoseChoice
+from sglpr_jax.data.readable import readable
 from sglpr_jax.sim.simulation import Simulated, default_dataset, default_sessions
 
 
@@ -66,17 +66,40 @@ def open_recording(root: Path, name: str | None, **options: Any) -> Recording:
 
 
 def leave_one_out(
-    root: Path, seq: str, *, train_seqs: Sequence[str] = (), pose_source: PoseChoice = "auto"
+    root: Path, seq: str, *, train_seqs: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Return what `data.leave_one_out` does, and say which they are."""
-    recordings, test = split.leave_one_out(root, seq, train=train_seqs, pose_source=pose_source)
+    """Return what `data.leave_one_out` does, and say which they are and what was found of each."""
+    recordings, test = split.leave_one_out(root, seq, train=train_seqs, **options)
     names = ", ".join(recording.name for recording in recordings)
     print(f"training on {names}; testing on {seq}, never seen", file=sys.stderr)
+    _describe([*recordings, test])
     return recordings, test
 
 
-def all_recordings(root: Path, *, pose_source: PoseChoice = "auto") -> list[Recording]:
-    """Return every recording of a dataset that is trained on beside another, and say which they are."""
-    recordings = split.all_recordings(root, pose_source=pose_source)
+def all_recordings(root: Path, **options: Any) -> list[Recording]:
+    """Return every recording of a dataset that is trained on beside another; say which and what was found of each."""
+    recordings = split.all_recordings(root, **options)
     print(f"training on {', '.join(recording.name for recording in recordings)} of {root} too", file=sys.stderr)
+    _describe(recordings)
     return recordings
+
+
+def without_bad_scans(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings without the scans that cannot be read, each of which is reported."""
+    with progress_bar("read all scans", sum(map(len, recordings))) as show:
+        found, done = [], 0
+        for recording in recordings:
+            before = done
+            found.append(readable(recording, on_bad_scan=report_bad, on_progress=lambda i, n=before: show(n + i)))
+            done += len(recording)
+    return found
+
+
+def report_bad(scan: str, error: Exception) -> None:
+    """Say on stderr which scan was skipped, and why."""
+    print(f"skipped {scan}: {error}", file=sys.stderr)
+
+
+def _describe(recordings: Sequence[Recording]) -> None:
+    for recording in recordings:
+        print("; ".join(recording.description), file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out
+from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
 from sglpr_jax.cli.runtime import (
     StopRequest,
     console,
@@ -20,7 +20,7 @@ from sglpr_jax.cli.runtime import (
     stop_on_signal,
 )
 from sglpr_jax.data import Recording
-from sglpr_jax.data.choices import PoseChoice
+from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 from sglpr_jax.evaluation.final_test import BESIDE, BesideName, final_test
 from sglpr_jax.evaluation.learning_curves import LearningCurves
@@ -34,6 +34,8 @@ from sglpr_jax.training.tensorboard import EVENTS, EventFiles
 
 SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source")
 """Flags that a resumed run must have the same, beside its configuration."""
+SETTINGS_SINCE = ("format", "sensor_height", "skip_bad")
+"""Such flags that older runs do not know: noted where they are set."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +82,13 @@ class TrainCommand:
     """Write event files for TensorBoard too (extra `tensorboard`)."""
     pose_source: PoseChoice = "auto"
     """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    format: ScanFormat = "auto"
+    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    sensor_height: SensorHeight = "auto"
+    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
+    does where the layout (a plain folder, a bag) does not tell."""
+    skip_bad: bool = False
+    """Read every scan before the training, report those that cannot be read and train without them."""
     hosts: int = 1
     """How many hosts train together, each started with this same command and its own index."""
     host_index: int = 0
@@ -119,6 +128,12 @@ def run_folder(command: TrainCommand) -> Path:
     return command.out or Path("runs") / f"{Path(command.preset).stem}-{command.seq}"
 
 
+def settings(command: TrainCommand) -> dict[str, object]:
+    """What is noted of the flags, beside the configuration."""
+    newer = [name for name in SETTINGS_SINCE if getattr(command, name) != getattr(TrainCommand, name)]
+    return {name: getattr(command, name) for name in (*SETTINGS, *newer)}
+
+
 def _train(
     command: TrainCommand, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording
 ) -> TrainResult:
@@ -137,7 +152,7 @@ def _train(
             cache=command.cache,
             callback=Callbacks(ProgressBar(), LearningCurves(folder), *watched),
             stopped=stopped,
-            settings={name: getattr(command, name) for name in SETTINGS},
+            settings=settings(command),
         )
     if is_first_host():
         print(result, file=sys.stderr)
@@ -154,13 +169,17 @@ def exit_unless_finished(result: TrainResult, stopped: StopRequest) -> None:
 
 def _recordings(command: TrainCommand) -> tuple[Sequence[Recording], Sequence[Recording], Recording]:
     """The recordings to train on, those of --also, and the one to test on. ValueError where one cannot be used."""
-    root, source = dataset_root(command.data), command.pose_source
-    recordings, test = leave_one_out(root, command.seq, train_seqs=command.train_seq, pose_source=source)
-    also = [recording for folder in command.also for recording in all_recordings(folder, pose_source=source)]
+    root = dataset_root(command.data)
+    options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
+    recordings, test = leave_one_out(root, command.seq, train_seqs=command.train_seq, **options)
+    also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
     if any(folder.resolve() == root.resolve() for folder in command.also):
         raise ValueError(
             f"--also {root}: expected another dataset than the one whose recording {command.seq} is tested"
         )
+    if command.skip_bad:
+        *read, test = without_bad_scans([*recordings, *also, test])
+        recordings, also = read[: len(recordings)], read[len(recordings) :]
     if command.pseudo_labels is not None:
         recordings = _pseudo_labelled(recordings, command.pseudo_labels, command.config)
     return recordings, also, test

@@ -8,13 +8,13 @@ import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import check_times, numbers_of, read_poses, read_rows
-from sglpr_jax.files import write_text
+from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
 
@@ -56,7 +56,8 @@ def write_g2o(path: Path | str, loops: Sequence[Loop], odometry: Float[np.ndarra
 def read_g2o(path: Path | str) -> Graph:
     """Read vertices and edges of the kinds that `write_g2o` writes; lines of other kinds are left out.
 
-    Raises FileNotFoundError, and ValueError naming the first line without the numbers that it needs.
+    Raises FileNotFoundError, and ValueError naming the first line without the numbers that it needs, or with a vertex
+    that stood there before.
     """
     path, graph = Path(path), Graph({}, [])
     if not path.is_file():
@@ -65,13 +66,16 @@ def read_g2o(path: Path | str) -> Graph:
         words, where = line.split(), f"{path}, line {i + 1}"
         if words and words[0] == VERTEX:
             values = numbers_of(words[1:], columns=8, where=where)
-            graph.poses[int(values[0])] = _pose(values[1:])
+            (frame,) = _frames(values[:1], where)
+            if frame in graph.poses:
+                raise ValueError(f"{where}: expected one vertex {frame}, found a second one")
+            graph.poses[frame] = _pose(values[1:], where)
         elif words and words[0] == EDGE:
             values = numbers_of(words[1:], columns=30, where=where)
             information = np.zeros((6, 6))
             information[UPPER] = values[9:]
             information = np.triu(information, 1).T + information
-            graph.edges.append((int(values[0]), int(values[1]), _pose(values[2:9]), information))
+            graph.edges.append((*_frames(values[:2], where), _pose(values[2:9], where), information))
     return graph
 
 
@@ -113,7 +117,8 @@ def read_loops_jsonl(path: Path | str) -> list[Loop]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
-    return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(path.read_text().splitlines())]
+    lines = path.read_bytes().splitlines()
+    return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(lines)]
 
 
 def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
@@ -128,16 +133,25 @@ def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
 
 
 def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "4 4"], float]]:
-    """Read query, match, match_from_query and probability of each line of a table that `write_loops_csv` wrote."""
+    """Read query, match, match_from_query and probability of each line of a table that `write_loops_csv` wrote.
+
+    Raises FileNotFoundError, and ValueError naming the first wrong line.
+    """
     path, found = Path(path), []
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table of loops, found no file")
-    lines = path.read_text().splitlines()
+    lines = path.read_text(errors="replace").splitlines()
     if not lines or tuple(lines[0].split(",")) != COLUMNS:
-        raise ValueError(f"{path}, line 1: expected {','.join(COLUMNS)}, found {lines[0] if lines else 'nothing'}")
+        raise ValueError(
+            f"{path}, line 1: expected {','.join(COLUMNS)}, found {lines[0][:200] if lines else 'nothing'}"
+        )
     for i, line in enumerate(lines[1:]):
-        values = numbers_of(line.split(",")[:10], columns=10, where=f"{path}, line {i + 2}")
-        found.append((int(values[0]), int(values[1]), _pose(values[2:9]), float(values[9])))
+        words, where = line.split(","), f"{path}, line {i + 2}"
+        words = words[:-1] if len(words) == len(COLUMNS) and not words[-1] else words  # of a loop without an overlap
+        values = numbers_of(words, columns=len(words) if len(words) in (10, 11) else 10, where=where)
+        query, match = _frames(values[:2], where)
+        _check_loop(query, match, values[9:].tolist(), where)
+        found.append((query, match, _pose(values[2:9], where), float(values[9])))
     return found
 
 
@@ -152,15 +166,30 @@ def _pose_rows(poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
     return [_numbers(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
 
 
-def _pose(values: Float[np.ndarray, " 7"]) -> Float[np.ndarray, "4 4"]:
-    return from_quaternions(values[None, :3], values[None, 3:])[0]
+def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
+    return from_quaternions(values[None, :3], _quaternions(values[None, 3:], where))[0]
 
 
-def _quaternions(values: Float[np.ndarray, "n 4"], path: Path) -> Float[np.ndarray, "n 4"]:
+def _quaternions(values: Float[np.ndarray, "n 4"], where: Path | str) -> Float[np.ndarray, "n 4"]:
     wrong = np.flatnonzero(np.abs(np.linalg.norm(values, axis=1) - 1) > 0.01)
     if wrong.size:
-        raise ValueError(f"{path}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
+        raise ValueError(f"{where}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
     return values
+
+
+def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
+    """Numbers of frames; ValueError where they are none."""
+    if (values < 0).any() or (values != np.round(values)).any():
+        raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
+    return tuple(int(value) for value in values)
+
+
+def _check_loop(query: int, match: int, shares: Sequence[float], where: str) -> None:
+    """Raise ValueError where the match is not the earlier frame, or probability or overlap is none."""
+    if not match < query:
+        raise ValueError(f"{where}: expected a match before the query, found {match} and {query}")
+    if not all(0 <= share <= 1 for share in shares):
+        raise ValueError(f"{where}: expected probability and overlap from 0 to 1, found {shares}")
 
 
 def _numbers(values: Float[np.ndarray, " n"]) -> str:
@@ -180,12 +209,29 @@ def _as_json(loop: Loop, ids: Sequence[str] | None) -> dict:
     }
 
 
-def _from_json(line: str, where: str) -> Loop:
+def _from_json(line: bytes, where: str) -> Loop:
+    value = parse_json(line, source=where)
     try:
-        value = json.loads(line)
-        pose, covariance = np.array(value["match_from_query"], float), np.array(value["covariance"], float)
-        if pose.shape != (4, 4) or covariance.shape != (6, 6):
-            raise ValueError(f"shapes {pose.shape} and {covariance.shape}")
-        return Loop(value["query"], value["match"], pose, covariance, value["probability"], value["overlap"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{where}: expected a loop as JSON, found another line ({error})") from error
+        frames = [value["query"], value["match"]]
+        shares = [share for share in (value["probability"], value["overlap"]) if share is not None]
+        if not (all(type(frame) is int and frame >= 0 for frame in frames) and value["probability"] is not None):
+            raise ValueError(f"frames {frames} and probability {value['probability']}")
+        if not all(type(share) in (int, float) for share in shares):
+            raise ValueError(f"probability and overlap {shares}")
+        pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
+        if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 0.01 or pose[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError(f"a pose that is none: {pose.tolist()}")
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ValueError(f"{where}: expected a loop as JSON, found another line ({in_short(error)})") from error
+    _check_loop(*frames, shares, where)
+    return Loop(*frames, pose, covariance, value["probability"], value["overlap"])
+
+
+def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:
+    """Rows of JSON as a matrix of finite numbers."""
+    if not all(type(number) in (int, float) for row in rows for number in row):
+        raise ValueError(f"others than numbers: {rows}")
+    matrix = np.array(rows, np.float64)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise ValueError(f"a matrix {matrix.shape}: {rows}")
+    return matrix

@@ -1,6 +1,7 @@
 """`describe` with its weights inside, as a program for runtimes that do not know this package: StableHLO and ONNX."""
 
 import dataclasses
+import hashlib
 import os
 import subprocess
 import sys
@@ -41,7 +42,8 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
     """Write `describe` as a program into `folder`, whole or not at all; one that is there is replaced.
 
     The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`, which says how
-    a scan becomes the program's input. Both take any number of images (b, h, w) in float32 and return (b, d).
+    a scan becomes the program's input, and the program's SHA-256. Both take any number of images (b, h, w) in float32
+    and return (b, d).
 
     `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; it needs the package flatbuffers. `onnx`
     needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; ValueError for a model
@@ -56,7 +58,8 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
         new.mkdir()
         (new / f"describe.{format}").write_bytes(program)
         write_json(new / CONFIG_FILE, dataclasses.asdict(params.config))
-        write_json(new / INPUT_FILE, input_description(params.config))
+        checksum = {"sha256": hashlib.sha256(program).hexdigest()}  # for whoever runs it: runtimes look at nothing
+        write_json(new / INPUT_FILE, input_description(params.config) | checksum)
     return folder
 
 

@@ -29,7 +29,7 @@ from sglpr_jax.training.loop import METRICS_FILE, ScoreFn, best_params, has_chec
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.mining import FOLDER as MINING
 from sglpr_jax.training.mining import Mining
-from sglpr_jax.training.run_folder import claim
+from sglpr_jax.training.run_folder import claimed
 from sglpr_jax.training.throughput import Throughput, throughput
 from sglpr_jax.training.training_recall import training_recall
 from sglpr_jax.training.validation import validation_score
@@ -114,13 +114,17 @@ def train(
     config = without_untrained_head(config)
     _require_usable(config, recordings, also, test)
     settings = _names(recordings, also, test) if settings is None else settings
-    with contextlib.closing(callback if callback is not None and is_first_host() else Callback()) as followed:
+    with contextlib.ExitStack() as opened:
+        followed = opened.enter_context(
+            contextlib.closing(callback if callback is not None and is_first_host() else Callback())
+        )
         pack = functools.partial(_packed, cache=cache, callback=followed, stopped=stopped)
         recordings, also = on_all_hosts(lambda: (pack(recordings), pack(also)))
         source, score = _source_and_score(recordings, also, config, folder)
         begun = resume and has_checkpoint(folder)
         start_from = None if weights is None or begun else _grafted(weights, config)
-        on_all_hosts(lambda: is_first_host() and claim(folder, config, settings, resume=resume))
+        claim = claimed(folder, config, settings, resume=resume)
+        on_all_hosts(lambda: is_first_host() and opened.enter_context(claim))
         state = run_steps(
             config,
             source,

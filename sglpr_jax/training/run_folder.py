@@ -1,35 +1,40 @@
 """A run's folder: begun once, with its settings and environment, and resumed with the same settings only."""
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sglpr_jax.files import read_json, remove_half_written, write_json
+from sglpr_jax.files import alone_in, read_json, remove_half_written, write_json
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.environment import note_environment
 
 CONFIG_FILE = "config.json"
 
 
-def claim(folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool) -> None:
-    """Write the configuration and further `settings` of a run into its folder; what a killed process left is removed.
+@contextlib.contextmanager
+def claimed(folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool) -> Iterator[None]:
+    """Be the only process that trains in a run's folder, for as long as the block lasts.
 
-    Raises FileExistsError where there is a run already and this one is not to `resume` it; otherwise as
-    `require_same_settings`.
+    The configuration and further `settings` are written into it; what a killed process left is removed. Raises
+    FileExistsError where there is a run already and this one is not to `resume` it, BlockingIOError where another
+    process trains there; otherwise as `require_same_settings`.
     """
     path = folder / CONFIG_FILE
-    if path.exists() and not resume:
-        raise FileExistsError(
-            f"{folder}: there is a run already; go on with it (--resume), or choose another folder (--out)"
-        )
     if resume:
         require_same_settings(folder, config, settings)
     folder.mkdir(parents=True, exist_ok=True)
-    remove_half_written(folder)
-    write_json(path, _as_json(config, settings))
-    note_environment(folder, seed=config.seed)
+    with alone_in(folder):
+        if path.exists() and not resume:
+            raise FileExistsError(
+                f"{folder}: there is a run already; go on with it (--resume), or choose another folder (--out)"
+            )
+        remove_half_written(folder)
+        write_json(path, _as_json(config, settings))
+        note_environment(folder, seed=config.seed)
+        yield
 
 
 def require_same_settings(folder: Path, config: TrainConfig, settings: Mapping[str, Any]) -> None:

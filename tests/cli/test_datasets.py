@@ -10,7 +10,11 @@ def test_all_drives_but_one_are_trained_on(town, capsys):
     recordings, test = leave_one_out(town, "08")
     assert [recording.name for recording in recordings] == ["00", "05"]
     assert test.name == "08"
-    assert capsys.readouterr().err == "training on 00, 05; testing on 08, never seen\n"
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "training on 00, 05; testing on 08, never seen"
+    assert [line.split(";")[:2] for line in said[1:]] == [
+        [f"{name}: 40 scans", " format: kitti (16 bytes a point)"] for name in ("00", "05", "08")
+    ]
 
 
 def test_the_training_drives_can_be_named(town):

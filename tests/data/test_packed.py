@@ -1,6 +1,7 @@
 """A packed recording equals that of the files, to the bit; a pack is whole or not there, and follows its source."""
 
 import dataclasses
+import json
 import os
 import shutil
 import threading
@@ -64,6 +65,28 @@ def test_a_drive_without_labels_has_none(recording, tmp_path):
     found = packed(plain, tmp_path / "cache")
     assert not found.has_labels and found.labels(0) is None
     assert not list((tmp_path / "cache").rglob("labels.bin"))
+
+
+def test_a_scan_whose_bytes_have_changed_is_refused_and_the_others_are_not(recording, tmp_path):
+    packed(recording, tmp_path / "cache")
+    (file,) = (tmp_path / "cache").rglob("points.bin")
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    found = packed(recording, tmp_path / "cache")
+    np.testing.assert_array_equal(found.points(0), recording.points(0))
+    with pytest.raises(ValueError, match=rf"^{file}: expected array 2 with the checksum .* packed anew"):
+        found.points(2)
+
+
+def test_a_pack_of_the_time_before_checksums_is_read(recording, tmp_path):
+    packed(recording, tmp_path / "cache")
+    (file,) = (tmp_path / "cache").rglob("pack.json")
+    about = json.loads(file.read_text())
+    for lies in about["arrays"].values():
+        assert len(lies.pop("checksums")) == 3
+    file.write_text(json.dumps(about))
+    require_same_scans(packed(recording, tmp_path / "cache"), recording)
 
 
 def test_images_are_those_of_the_files(bev_root, tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERATED = {ROOT / "docs" / "reference" / f"{name}.md" for name in ("api", "commands", "configuration")}
+GENERATED = {ROOT / "docs" / "reference" / f"{name}.md" for name in ("api", "commands", "configuration", "licences")}
 PAGES = [ROOT / "README.md", *sorted(set((ROOT / "docs").rglob("*.md")) - GENERATED)]
 
 

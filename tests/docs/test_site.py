@@ -69,7 +69,7 @@ def test_files_that_are_named_exist(page):
     """Links of the Markdown itself, as GitHub shows it, and paths of source files in the text."""
     text = page.read_text()
     links = [target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in target]
-    generated = ("api.md", "commands.md", "configuration.md")
+    generated = ("api.md", "commands.md", "configuration.md", "licences.md")
     lost = [link for link in links if link and not link.endswith(generated) and not (page.parent / link).exists()]
     paths = re.findall(r"`((?:\w+/)+[\w-]+\.py)`", text)
     lost += [path for path in paths if "NAME" not in path and not _is_source(path)]

@@ -25,12 +25,10 @@ from sglpr_jax.data.cache.stacked import Stacked, StackWriter, map_stacked, sync
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.record import ReadRecord, Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import half_written, read_json, replacing
+from sglpr_jax.files import ABANDONED_S, half_written, in_short, read_json, replacing
 
 FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
-ABANDONED_S = 3600
-"""A half-made pack to which nothing was added for so long is nobody's: its process was killed."""
 
 
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
@@ -50,7 +48,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
     target = folder / f"{recording.name}-{hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]}"
     if not target.is_dir():
         _make(target, recording, source, on_progress)
-    return dataclasses.replace(recording, read=_reader(recording, _open(target)), on_disk=False)
+    return dataclasses.replace(recording, read=_reader(recording, open_pack(target)), on_disk=False)
 
 
 def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
@@ -127,12 +125,13 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
     return {"points": record.points, "labels": labels}
 
 
-def _open(folder: Path) -> dict[str, Stacked]:
+def open_pack(folder: Path) -> dict[str, Stacked]:
+    """The arrays of a pack, by name. Raises ValueError, naming the folder, where it is damaged."""
     try:
         lie = read_json(folder / ABOUT_FILE)["arrays"]
         return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError) as error:
         raise ValueError(
-            f"{folder}: expected a packed recording, found a damaged one ({error}); once it is removed the recording "
-            "is packed anew"
+            f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); once it is "
+            "removed the recording is packed anew"
         ) from error

@@ -1,0 +1,176 @@
+"""Load: 100,000 scans in one embed; commands that are killed, run twice at once, or find the disk full or files gone.
+
+    python benchmarks/load.py scans --method network
+    python benchmarks/load.py kills
+    python benchmarks/load.py together
+    python benchmarks/load.py disk
+
+Each part prints a table and, with --out, keeps it as JSON; with --quick it takes few scans, commands and tries.
+"""
+
+import dataclasses
+import os
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from disturbed import TROUBLES, killed, together, troubled
+from many_scans import Watch, tiny_network, write_scans
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from writers import WRITERS, Writer, make_inputs
+
+import sglpr_jax
+from sglpr_jax.files import write_json
+from sglpr_jax.methods.registry import method_named
+
+QUICK = ("embed", "simulate images")
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """What all parts have."""
+
+    quick: bool = False
+    """Few of everything, to try it."""
+    out: Path | None = None
+    """A JSON file for the table."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OfCommands(Part):
+    """What is done to the commands that write."""
+
+    commands: tuple[str, ...] = ()
+    """Of `writers.WRITERS`. None: all."""
+    times: int = 20
+    """How often each is disturbed."""
+    seed: int = 0
+
+    def each(self) -> Iterator[tuple[Writer, Path, int]]:
+        """The commands chosen, the folder in which they work, and how often."""
+        names = self.commands or (QUICK if self.quick else tuple(WRITERS))
+        with tempfile.TemporaryDirectory() as folder:
+            make_inputs(Path(folder))
+            for name in track(names, console=Console(stderr=True), disable=not sys.stderr.isatty()):
+                yield WRITERS[name], Path(folder), 4 if self.quick else self.times
+
+
+@dataclasses.dataclass(frozen=True)
+class Scans(Part):
+    """Describe very many small scans in one go: seconds, and resident memory on the way."""
+
+    count: int = 100_000
+    points: int = 200
+    """Of each scan."""
+    method: str = "solid"
+    """A handcrafted method that takes points, or `network`: one of next to no arithmetic, with weights as drawn."""
+    moments: int = 10
+    """Rows of the table."""
+
+    def run(self) -> None:
+        count, seconds = 500 if self.quick else self.count, {}
+        with tempfile.TemporaryDirectory() as name:
+            scans, path = Path(name) / "scans", Path(name) / "all.npz"
+            _, seconds["write them"] = _timed(lambda: write_scans(scans, count=count, points=self.points))
+            recording, seconds["open"] = _timed(lambda: sglpr_jax.open_recording(scans))
+            method = tiny_network() if self.method == "network" else method_named(self.method, None, recording)
+            watch = Watch(count, self.moments)
+            file, seconds["embed"] = _timed(lambda: sglpr_jax.embed(method, recording, on_progress=watch))
+            _, seconds["save"] = _timed(lambda: file.save(path))
+            again, seconds["load"] = _timed(lambda: sglpr_jax.DescriptorFile.load(path))
+            assert len(again) == count
+        parts = ", ".join(f"{value:.1f} s to {name}" for name, value in seconds.items())
+        head = ("scans", "seconds", "scans a second", "MB resident", "MB of descriptors")
+        each = file.descriptors.nbytes / count / 1e6
+        rows = [(*row, row[0] * each) for row in watch.rows]
+        report(f"{count} scans of {self.points} points, {self.method}: {parts}", head, rows, self.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kills(OfCommands):
+    """Kill each command with signal 9 again and again; see what lies there, and how its next run ends."""
+
+    def run(self) -> None:
+        rows = []
+        for writer, folder, times in self.each():
+            whole, counts = killed(writer, folder, kills=times, seed=self.seed)
+            counted = [counts[what] for what in ("kills", "middle", "half", "fail", "other")]
+            rows.append((writer.name, whole.seconds, len(whole.files), *counted))
+        head = (
+            "command",
+            "seconds",
+            "files",
+            "kills",
+            "in the middle",
+            "half-written",
+            "next run fails",
+            "other bytes",
+        )
+        report("killed", head, rows, self.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class Together(OfCommands):
+    """Start each command twice at once on one folder."""
+
+    times: int = 5
+
+    def run(self) -> None:
+        rows = []
+        for writer, folder, times in self.each():
+            counts = together(writer, folder, times=times)
+            rows.append((writer.name, *(counts[what] for what in ("both", "refused", "failed", "other"))))
+        report("two at once", ("command", "both end well", "one is refused", "fail", "other bytes"), rows, self.out)
+
+
+@dataclasses.dataclass(frozen=True)
+class Disk(OfCommands):
+    """No room, no right to write, files that are read vanish or are half there: one line, and nothing half-written."""
+
+    times: int = 4
+
+    def run(self) -> None:
+        rows = []
+        for writer, folder, times in self.each():
+            found = troubled(writer, folder, times=1 if self.quick else times, seed=self.seed)
+            rows += [
+                (writer.name, name, *(found[name][what] for what in ("refused", "well", "bad", "half")))
+                for name in TROUBLES
+            ]
+        head = ("command", "trouble", "refused in one line", "ends well", "anything else", "half-written")
+        report("troubles", head, rows, self.out)
+
+
+def report(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], out: Path | None) -> None:
+    """Print a table and how it was made; keep it where a file is named."""
+    table = Table(*head, title=title)
+    for row in rows:
+        table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row))
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    command = shlex.join(["python", *sys.argv])
+    print(f"Command: {command}\n{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
+    if out is not None:
+        write_json(out, {"title": title, "command": command, "rows": [dict(zip(head, r, strict=True)) for r in rows]})
+
+
+def _timed(job: Callable[[], T]) -> tuple[T, float]:
+    start = time.perf_counter()
+    value = job()
+    return value, time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    tyro.cli(
+        Annotated[Scans, tyro.conf.subcommand("scans")]
+        | Annotated[Kills, tyro.conf.subcommand("kills")]
+        | Annotated[Together, tyro.conf.subcommand("together")]
+        | Annotated[Disk, tyro.conf.subcommand("disk")]
+    ).run()

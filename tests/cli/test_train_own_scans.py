@@ -1,0 +1,49 @@
+"""bin/train on scans of one's own: their format and mounting can be said, and bad ones left out."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from sglpr_jax.cli.train import SETTINGS, parse, settings
+
+from .conftest import assert_one_line_error
+
+
+def test_flags_that_older_runs_do_not_know_are_noted_only_where_they_are_set():
+    assert tuple(settings(parse([]))) == SETTINGS
+    said = settings(parse(["--sensor-height", "0.6", "--skip-bad", "--format", "float32x4"]))
+    assert {name: said[name] for name in said if name not in SETTINGS} == {
+        "format": "float32x4",
+        "sensor_height": 0.6,
+        "skip_bad": True,
+    }
+
+
+@pytest.fixture
+def damaged(town, tmp_path):
+    """The town with an empty scan in 00, and one of zeros in 08, which is tested."""
+    root = shutil.copytree(town, tmp_path / "town")
+    (root / "sequences/00/velodyne/000003.bin").write_bytes(b"")
+    scan = root / "sequences/08/velodyne/000005.bin"
+    scan.write_bytes(bytes(scan.stat().st_size))
+    return root
+
+
+@pytest.mark.slow
+def test_bad_scans_are_left_out_before_the_training(damaged, preset, command, tmp_path):
+    options = ("--seq", "08", "--data", damaged, "--preset", preset, "--method", "thumbnail")
+    ended = command("train", *options, "--out", tmp_path / "run", "--skip-bad", "--sensor-height", "1.73")
+    assert ended.status == 0, ended.error
+    assert "skipped 000003: " in ended.error and "skipped 000005: scan 000005 of sequence 08" in ended.error
+    assert "as said" in ended.error
+    assert json.loads((tmp_path / "run/config.json").read_text())["skip_bad"] is True
+    with np.load(tmp_path / "run/test/thumbnail-raw.npz") as file:
+        assert len(file["ids"]) == 39 and "000005" not in file["ids"]
+
+
+@pytest.mark.slow
+def test_without_that_a_bad_scan_is_one_line(damaged, preset, command, tmp_path):
+    options = ("--seq", "00", "--data", damaged, "--preset", preset, "--out", tmp_path / "run")
+    assert_one_line_error(command("train", *options, "--train-seq", "08"), "expected")
