@@ -94,6 +94,8 @@ def said_lines(content: bytes) -> Any:
     for value in values:
         assert type(value["query"]) is int and type(value["match"]) is int
         assert 0 <= value["match"] < value["query"] and 0 <= value["probability"] <= 1
+        for name in ("match_from_query", "covariance"):
+            value[name] = [[float(number) for number in row] for row in value[name]]
     names = ("query", "match", "match_from_query", "covariance", "probability", "overlap")
     return [[value[name] for name in names] for value in values]
 

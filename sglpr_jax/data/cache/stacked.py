@@ -36,7 +36,7 @@ class Stacked:
         array = self.rows[start:stop]
         if self.checksums is not None and self.checksums[i] != (found := _checksum(array)):
             raise ValueError(
-                f"{self.path}: expected array {i} with the checksum {self.checksums[i]}, as it was written, found"
+                f"{self.path}: expected array {i} with the checksum {self.checksums[i]}, as pack.json says, found"
                 f" {found}; once its folder is removed the recording is packed anew"
             )
         return array
@@ -93,8 +93,8 @@ def map_stacked(
     """
     if any(type(number) is not int for number in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
         raise ValueError(f"{path.name}: expected offsets that rise from 0, found {offsets!s:.60}")
-    if checksums is not None and len(checksums) != len(offsets) - 1:
-        raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {len(checksums)}")
+    if checksums is not None and [type(number) for number in checksums] != [int] * (len(offsets) - 1):
+        raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
     shape = (offsets[-1], *row)
     expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
     if expected != found:
