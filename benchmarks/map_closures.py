@@ -5,8 +5,8 @@
 MapClosures asks for another numpy, so it runs in an environment of its own, which is made on first use
 (benchmarks/peers/requirements.txt). It closes loops between local maps of 100 m of driving, ours between scans. A
 closure of maps is right where its pose, between the first scans of the maps, is: maps overlap beyond their scans. A
-loop of scans is right where they were taken within `LOOP_M`. Fewer than 10 scans a second (600 in a minute, the shortest drive) are too few for
-kiss-icp. The milliseconds of ours hold the compiling.
+loop of scans is right where they were taken within `LOOP_M`. Fewer than 10 scans a second (600 in a minute, the
+shortest drive) are too few for kiss-icp. The milliseconds of ours hold the compiling.
 """
 
 import dataclasses
