@@ -4,9 +4,9 @@
 
 MapClosures asks for another numpy, so it runs in an environment of its own, which is made on first use
 (benchmarks/peers/requirements.txt). It closes loops between local maps of 100 m of driving, ours between scans. A
-closure of maps is right where a scan of one was taken within `LOOP_M` of a scan of the other, and its pose is that
-between the first scans of the maps. Fewer than 10 scans a second (600 in a minute, the shortest drive) are too few for
-kiss-icp. The milliseconds of ours hold the compiling.
+closure of maps is right where its pose, between the first scans of the maps, is: maps overlap beyond their scans. A
+loop of scans is right where they were taken within `LOOP_M`. Fewer than 10 scans a second (600 in a minute, the
+shortest drive) are too few for kiss-icp. The milliseconds of ours hold the compiling.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from loops import LOOP_M, OTHER_M, REVISIT_M, SUCCESS_DEG, SUCCESS_M, revisits
 from rich.console import Console
 from rich.table import Table
@@ -39,8 +39,9 @@ HERE = Path(__file__).resolve().parent
 class Scored:
     """What is counted of one method on one drive."""
 
-    apart: Float[np.ndarray, " k"]
-    """Of each loop: metres between its places."""
+    right: Bool[np.ndarray, " k"]
+    wrong: Bool[np.ndarray, " k"]
+    """Of each loop; what is neither is not counted."""
     found: set[int]
     """The scans that have a right loop."""
     errors: Float[np.ndarray, "k 4 4"]
@@ -116,18 +117,20 @@ def run_peer(python: Path, drive: SimulatedRecording) -> dict:
 
 
 def score_maps(peer: dict, drive: SimulatedRecording) -> Scored:
-    """Closures of local maps: how near their scans come, and the pose between their first scans."""
+    """Closures of local maps: whether their poses are right; scans are found within `LOOP_M` of the other map's."""
     poses, maps = drive.poses.world_from_lidar, [range(*ends) for ends in peer["maps"]]
-    apart, found, errors = [], set(), []
+    right, found, errors = [], set(), []
     for closure in peer["closures"]:
         older, newer = sorted((maps[closure["source"]], maps[closure["target"]]), key=lambda scans: scans.start)
-        between = distances(poses[newer, :3, 3], poses[older, :3, 3])
-        apart.append(between.min())
-        found |= {newer[i] for i in np.flatnonzero(between.min(axis=1) <= LOOP_M)}
         source, target = (poses[maps[closure[name]].start] for name in ("source", "target"))
         errors.append(inverse(inverse(target) @ source) @ np.array(closure["target_from_source"]))
+        right.append(bool(succeeded(errors[-1][None])[0]))
+        if right[-1]:
+            between = distances(poses[newer, :3, 3], poses[older, :3, 3]).min(axis=1)
+            found |= {newer[i] for i in np.flatnonzero(between <= LOOP_M)}
     seconds = peer["seconds"]["maps and closures"] / len(drive)
-    return Scored(np.array(apart), found, np.array(errors).reshape(-1, 4, 4), seconds)
+    said = np.array(right, bool)
+    return Scored(said, ~said, found, np.array(errors).reshape(-1, 4, 4), seconds)
 
 
 def score(
@@ -144,7 +147,20 @@ def score(
         inverse(inverse(poses[match]) @ poses[query]) @ pose
         for (query, match), pose in zip(pairs, match_from_query, strict=True)
     ]
-    return Scored(apart, found, np.array(errors).reshape(-1, 4, 4), seconds / len(drive))
+    errors = np.array(errors).reshape(-1, 4, 4)
+    return Scored(apart <= LOOP_M, apart > OTHER_M, found, errors, seconds / len(drive))
+
+
+def succeeded(errors: Float[np.ndarray, "k 4 4"]) -> Bool[np.ndarray, " k"]:
+    """Which poses are within `SUCCESS_M` and `SUCCESS_DEG` in the plane."""
+    metres, degrees = in_plane(errors)
+    return (metres < SUCCESS_M) & (degrees < SUCCESS_DEG)
+
+
+def in_plane(errors: Float[np.ndarray, "k 4 4"]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """How far and by how many degrees poses are off."""
+    turned = np.degrees(np.arctan2(errors[:, 1, 0], errors[:, 0, 0]))
+    return np.linalg.norm(errors[:, :2, 3], axis=1), np.abs(turned)
 
 
 def print_table(title: str, rows: dict[str, Scored], drive: SimulatedRecording) -> None:
@@ -153,16 +169,15 @@ def print_table(title: str, rows: dict[str, Scored], drive: SimulatedRecording) 
     columns = ("", "loops", "precision", "recall", f"{SUCCESS_M:g} m, {SUCCESS_DEG:g}°", "m", "°", "ms a scan")
     table = Table(*columns, title=title)
     for name, one in rows.items():
-        counted = (one.apart <= LOOP_M) | (one.apart > OTHER_M)
-        precision = np.mean(one.apart[counted] <= LOOP_M) if counted.any() else np.nan
+        counted = one.right | one.wrong
+        precision = np.mean(one.right[counted]) if counted.any() else np.nan
         recall = np.mean([scan in one.found for scan in revisited]) if len(revisited) else np.nan
-        metres = np.linalg.norm(one.errors[:, :2, 3], axis=1)
-        degrees = np.abs(np.degrees(np.arctan2(one.errors[:, 1, 0], one.errors[:, 0, 0])))
-        good = (metres < SUCCESS_M) & (degrees < SUCCESS_DEG)
+        metres, degrees = in_plane(one.errors)
+        good = succeeded(one.errors)
         numbers = (precision, recall, good.mean() if len(good) else np.nan)
         medians = (np.median(metres), np.median(degrees)) if len(good) else (np.nan, np.nan)
         cells = [f"{value:.3f}" for value in (*numbers, *medians)]
-        table.add_row(name, str(len(one.apart)), *cells, f"{1e3 * one.seconds:.0f}")
+        table.add_row(name, str(len(one.right)), *cells, f"{1e3 * one.seconds:.0f}")
     Console().print(table)
 
 

@@ -350,12 +350,13 @@ def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
         "seconds": {"odometry": 1.0, "maps and closures": 8.0},
     }
     maps = closures.score_maps(peer, drive)
-    assert maps.apart.tolist() == [0, 5] and maps.found == set(range(60, 80)) | {58, 59}
+    assert maps.right.tolist() == [True, False] == (~maps.wrong).tolist() and maps.found == set(range(60, 80))
     assert np.linalg.norm(maps.errors[0, :3, 3]) < 1e-9 and np.linalg.norm(maps.errors[1, :3, 3]) > 100
     assert maps.seconds == 0.1
     pairs = [(70, 9), (75, 40)]
     scans = closures.score(pairs, [np.linalg.inv(poses[9]) @ poses[70], np.eye(4)], drive, 8.0)
-    assert scans.apart.tolist() == [0, 175] and scans.found == {70} and np.linalg.norm(scans.errors[0, :3, 3]) < 1e-9
+    assert scans.right.tolist() == [True, False] == (~scans.wrong).tolist() and scans.found == {70}
+    assert np.linalg.norm(scans.errors[0, :3, 3]) < 1e-9
     closures.print_table("a line", {"maps": maps, "scans": scans}, drive)
     table = capsys.readouterr().out
     assert "0.500" in table and "maps" in table
