@@ -16,8 +16,8 @@ class EmbedCommand:
 
     Examples:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
-      bin/embed --weights rings --data my_scans/ --out mine.npz --skip-bad
-      bin/embed --weights rings --data my_scans/ --poses odometry.tum --out mine.npz
+      bin/embed --data my_scans/ --out mine.npz --skip-bad
+      bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
     """
 
@@ -26,7 +26,8 @@ class EmbedCommand:
     out: Path
     """The descriptor file to write (.npz)."""
     weights: str | None = None
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors. None: those
+    of the name sglpr."""
     method: MethodName = "sglpr"
     """The network, or a handcrafted method, which needs no weights; some need points, ssc labels too."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()

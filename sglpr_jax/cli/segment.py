@@ -3,8 +3,10 @@
 import dataclasses
 from pathlib import Path
 
+import tyro
+
+from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
-from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 RESULT_FILE = "segmentation.json"
@@ -28,13 +30,7 @@ class SegmentCommand:
     """The folder to write to; made if need be."""
     weights: str = DEFAULT_WEIGHTS
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
-    seq: str | None = None
-    """Which sequence; may be left out where there is only one."""
-    format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     min_confidence: float = 0.0
     """Leave cells unlabelled, and out of the score, whose likeliest class has a smaller probability."""
 
@@ -43,14 +39,13 @@ def segment_recording(command: SegmentCommand) -> Path:
     """Do what the command says; returns the folder written."""
     import numpy as np  # these bring JAX and more, which --help does not need
 
-    from sglpr_jax.cli.datasets import open_recording
     from sglpr_jax.evaluation.segmentation import map_confusion
     from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
     from sglpr_jax.files import write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
 
-    recording = open_recording(command.data, command.seq, format=command.format, sensor_height=command.sensor_height)
+    recording = command.source.open(command.data)
     least = command.min_confidence
     if not 0 <= least <= 1:
         raise ValueError(f"--min-confidence is a probability: expected 0 to 1, found {least}")

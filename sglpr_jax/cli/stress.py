@@ -31,7 +31,8 @@ class StressCommand:
     out: Path
     """Folder for results.json, config.json, stress.png and the descriptors; made if need be."""
     weights: str | None = None
-    """The name of shipped weights or a training run's folder: the network is among the methods."""
+    """The name of shipped weights or a training run's folder: the network is among the methods. None: sglpr, where no
+    --method is named."""
     method: tuple[MethodName, ...] = ()
     """Methods that need no weights."""
     protocol: tuple[str, ...] = ()
