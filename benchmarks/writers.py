@@ -90,19 +90,19 @@ TRAINED = f"--seq 08 --data {TOWN} --preset ../{INPUTS}/preset.py --method solid
 WRITERS = {
     writer.name: writer
     for writer in (
-        Writer("embed", f"--weights simulated --data {TOWN} --seq 08 --out {OUT}/08.npz"),
+        Writer("embed", f"--weights rings --data {TOWN} --seq 08 --out {OUT}/08.npz"),
         Writer("evaluate", f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
         Writer("simulate", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
         Writer("simulate images", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
-        Writer("export", f"--weights simulated --out {OUT}/mine", refuses="does not exist yet"),
+        Writer("export", f"--weights rings --out {OUT}/mine", refuses="does not exist yet"),
         Writer(
             "export stablehlo",
-            f"--weights simulated --format stablehlo --out {OUT}/mine",
+            f"--weights rings --format stablehlo --out {OUT}/mine",
             refuses="does not exist yet",
         ),
         Writer("map", f"{TOWN} --seq 08 --poses {POSES} --pose-format kitti --out {OUT}/town.safetensors"),
         Writer("relocalize", f"{TOWN}/{SCANS}/000003.bin --map ../{INPUTS}/town.safetensors --out {OUT}/pose.json"),
-        Writer("loops", f"{TOWN} --seq 08 --poses {POSES} --pose-format kitti --out {OUT}/found"),
+        Writer("loops", f"{TOWN} --seq 08 --odometry {POSES} --odometry-format kitti --out {OUT}/found"),
         Writer("segment", f"--weights sglpr --data {TOWN} --seq 08 --out {OUT}/maps"),
         Writer(
             "stress", f"--method solid --data {TOWN} --seq 08 --out {OUT}/stress --corruption rotation occlusion-45"

@@ -75,7 +75,8 @@ def read_g2o(path: Path | str) -> Graph:
             information = np.zeros((6, 6))
             information[UPPER] = values[9:]
             information = np.triu(information, 1).T + information
-            graph.edges.append((*_frames(values[:2], where), _pose(values[2:9], where), information))
+            first, second = _frames(values[:2], where)
+            graph.edges.append((first, second, _pose(values[2:9], where), information))
     return graph
 
 
@@ -212,10 +213,12 @@ def _as_json(loop: Loop, ids: Sequence[str] | None) -> dict:
 def _from_json(line: bytes, where: str) -> Loop:
     value = parse_json(line, source=where)
     try:
-        frames = [value["query"], value["match"]]
+        query, match = value["query"], value["match"]
         shares = [share for share in (value["probability"], value["overlap"]) if share is not None]
-        if not (all(type(frame) is int and frame >= 0 for frame in frames) and value["probability"] is not None):
-            raise ValueError(f"frames {frames} and probability {value['probability']}")
+        if not (
+            all(type(frame) is int and frame >= 0 for frame in (query, match)) and value["probability"] is not None
+        ):
+            raise ValueError(f"frames {query}, {match} and probability {value['probability']}")
         if not all(type(share) in (int, float) for share in shares):
             raise ValueError(f"probability and overlap {shares}")
         pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
@@ -223,8 +226,8 @@ def _from_json(line: bytes, where: str) -> Loop:
             raise ValueError(f"a pose that is none: {pose.tolist()}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found another line ({in_short(error)})") from error
-    _check_loop(*frames, shares, where)
-    return Loop(*frames, pose, covariance, value["probability"], value["overlap"])
+    _check_loop(query, match, shares, where)
+    return Loop(query, match, pose, covariance, value["probability"], value["overlap"])
 
 
 def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:

@@ -137,10 +137,16 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(embed, town
     assert_one_line_error(embed(*options, out="out")[0], ".npz")
 
 
-def test_the_network_needs_weights(embed, town, tmp_path):
+def test_without_weights_the_network_has_those_of_the_package(embed, town):
     options = ("--data", town, "--seq", "08")
-    assert_one_line_error(embed(*options)[0], "--weights")
-    ended, _ = embed(*options, "--weights", tmp_path)
+    ended, found = embed(*options)
+    assert ended.status == 0, ended.error
+    _, named = embed(*options, "--weights", "sglpr", out="named.npz")
+    np.testing.assert_array_equal(load(found).descriptors, load(named).descriptors)
+
+
+def test_weights_that_are_not_there_are_named(embed, town, tmp_path):
+    ended, _ = embed("--data", town, "--seq", "08", "--weights", tmp_path)
     assert_one_line_error(ended, tmp_path, "config.json", "model.safetensors", "missing")
 
 

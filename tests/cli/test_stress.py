@@ -129,8 +129,7 @@ def test_wrong_names_are_refused_before_any_work(stress, rings, tmp_path):
         stress(*options, "--corruption", "beams-61")[0], "no corruption 'beams-61'", "mean 'beams-16'"
     )
     assert_one_line_error(stress(*options, "--protocol", "top1")[0], "no protocol 'top1'", "mean 'top1-f1max'")
-    assert_one_line_error(stress("--data", rings)[0], "--weights", "--method", "found neither")
-    assert_one_line_error(stress("--data", rings, "--method", "sglpr")[0], "--weights")
+    assert_one_line_error(stress("--data", rings, "--weights", "sglprr")[0], "sglprr: expected a folder")
     assert not (tmp_path / "out").exists()
 
 

@@ -52,7 +52,7 @@ def index() -> Index:
 
 def place_map() -> PlaceMap:
     images = np.arange(N * 16, dtype=np.uint8).reshape(N, 4, 4)
-    return PlaceMap(index(), images, POSES)
+    return PlaceMap(index(), images, POSES, np.tile([1.73, 0.0, 0.0, 1.0], (N, 1)))
 
 
 def change_header(content: bytes, draw: Random) -> Damaged:
