@@ -6,7 +6,7 @@ against the row v. Functions on clouds take any leading batch axes; a padded clo
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -138,24 +138,28 @@ def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order
 
 
 @jax.jit
-def even_cells(image: Num[Array, "*b h w"]) -> Num[Array, "*b h+h%2 w+w%2"]:
+def even_cells(image: Num[Array | np.ndarray, "*b h w"]) -> Num[Array | np.ndarray, "*b h+h%2 w+w%2"]:
     """A ready-made density image on the cells of eq. 1: its middle row and column become two of half the count.
 
     There they are as wide as two others, for the recipe truncates coordinates. Left as they are, they are a bright
     cross that points where the vehicle does, and the sensor is not at the middle of an even crop. Labels (integers)
-    are not halved. Images of an even number of cells stay as they are.
+    are not halved. Images of an even number of cells stay as they are. A numpy image stays one: an operation of JAX on
+    each image of a recording would wait for the network that describes the last batch.
     """
+    of_arrays: Any = np if isinstance(image, np.ndarray) else jnp
     counts = jnp.issubdtype(image.dtype, jnp.floating)
     for axis in (-2, -1):
         middle, odd = divmod(image.shape[axis], 2)
         if odd:
-            before, wide, after = jnp.split(image, (middle, middle + 1), axis=axis)
+            before, wide, after = of_arrays.split(image, (middle, middle + 1), axis=axis)
             half = wide / 2 if counts else wide
-            image = jnp.concatenate([before, half, half, after], axis=axis)
+            image = of_arrays.concatenate([before, half, half, after], axis=axis)
     return image
 
 
-def centre_crop(image: Shaped[Array, "*b h w"], *, height: int, width: int) -> Shaped[Array, "*b {height} {width}"]:
+def centre_crop(
+    image: Shaped[Array | np.ndarray, "*b h w"], *, height: int, width: int
+) -> Shaped[Array | np.ndarray, "*b {height} {width}"]:
     """The middle `height` x `width` cells of larger images; the odd cell of an uneven margin is cut at the far side."""
     if image.shape[-2] < height or image.shape[-1] < width:
         raise ValueError(f"a crop of {height} x {width} cells needs a larger image, found {image.shape[-2:]}")

@@ -54,7 +54,7 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
     The voxels' edge is the smallest of 0.10, 0.15, 0.20, ... m that leaves at most 6000 voxels. Points that are not
     finite are dropped. Pixel for pixel what the ready-made images of KITTI show.
     """
-    centroids = _voxel_centroids(points[_in_crop(points)])
+    centroids = _voxel_centroids(points.take(np.flatnonzero(_in_crop(points)), axis=0))
     counts = np.bincount(_cell_of_point(centroids), minlength=SIZE**2).clip(max=MAX_COUNT)
     return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(SIZE, SIZE)
 

@@ -32,8 +32,8 @@ _POINTS_STEP = 16384
 class View(NamedTuple):
     """What a model sees."""
 
-    image: Float[Array, "*b h w"]
-    classes: Int[Array, "*b h w"] | None = None
+    image: Float[Array | np.ndarray, "*b h w"]
+    classes: Int[Array | np.ndarray, "*b h w"] | None = None
     """The class of every cell, 0 where it is empty or not known; None where nobody asked."""
 
 
@@ -95,10 +95,9 @@ def image_view(
 ) -> View:
     """The view of whole images with their maps: on even cells, rotated by `angle`, cut to `grid` (None: left whole)."""
 
-    def see(whole: Any, rotate: Any) -> Array:
-        whole = jnp.asarray(whole)
+    def see(whole: Any, rotate: Any) -> Array | np.ndarray:
         whole = whole if grid is None else even_cells(whole)
-        whole = whole if angle is None else rotate(whole, angle)
+        whole = whole if angle is None else rotate(jnp.asarray(whole), angle)
         return whole if grid is None else centre_crop(whole, height=grid.height, width=grid.width)
 
     return View(see(image, rotate_image), None if classes is None else see(classes, rotate_labels))

@@ -1,7 +1,10 @@
 """From a recording to its descriptor file: by a model, or by any function of images or of points."""
 
 import functools
+import os
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import jax
@@ -25,6 +28,8 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 OnBadScan = Callable[[str, Exception], None]
 T = TypeVar("T")
+SCANS_AHEAD = 8
+"""So many scans are read before the first of them is needed."""
 
 
 def embed(
@@ -86,14 +91,16 @@ def embed_images(
     rows, views = [], []
     descriptors = _Descriptors()
 
-    def see(row: int) -> View:
-        record = recording.record(row, labels=bool(categories))
+    def read(row: int) -> tuple[int, Record]:
+        return row, recording.record(row, labels=bool(categories))
+
+    def see(row: int, record: Record) -> View:
         angle = None if angles is None else jnp.float32(angles[row])
         found = view(record, grid, image=image, categories=categories, angle=angle)
         _check_view(np.asarray(found.image), field, name=record.name)
         return found
 
-    for row, seen in _readable(recording, see, on_bad_scan):
+    for row, seen in _readable(recording, read, see, on_bad_scan):
         rows.append(row)
         views.append(seen)
         if len(views) == batch:
@@ -142,8 +149,12 @@ def embed_scans(
     """
     angles = _angles(len(recording), rotation_seed)
     rows, descriptors = [], []
-    read = functools.partial(_finite_points, recording, labels=labels)
-    for row, (points, classes) in _readable(recording, read, on_bad_scan):
+
+    def read(row: int) -> tuple[Record]:
+        return (recording.record(row, labels=labels),)
+
+    finite = functools.partial(_finite_points, labels=labels)
+    for row, (points, classes) in _readable(recording, read, finite, on_bad_scan):
         rows.append(row)
         descriptors.append(describe(points if angles is None else rotated(points, angles[row]), classes)[None])
         on_progress(row + 1)
@@ -161,7 +172,7 @@ def scan_image(
     """
     image = view(Record(points=points, mounting=mounting), config.grid, image=config.image).image
     _check_view(np.asarray(image), field_of_view(config)[0], name="the scan")
-    return image
+    return jnp.asarray(image)
 
 
 def _check_view(image: Float[np.ndarray, "h w"], field: Bool[np.ndarray, "h w"] | None, *, name: str) -> None:
@@ -192,15 +203,40 @@ def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
     return None if seed is None else np.random.default_rng(seed).uniform(0, 2 * np.pi, n)
 
 
-def _readable(recording: Recording, read: Callable[[int], T], on_bad_scan: OnBadScan | None) -> Iterator[tuple[int, T]]:
-    """Every readable scan's row and what `read` makes of it."""
-    for row in range(len(recording)):
-        try:
-            yield row, read(row)
-        except (ValueError, OSError) as error:
-            if on_bad_scan is None:
-                raise
-            on_bad_scan(recording.ids[row], error)
+def _readable(
+    recording: Recording,
+    read: Callable[[int], tuple],
+    then: Callable[..., T],
+    on_bad_scan: OnBadScan | None,
+) -> Iterator[tuple[int, T]]:
+    """Every readable scan's row and what `then` makes of what `read` gives, in order.
+
+    `read` is called here, for not every file can be read by two at once; `then`, a pure function, in other threads, a
+    few scans ahead.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        ahead: deque[tuple[int, Future[T]]] = deque()
+        for row in range(len(recording) + SCANS_AHEAD):
+            if row < len(recording):
+                ahead.append((row, _begun(threads, read, then, row)))
+            if row >= SCANS_AHEAD and ahead:
+                done, seen = ahead.popleft()
+                try:
+                    yield done, seen.result()
+                except (ValueError, OSError) as error:
+                    if on_bad_scan is None:
+                        raise
+                    on_bad_scan(recording.ids[done], error)
+
+
+def _begun(threads: ThreadPoolExecutor, read: Callable[[int], tuple], then: Callable[..., T], row: int) -> Future[T]:
+    """What will come of a row; where it cannot be read, the error that says so."""
+    try:
+        return threads.submit(then, *read(row))
+    except (ValueError, OSError) as error:
+        failed: Future[T] = Future()
+        failed.set_exception(error)
+        return failed
 
 
 def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], **about: Any) -> DescriptorFile:
@@ -219,10 +255,9 @@ def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], 
 
 
 def _finite_points(
-    recording: Recording, row: int, *, labels: bool
+    record: Record, *, labels: bool
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
     """The finite points of one scan and, with `labels`, their classes; ValueError where it shows no place."""
-    record = recording.record(row, labels=labels)
     assert record.points is not None
     check_cloud(record.points, name=record.name)
     finite = np.isfinite(record.points).all(axis=1)
