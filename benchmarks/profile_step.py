@@ -32,6 +32,8 @@ BACKWARD = "transpose("
 WITHOUT_TIME = ("call", "while", "conditional")
 """Operations whose time is that of those inside them."""
 REST = "images, losses, optimiser"
+WARM_UP = 4
+"""Steps before: the memory of the first ones comes from the system page by page."""
 EXECUTION = "ThunkExecutor::Execute"
 """How the profiler calls the run of a whole program."""
 OPERATION = re.compile(r"^\s*(?:ROOT )?%?(\S+) = .*? ([\w-]+)\(.*op_name=\"([^\"]*)\"", re.MULTILINE)
@@ -45,7 +47,7 @@ def main(
 
     Args:
         preset: files of configs/ by name, or paths.
-        steps: steps that are measured, after one that is not.
+        steps: steps that are measured, after four that are not.
         labels: whether the clouds have them; without them the segmentation head is not computed.
         depth: how many modules deep the network is taken apart.
     """
@@ -64,7 +66,8 @@ def profiled(
     """Milliseconds a step by part and direction, measured and at least, and those of a whole step."""
     state = new_state(config)
     program = train_step.lower(state, batch, config=config).compile()
-    state, _ = program(state, batch)
+    for _ in range(WARM_UP):
+        state, _ = program(state, batch)
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             for _ in range(steps):
