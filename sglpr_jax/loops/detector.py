@@ -70,8 +70,8 @@ class LoopDetector:
 
         `scan` is a record (with the sensor's mounting, where it has one), points (n, 3) in metres or an image (h, w) as
         `density_bev` makes them; `time` seconds; `odometry` the pose of the LiDAR in a frame that stays, drifting as it
-        may. Raises ValueError for values of
-        another shape, for times that go back, and where some frames have a time or odometry and others not.
+        may. Raises ValueError for values of another shape, for times that go back, and where some frames have a time or
+        odometry and others not.
         """
         return self.add_seen(self.finder.seen(_record(scan)), time=time, odometry=_pose(odometry))
 

@@ -22,6 +22,7 @@ from sglpr_jax.retrieval.index_rows import (
     checked_rows,
     nearest_of,
     new_places,
+    places_of,
 )
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
@@ -100,10 +101,7 @@ class FleetIndex:
 
     def add_file(self, file: DescriptorFile) -> None:
         """Add the places of a descriptor file. Raises ValueError where another model or method made it."""
-        if file.distance != self.distance:
-            raise ValueError(f"expected descriptors compared by {self.distance}, found {file.distance}")
-        about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
-        self.add(file.descriptors, ids=file.ids, **about)
+        self.add(**places_of(file, distance=self.distance))
 
     def query(
         self,

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+
 COLUMNS = ("descriptors", "times", "positions")
 
 
@@ -54,6 +56,17 @@ def new_places(
     if first and set(columns) != set(before):
         raise ValueError(f"expected places with {', '.join(before)}, as before, found {', '.join(columns)}")
     return NewPlaces(names, columns)
+
+
+def places_of(file: DescriptorFile, *, distance: str) -> dict[str, Any]:
+    """The places of a descriptor file, as `add` of an index takes them.
+
+    Raises ValueError for descriptors that are not compared by `distance`.
+    """
+    if file.distance != distance:
+        raise ValueError(f"expected descriptors compared by {distance}, found {file.distance}")
+    about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
+    return {"descriptors": file.descriptors, "ids": file.ids, **about}
 
 
 def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:

@@ -26,21 +26,10 @@ def resampled_means(found: Bool[np.ndarray, " q"], rng: np.random.Generator) -> 
 
 
 def f1_max_interval(
-    scores: Float[np.ndarray, " n"],
-    *,
-    true_if_accepted: Bool[np.ndarray, " n"],
-    false_if_accepted: Bool[np.ndarray, " n"],
-    missed_if_rejected: Bool[np.ndarray, " n"],
-    query: Int[np.ndarray, " n"],
-    seed: int,
+    scores: Float[np.ndarray, " n"], *, query: Int[np.ndarray, " n"], seed: int, **flags: Bool[np.ndarray, " n"]
 ) -> tuple[float, float]:
-    """Return the interval of F1max over the decisions of `metrics.decision_curve`, of which item i is `query[i]`'s."""
-    flags = {
-        "true_if_accepted": true_if_accepted,
-        "false_if_accepted": false_if_accepted,
-        "missed_if_rejected": missed_if_rejected,
-    }
-    return interval(resampled_f1_max(scores, **flags, query=query, seed=seed))
+    """Return the interval of F1max over the decisions whose `flags` `resampled_f1_max` names."""
+    return interval(resampled_f1_max(scores, query=query, seed=seed, **flags))
 
 
 def resampled_f1_max(
@@ -52,10 +41,11 @@ def resampled_f1_max(
     query: Int[np.ndarray, " n"],
     seed: int,
 ) -> Float[np.ndarray, " resamples"]:
-    """Return F1max in every resample; with one seed, two methods that answer the same queries meet the same resamples.
+    """Return F1max, over the decisions of `metrics.decision_curve`, in every resample; item i is `query[i]`'s.
 
-    All items of a query are drawn or left out together. Every resample has its own best threshold, sought among at most
-    256 scores of items that are right or could be missed: accepting any other cannot raise F1.
+    With one seed, two methods that answer the same queries meet the same resamples. All items of a query are drawn or
+    left out together. Every resample has its own best threshold, sought among at most 256 scores of items that are
+    right or could be missed: accepting any other cannot raise F1.
     """
     if not np.any(true_if_accepted & np.isfinite(scores)):
         return np.zeros(RESAMPLES)
