@@ -1,12 +1,14 @@
 """Positions and their distances: what "the same place" means in metres."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 POSITIVE_M = 3.0
 """Two scans no farther apart than this show the same place."""
 NEGATIVE_M = 20.0
 """Two scans farther apart than this show different places; in between nothing is claimed."""
+ROTATION_TOLERANCE = 0.01
+"""Of what files say with few digits."""
 
 
 def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n 3"]:
@@ -17,6 +19,13 @@ def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Floa
     """
     x, y, z = world_from_camera[:, :, 3].astype(np.float64).T
     return np.stack([z, -x, -y], axis=1)
+
+
+def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b"]:
+    """Whether each matrix R is a rotation: no entry of R R^T - I is .01 or more, and R is no mirror."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.abs(matrices @ matrices.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
+        return np.asarray((apart < ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))
 
 
 def distances(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:

@@ -10,7 +10,7 @@ import pytest
 
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.readers.kitti import read_trajectory
-from sglpr_jax.poses import POSITIVE_M, distances, positions_from_camera
+from sglpr_jax.poses import POSITIVE_M, are_rotations, distances, positions_from_camera
 from sglpr_jax.revisits import EXCLUDED_FRAMES, database_end, revisits
 
 coordinates = st.floats(-1e4, 1e4)
@@ -20,6 +20,15 @@ def test_camera_axes_become_forward_left_up():
     world_from_camera = np.zeros((1, 3, 4))
     world_from_camera[0, :, 3] = [1, 2, 3]  # right, down, forward
     np.testing.assert_array_equal(positions_from_camera(world_from_camera), [[3, -1, -2]])
+
+
+@hypothesis.settings(deadline=None, max_examples=25)
+@hypothesis.given(st.floats(-4, 4), st.sampled_from([0.0, 0.02, 1e300, np.inf, np.nan]))
+def test_rotations_are_told_from_what_is_none(angle, error):
+    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    mirror, damaged = turned * [1, 1, -1], turned + np.full((3, 3), error)
+    np.testing.assert_array_equal(are_rotations(np.stack([turned, mirror, damaged])), [True, False, error == 0])
+    assert are_rotations(turned)
 
 
 @hypothesis.settings(deadline=None, max_examples=25)

@@ -13,6 +13,7 @@ from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import VerificationConfig
 from sglpr_jax.models.params import Params
+from sglpr_jax.poses import are_rotations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,6 +149,6 @@ def _pose(odometry: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "4 4"]
         return None
     pose = np.asarray(odometry, np.float64)
     turned = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
-    if not np.isfinite(pose).all() or not np.allclose(turned @ turned.T, np.eye(3), atol=1e-3):
+    if not (np.isfinite(pose).all() and are_rotations(turned)):
         raise ValueError(f"expected odometry as a 4 x 4 pose with a rotation, found {pose.tolist()}")
     return pose

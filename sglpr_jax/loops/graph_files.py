@@ -17,6 +17,7 @@ from sglpr_jax.data.formats.pose_files import check_times, numbers_of, read_pose
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
+from sglpr_jax.poses import are_rotations
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 UPPER = np.triu_indices(6)
@@ -222,7 +223,7 @@ def _from_json(line: bytes, where: str) -> Loop:
         if not all(type(share) in (int, float) for share in shares):
             raise ValueError(f"probability and overlap {shares}")
         pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
-        if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > 0.01 or pose[3].tolist() != [0, 0, 0, 1]:
+        if not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
             raise ValueError(f"a pose that is none: {pose.tolist()}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found another line ({in_short(error)})") from error

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
+from sglpr_jax.poses import are_rotations
 
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """kitti, lidar: 12 numbers a line, in KITTI's camera axes or z up; tum: time, position, quaternion; g2o: vertices."""
@@ -24,7 +25,7 @@ def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float
     if not len(poses):
         raise ValueError(f"{path}: expected at least one pose, found none")
     turned = poses[:, :3, :3]
-    wrong = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 0.01
+    wrong = ~are_rotations(turned)
     if wrong.any():
         raise ValueError(f"{path}, pose {int(wrong.argmax())}: expected a rotation, found {turned[wrong][0].tolist()}")
     return poses

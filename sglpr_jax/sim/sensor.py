@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sglpr_jax.poses import are_rotations
 from sglpr_jax.sim.ground_cast import GroundView, ground_view, meet_ground
 from sglpr_jax.sim.raycast import COLUMNS, Candidates, Chance, find_candidates, nearest_hit, sector_count
 from sglpr_jax.sim.returns import Surface, echo_returns, mix_edges, nearer, reflectivity, surface_of_shapes
@@ -126,7 +127,7 @@ def view_of(
 ) -> View:
     """Choose what the sensor may meet from a pose; raises as `scan` does."""
     rotation = world_from_lidar[:3, :3]
-    if not (np.isfinite(world_from_lidar).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)):
+    if not (np.isfinite(world_from_lidar).all() and are_rotations(rotation)):
         raise ValueError(f"expected a pose of rotation and translation, found {world_from_lidar.tolist()}")
     if sensor.motion_distortion and velocity is None:
         raise ValueError("a sensor with motion_distortion needs the velocity of the sensor, found None")

@@ -56,6 +56,7 @@ FOUND = (
     ("configuration", _configuration(image="Density")),
     ("configuration", _configuration(blind_m=float("nan"))),
     ("configuration", Damaged(b"[" * 100_000)),
+    ("loops, JSON lines", _replaced("loops, JSON lines", b"0.98006", b"1e300")),
     ("weights", _checksum_without_its_name()),
     ("image", _picture_that_promises_more("image", 6000)),
     ("image", _picture_that_promises_more("image", 2**31 - 1)),

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-ROTATION_TOLERANCE = 0.01
-"""How far R R^T may be from the identity: pose files have few digits."""
+from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
+
 FARTHEST_M = 1e8
 LATEST_S = 1e11
 """Times beyond the year 5000 are milli-, micro- or nanoseconds."""
@@ -20,10 +20,7 @@ def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
     no rotation and translation.
     """
     poses = read_rows(path, columns=12).reshape(-1, 3, 4)
-    rotations = poses[:, :, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = np.flatnonzero(~(apart < ROTATION_TOLERANCE) | ~(np.linalg.det(rotations) > 0))
+    wrong = np.flatnonzero(~are_rotations(poses[:, :, :3]))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in poses[wrong[0]].ravel())
         raise ValueError(f"{path}: expected a rotation and a translation in row {wrong[0] + 1}, found {found}")
