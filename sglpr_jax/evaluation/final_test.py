@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import jax
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -14,9 +14,8 @@ from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.scoring import score
 from sglpr_jax.evaluation.semantic_score import SemanticScore, score_semantics
 from sglpr_jax.files import write_json
-from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import Method
-from sglpr_jax.methods.names import NETWORK
+from sglpr_jax.methods.names import BESIDE, NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.methods.registry import handcrafted, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
@@ -26,14 +25,6 @@ from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.embed import embed
 
 ROTATION_SEED = 0
-UNTRAINED, SHIPPED = "untrained", "shipped"
-"""This network with fresh weights, and the weights that describe where none are named."""
-BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
-"""The methods that stand beside the trained network, where none are named."""
-if TYPE_CHECKING:
-    BesideName = str
-else:
-    BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED)]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
