@@ -53,11 +53,10 @@ def demo(command: DemoCommand) -> Path:
         TrainCommand(seq=TESTED, data=town, preset=PRESET, weights=WEIGHTS, method=BESIDE, out=trained, config=config)
     )
     print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
-    source = PosedRecordingOptions(seq=TESTED)
-    descriptors = embed_recording(
-        EmbedCommand(data=town, source=source, weights=str(trained), out=command.out / f"{TESTED}.npz")
-    )
-    evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=str(trained)))
+    source, weights = PosedRecordingOptions(seq=TESTED), str(trained)
+    file = command.out / f"{TESTED}.npz"
+    embed_recording(EmbedCommand(data=town, source=source, weights=weights, out=file))
+    evaluate_file(EvaluateCommand(file, data=town, source=source, weights=weights))
     pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])
     print("pictures:", *pictures, sep="\n  ")
     print(f"all on one page: {command.out / TESTED / PAGE}")
