@@ -83,6 +83,13 @@ def test_the_way_from_a_file_to_its_descriptor_is_timed():
     assert all(f"{part} " in output for part in ("reading", "image", "network"))
 
 
+def test_the_start_of_commands_is_timed():
+    options = ("--commands", "embed", "--weights", "rings", "--repeats", 1)
+    rows = table(printed("start_up.py", *options))
+    assert [row[0] for row in rows] == ["embed --help", "embed one scan, rings"]
+    assert 0 < float(rows[0][3]) < float(rows[1][3])
+
+
 def test_index_is_timed_beside_others():
     output = printed("index.py", "--rows", "3000", "--width", "16", "--repeats", "2")
     assert "Index: " in output and "MB for 3,000 places" in output
