@@ -6,7 +6,6 @@ import random
 import shutil
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -58,14 +57,15 @@ def _seen(folder: Path) -> list[tuple[str, int]]:
     return sorted(found)
 
 
-def killed(writer: Writer, folder: Path, *, kills: int, seed: int) -> tuple[Whole, Counter[str]]:
+def killed(writer: Writer, folder: Path, *, kills: int, seed: int) -> tuple[Whole, dict[str, int]]:
     """Kill it so often, each time in a fresh folder, and let it run again.
 
     Every second kill comes at any time of the run, the others within 5 ms of any of the changes in its folder. Counts
-    `kills`, those in the `middle` of writing, files that are `half` there under their own names, next runs that `fail`,
-    and `other` bytes after them.
+    kills, those in the middle of writing, files that are half there under their own names, next runs that fail, and
+    other bytes after them.
     """
-    draw, whole, counts = random.Random(f"{seed} {writer.name}"), undisturbed(writer, folder), Counter[str]()
+    draw, whole = random.Random(f"{seed} {writer.name}"), undisturbed(writer, folder)
+    counts = dict.fromkeys(("kills", "in the middle", "half-written", "next run fails", "other bytes"), 0)
     for attempt in range(3 * kills):
         if counts["kills"] == kills:
             break
@@ -81,20 +81,21 @@ def killed(writer: Writer, folder: Path, *, kills: int, seed: int) -> tuple[Whol
             continue  # it was faster
         found = written(place)
         counts["kills"] += 1
-        counts["middle"] += bool(left_behind(place)) or 0 < len(found) < len(whole.files)
-        counts["half"] += _told(writer, "is not whole", differing(writer, found, whole.files))
+        counts["in the middle"] += bool(left_behind(place)) or 0 < len(found) < len(whole.files)
+        counts["half-written"] += _told(writer, "is not whole", differing(writer, found, whole.files))
         if not _finishes(writer, place):
-            counts["fail"] += 1
+            counts["next run fails"] += 1
         else:
-            counts["other"] += _told(writer, "is another one after the next run", _unlike(writer, place, whole))
+            counts["other bytes"] += _told(writer, "is another one after the next run", _unlike(writer, place, whole))
     return whole, counts
 
 
-def together(writer: Writer, folder: Path, *, times: int) -> Counter[str]:
-    """Start it twice at once, so often. Counts how often `both` ended well, one was `refused` in one line, one or both
-    `failed`, and `other` bytes.
+def together(writer: Writer, folder: Path, *, times: int) -> dict[str, int]:
+    """Start it twice at once, so often. Counts how often both ended well, one was refused in one line, one or both
+    failed, and other bytes.
     """
-    whole, counts = undisturbed(writer, folder), Counter[str]()
+    whole = undisturbed(writer, folder)
+    counts = dict.fromkeys(("both end well", "one is refused", "fail", "other bytes"), 0)
     for _ in range(times):
         place = _fresh(folder, writer)
         errors = (f"{ERRORS}-0", f"{ERRORS}-1")
@@ -102,28 +103,30 @@ def together(writer: Writer, folder: Path, *, times: int) -> Counter[str]:
         statuses = [ended(process) for process in processes]
         bad = [said(place, name) for name, status in zip(errors, statuses, strict=True) if status]
         refused = len(bad) == 1 and is_one_line(bad[0])
-        counts["both" if not bad else "refused" if refused else "failed"] += 1
+        counts["both end well" if not bad else "one is refused" if refused else "fail"] += 1
         for error in bad:
             print(f"{writer.name}: one of two ended with: {error[-2000:]}", file=sys.stderr)
-        counts["other"] += _told(writer, "is another one after two at once", _unlike(writer, place, whole))
+        counts["other bytes"] += _told(writer, "is another one after two at once", _unlike(writer, place, whole))
     return counts
 
 
-def troubled(writer: Writer, folder: Path, *, times: int, seed: int) -> dict[str, Counter[str]]:
-    """Let it run with each of `TROUBLES`, so often. Counts how often it was `refused` in one line, ended `well`, ended
-    in anything else (`bad`), and files that are `half` there under their own names, or others than in a good run.
+def troubled(writer: Writer, folder: Path, *, times: int, seed: int) -> dict[str, dict[str, int]]:
+    """Let it run with each of `TROUBLES`, so often. Counts how often it was refused in one line, ended well, ended in
+    anything else, and files that are half there under their own names, or others than in a good run.
     """
     draw, whole, found = random.Random(f"{seed} {writer.name}"), undisturbed(writer, folder), {}
     for name, trouble in TROUBLES.items():
-        counts = found[name] = Counter[str]()
+        counts = found[name] = dict.fromkeys(("refused in one line", "ends well", "anything else", "half-written"), 0)
         for _ in range(times):
             place = _fresh(folder, writer)
             status = trouble(writer, place, whole, draw)
-            kind = "well" if status == 0 else "refused" if status == 1 and is_one_line(said(place)) else "bad"
-            if kind == "bad":
+            refused = status == 1 and is_one_line(said(place))
+            kind = "ends well" if status == 0 else "refused in one line" if refused else "anything else"
+            if kind == "anything else":
                 print(f"{writer.name}, {name}: status {status}: {said(place)[-2000:]}", file=sys.stderr)
             counts[kind] += 1
-            counts["half"] += _told(writer, f"is not whole: {name}", differing(writer, written(place), whole.files))
+            unlike = differing(writer, written(place), whole.files)
+            counts["half-written"] += _told(writer, f"is not whole: {name}", unlike)
     return found
 
 

@@ -16,10 +16,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import tyro
-from disturbed import TROUBLES, killed, together, troubled
+from disturbed import killed, together, troubled
 from many_scans import Watch, tiny_network, write_scans
 from rich.console import Console
 from rich.progress import track
@@ -31,6 +31,8 @@ from sglpr_jax.files import write_json
 from sglpr_jax.methods.registry import method_named
 
 QUICK = ("embed", "simulate images")
+Row = dict[str, Any]
+"""What a column is called, and what stands in it."""
 T = TypeVar("T")
 
 
@@ -53,14 +55,20 @@ class OfCommands(Part):
     times: int = 20
     """How often each is disturbed."""
     seed: int = 0
+    title: ClassVar[str]
 
-    def each(self) -> Iterator[tuple[Writer, Path, int]]:
-        """The commands chosen, the folder in which they work, and how often."""
-        names = self.commands or (QUICK if self.quick else tuple(WRITERS))
+    def rows(self, writer: Writer, folder: Path, times: int) -> Iterator[Row]:
+        """Disturb a command so often; what came of it."""
+        raise NotImplementedError
+
+    def run(self) -> None:
+        names, rows = self.commands or (QUICK if self.quick else tuple(WRITERS)), []
         with tempfile.TemporaryDirectory() as folder:
             make_inputs(Path(folder))
             for name in track(names, console=Console(stderr=True), disable=not sys.stderr.isatty()):
-                yield WRITERS[name], Path(folder), 4 if self.quick else self.times
+                found = self.rows(WRITERS[name], Path(folder), 4 if self.quick else self.times)
+                rows += [{"command": name, **row} for row in found]
+        report(self.title, rows, self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,33 +96,20 @@ class Scans(Part):
             again, seconds["load"] = _timed(lambda: sglpr_jax.DescriptorFile.load(path))
             assert len(again) == count
         parts = ", ".join(f"{value:.1f} s to {name}" for name, value in seconds.items())
-        head = ("scans", "seconds", "scans a second", "MB resident", "MB of descriptors")
         each = file.descriptors.nbytes / count / 1e6
-        rows = [(*row, row[0] * each) for row in watch.rows]
-        report(f"{count} scans of {self.points} points, {self.method}: {parts}", head, rows, self.out)
+        rows = [{**row, "MB of descriptors": row["scans"] * each} for row in watch.rows]
+        report(f"{count} scans of {self.points} points, {self.method}: {parts}", rows, self.out)
 
 
 @dataclasses.dataclass(frozen=True)
 class Kills(OfCommands):
     """Kill each command with signal 9 again and again; see what lies there, and how its next run ends."""
 
-    def run(self) -> None:
-        rows = []
-        for writer, folder, times in self.each():
-            whole, counts = killed(writer, folder, kills=times, seed=self.seed)
-            counted = [counts[what] for what in ("kills", "middle", "half", "fail", "other")]
-            rows.append((writer.name, whole.seconds, len(whole.files), *counted))
-        head = (
-            "command",
-            "seconds",
-            "files",
-            "kills",
-            "in the middle",
-            "half-written",
-            "next run fails",
-            "other bytes",
-        )
-        report("killed", head, rows, self.out)
+    title = "killed"
+
+    def rows(self, writer: Writer, folder: Path, times: int) -> Iterator[Row]:
+        whole, counts = killed(writer, folder, kills=times, seed=self.seed)
+        yield {"seconds": whole.seconds, "files": len(whole.files), **counts}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,13 +117,10 @@ class Together(OfCommands):
     """Start each command twice at once on one folder."""
 
     times: int = 5
+    title = "two at once"
 
-    def run(self) -> None:
-        rows = []
-        for writer, folder, times in self.each():
-            counts = together(writer, folder, times=times)
-            rows.append((writer.name, *(counts[what] for what in ("both", "refused", "failed", "other"))))
-        report("two at once", ("command", "both end well", "one is refused", "fail", "other bytes"), rows, self.out)
+    def rows(self, writer: Writer, folder: Path, times: int) -> Iterator[Row]:
+        yield dict(together(writer, folder, times=times))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,29 +128,23 @@ class Disk(OfCommands):
     """No room, no right to write, files that are read vanish or are half there: one line, and nothing half-written."""
 
     times: int = 4
+    title = "troubles"
 
-    def run(self) -> None:
-        rows = []
-        for writer, folder, times in self.each():
-            found = troubled(writer, folder, times=1 if self.quick else times, seed=self.seed)
-            rows += [
-                (writer.name, name, *(found[name][what] for what in ("refused", "well", "bad", "half")))
-                for name in TROUBLES
-            ]
-        head = ("command", "trouble", "refused in one line", "ends well", "anything else", "half-written")
-        report("troubles", head, rows, self.out)
+    def rows(self, writer: Writer, folder: Path, times: int) -> Iterator[Row]:
+        for trouble, counts in troubled(writer, folder, times=1 if self.quick else times, seed=self.seed).items():
+            yield {"trouble": trouble, **counts}
 
 
-def report(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]], out: Path | None) -> None:
-    """Print a table and how it was made; keep it where a file is named."""
-    table = Table(*head, title=title)
+def report(title: str, rows: Sequence[Row], out: Path | None) -> None:
+    """Print a table, whose columns are the keys of its rows, and how it was made; keep it where a file is named."""
+    table = Table(*rows[0], title=title)
     for row in rows:
-        table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row))
+        table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values()))
     Console(width=None if sys.stdout.isatty() else 140).print(table)
     command = shlex.join(["python", *sys.argv])
     print(f"Command: {command}\n{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
     if out is not None:
-        write_json(out, {"title": title, "command": command, "rows": [dict(zip(head, r, strict=True)) for r in rows]})
+        write_json(out, {"title": title, "command": command, "rows": rows})
 
 
 def _timed(job: Callable[[], T]) -> tuple[T, float]:

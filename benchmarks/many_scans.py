@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import writers
+from tiny import MODEL
 
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
@@ -23,16 +23,18 @@ class Watch:
     """Told how many scans are done, notes time and memory at so many moments."""
 
     def __init__(self, count: int, moments: int):
-        self.rows: list[tuple[int, float, float, float]] = []
+        self.rows: list[dict[str, float]] = []
         """Scans done, seconds since the start, scans per second since the row before, MB resident."""
         self._every, self._start = count / moments, time.perf_counter()
 
     def __call__(self, done: int) -> None:
-        before, then = self.rows[-1][:2] if self.rows else (0, 0.0)
+        last = self.rows[-1] if self.rows else {"scans": 0, "seconds": 0.0}
+        before, then = last["scans"], last["seconds"]
         if done < (len(self.rows) + 1) * self._every or done == before:
             return
         now = time.perf_counter() - self._start
-        self.rows.append((done, now, (done - before) / (now - then), resident_mb()))
+        rate = (done - before) / (now - then)
+        self.rows.append({"scans": done, "seconds": now, "scans a second": rate, "MB resident": resident_mb()})
 
 
 def resident_mb() -> float:
@@ -55,7 +57,5 @@ def write_scans(folder: Path, *, count: int, points: int) -> None:
 
 
 def tiny_network() -> Params:
-    """The model of the writers' preset, as drawn."""
-    found = {"__name__": "preset"}
-    exec(writers.PRESET, found)
-    return init(jax.random.key(0), config=found["CONFIG"].model)
+    """The model of the tiny preset, as drawn."""
+    return init(jax.random.key(0), config=MODEL)

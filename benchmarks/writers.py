@@ -26,34 +26,8 @@ OUT = "out"
 """What a command writes goes in here, in the folder that it is started in; so its name is always the same."""
 ERRORS = "stderr"
 TIMEOUT_S = 900
-PRESET = """
-import dataclasses
-
-from sglpr_jax.bev import Grid
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
-from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.presets import model_preset
-from sglpr_jax.training.config import OptimizerConfig, TrainConfig
-
-MODEL = dataclasses.replace(
-    model_preset("tiny"),
-    grid=Grid(resolution_m=3.2, height=16, width=16),
-    backbone=SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1),
-    head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4),
-)
-CONFIG = TrainConfig(
-    model=MODEL,
-    sampling=TupleConfig(negatives=2, positive_m=16.0),
-    optimizer=OptimizerConfig(learning_rate=1e-3),
-    steps=8,
-    tuples=2,
-    max_points=512,
-    log_every=1,
-    score_every=2,
-)
-"""
-"""Of a model that is next to no arithmetic."""
+TINY = Path(__file__).with_name("tiny.py")
+"""The preset that trainings take."""
 DRIVE = "--azimuth-steps 60 --sensor vlp16"
 SCANS = "sequences/08/velodyne"
 TOWN = f"../{INPUTS}/town"
@@ -86,7 +60,7 @@ class Writer:
 
 
 RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/hard-negatives/*")
-TRAINED = f"--seq 08 --data {TOWN} --preset ../{INPUTS}/preset.py --method solid"
+TRAINED = f"--seq 08 --data {TOWN} --preset {TINY} --steps 8 --method solid"
 WRITERS = {
     writer.name: writer
     for writer in (
@@ -119,10 +93,9 @@ WRITERS = {
 
 
 def make_inputs(folder: Path) -> None:
-    """Write what the commands read: a town of two drives, a preset, a descriptor file and a map."""
+    """Write what the commands read: a town of two drives, a descriptor file and a map."""
     inputs = folder / INPUTS
     inputs.mkdir(parents=True)
-    (inputs / "preset.py").write_text(PRESET)
     for line in (
         f"simulate --out town {DRIVE} --seq 05 08 --scans 24 --rate-hz 1",
         "embed --method solid --data town --seq 08 --out 08.npz",

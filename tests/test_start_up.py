@@ -3,21 +3,36 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 SLOW = ("jax", "flax", "numpy", "jaxtyping")
-QUICK = ("embed", "evaluate", "export", "segment")
+QUICK = (
+    "convert",
+    "demo",
+    "embed",
+    "evaluate",
+    "export",
+    "loops",
+    "map",
+    "relocalize",
+    "segment",
+    "simulate",
+    "stress",
+)
 """Commands whose --help does not wait for JAX."""
 
 
-def imported_by(program: str) -> set[str]:
-    """Which of the slow packages a Python of its own has imported at the end of the program."""
-    program += f"\nimport sys; print('imported', *(name for name in {SLOW} if name in sys.modules))"
+def imported_by(program: str, *, of: tuple[str, ...] = SLOW) -> set[str]:
+    """Which of these modules a Python of its own has imported at the end of the program."""
+    program += f"\nimport sys; print('imported', *(name for name in {of} if name in sys.modules))"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return set(ended.stdout.splitlines()[-1].split()[1:])
 
 
-@pytest.mark.parametrize("module", ["sglpr_jax", "sglpr_jax.data", *(f"sglpr_jax.cli.{name}" for name in QUICK)])
+@pytest.mark.parametrize(
+    "module", ["sglpr_jax", "sglpr_jax.data", "sglpr_jax.sim", *(f"sglpr_jax.cli.{name}" for name in QUICK)]
+)
 def test_an_import_brings_nothing_slow(module):
     assert imported_by(f"import {module}") == set()
 
@@ -27,8 +42,19 @@ def test_a_name_of_the_library_brings_what_it_needs():
     assert "jax" in imported_by("import sglpr_jax; sglpr_jax.describe")
 
 
+def test_a_folder_of_scans_is_opened_without_scipy_and_without_the_simulator(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (500, 4)).astype("<f4") * [20, 20, 2, 1]
+    points.astype("<f4").tofile(tmp_path / "000000.bin")
+    program = f"""
+from pathlib import Path
+from sglpr_jax.cli.datasets import open_recording
+assert len(open_recording(Path({str(tmp_path)!r}), None, sensor_height=1.7)) == 1
+"""
+    assert imported_by(program, of=("scipy", "sglpr_jax.sim.simulation")) == set()
+
+
 @pytest.mark.parametrize("command", QUICK)
-@pytest.mark.parametrize("flags", ["'--help'", "'--no-such-flag'", ""])
+@pytest.mark.parametrize("flags", ["'--help'", "'--no-such-flag'"])
 def test_help_and_wrong_flags_do_not_wait_for_jax(command, flags):
     program = f"""
 import sys

@@ -4,16 +4,9 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-import jax
 import tyro
 
 from sglpr_jax.cli.runtime import parse_command, run
-from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.torch_import import import_swin_t, import_swin_unet
-from sglpr_jax.models.weights import by_name
-from sglpr_jax.models.weights_file import save
-from sglpr_jax.training.presets import load_preset
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +34,14 @@ class ConvertCommand:
 
 def convert(command: ConvertCommand) -> Path:
     """Do what the command says; returns the folder written. Raises FileExistsError where there is one."""
+    import jax  # these bring JAX and more, which --help does not need
+
+    from sglpr_jax.models.sglpr import init
+    from sglpr_jax.models.torch_import import import_swin_t, import_swin_unet
+    from sglpr_jax.models.weights import by_name
+    from sglpr_jax.models.weights_file import save
+    from sglpr_jax.training.presets import load_preset
+
     if command.out.exists():
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")
     fresh = init(jax.random.key(command.seed), config=load_preset(command.preset).model)
@@ -50,15 +51,15 @@ def convert(command: ConvertCommand) -> Path:
         params, unused = import_swin_unet(fresh, command.checkpoint), ()
         copied = tuple(name for name in by_name(params.weights) if not name.startswith("place_head/"))
     save(params, command.out)
-    print(f"{command.out}: {_share(params, copied)} of {command.checkpoint.name}, the rest fresh (seed {command.seed})")
+    share = _share({name: leaf.size for name, leaf in by_name(params.weights).items()}, copied)
+    print(f"{command.out}: {share} of {command.checkpoint.name}, the rest fresh (seed {command.seed})")
     if unused:
         print(f"without a place in {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")
     return command.out
 
 
-def _share(params: Params, copied: tuple[str, ...]) -> str:
-    """How many of the numbers were taken over, in words."""
-    sizes = {name: leaf.size for name, leaf in by_name(params.weights).items()}
+def _share(sizes: dict[str, int], copied: tuple[str, ...]) -> str:
+    """How many of the numbers were taken over, in words; `sizes` are those of all weights."""
     taken, whole = sum(sizes[name] for name in copied), sum(sizes.values())
     return f"{taken / 1e6:.1f} of {whole / 1e6:.1f} million numbers ({taken / whole:.0%})"
 

@@ -4,20 +4,23 @@ import contextlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sglpr_jax import sim
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
 from sglpr_jax.data import Recording, readers
 from sglpr_jax.data import leave_one_out as split
 from sglpr_jax.data.readable import readable
-from sglpr_jax.sim.simulation import Simulated, default_dataset, default_sessions
+
+if TYPE_CHECKING:
+    from sglpr_jax.sim import Simulated
 
 
 def dataset_root(data: Path | None) -> Path:
     """The dataset's folder; without one, the simulated recordings, made on first use and kept in the user's cache."""
     if data is not None:
         return data
+    from sglpr_jax.sim.simulation import default_dataset  # this brings the simulator, which real data does not need
+
     root, options = default_dataset(cache_folder())
     print(
         f"no dataset named: using the simulated recordings in {root} "
@@ -30,25 +33,29 @@ def dataset_root(data: Path | None) -> Path:
 
 def cached_sessions() -> Path:
     """The folder of the simulated sessions in NCLT's layout, made on first use and kept in the user's cache."""
+    from sglpr_jax.sim.simulation import default_sessions
+
     root, options = default_sessions(cache_folder())
     print(f"no sessions named: using the simulated ones in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
     simulate(root, **options)
     return root
 
 
-def simulate(root: Path, **options: Any) -> Simulated:
+def simulate(root: Path, **options: Any) -> "Simulated":
     """Do what `sim.simulate` does, with the size said beforehand and the progress shown."""
+    from sglpr_jax import sim
+
     with contextlib.ExitStack() as opened:
         bars = []
 
-        def start(dataset: Simulated) -> None:
+        def start(dataset: "Simulated") -> None:
             _announce(dataset)
             bars.append(opened.enter_context(progress_bar("simulate", dataset.scans * len(dataset.names))))
 
         return sim.simulate(root, **options, on_start=start, on_progress=lambda done: bars[0](done))
 
 
-def _announce(dataset: Simulated) -> None:
+def _announce(dataset: "Simulated") -> None:
     if dataset.missing:
         what = "images" if dataset.layout == "images" else "scans"
         print(

@@ -5,20 +5,17 @@ import shutil
 import sys
 from pathlib import Path
 
-from sglpr_jax.cli.datasets import simulate
 from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
 from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import own_names, parse_command, run
-from sglpr_jax.cli.train import TrainCommand, train_and_test
-from sglpr_jax.evaluation.final_test import SHIPPED, UNTRAINED
-from sglpr_jax.evaluation.page.writing import PAGE
+from sglpr_jax.methods.names import SHIPPED, UNTRAINED
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.training.presets import load_preset
 
 SCANS = 300
 AZIMUTH_STEPS = 450
 TESTED = "00"
+PRESET = "demo"
 WEIGHTS = DEFAULT_WEIGHTS
 BESIDE = (SHIPPED, UNTRAINED, "thumbnail", "polar-fft")
 
@@ -41,21 +38,25 @@ class DemoCommand:
 
 def demo(command: DemoCommand) -> Path:
     """Do what the command says; returns its folder."""
+    from sglpr_jax.cli.datasets import simulate  # these bring JAX and more, which --help does not need
+    from sglpr_jax.cli.train import TrainCommand, train_and_test
+    from sglpr_jax.evaluation.page.writing import PAGE
+    from sglpr_jax.training.presets import load_preset
+
     town, trained = command.out / "town", command.out / "run"
     simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)
     if trained.exists():
         shutil.rmtree(trained)
-    config = load_preset("demo")
+    config = load_preset(PRESET)
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
     train_and_test(
-        TrainCommand(seq=TESTED, data=town, preset="demo", weights=WEIGHTS, method=BESIDE, out=trained, config=config)
+        TrainCommand(seq=TESTED, data=town, preset=PRESET, weights=WEIGHTS, method=BESIDE, out=trained, config=config)
     )
     print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
-    source = PosedRecordingOptions(seq=TESTED)
-    descriptors = embed_recording(
-        EmbedCommand(data=town, source=source, weights=str(trained), out=command.out / f"{TESTED}.npz")
-    )
-    evaluate_file(EvaluateCommand(descriptors, data=town, seq=TESTED, weights=str(trained)))
+    source, weights = PosedRecordingOptions(seq=TESTED), str(trained)
+    file = command.out / f"{TESTED}.npz"
+    embed_recording(EmbedCommand(data=town, source=source, weights=weights, out=file))
+    evaluate_file(EvaluateCommand(file, data=town, source=source, weights=weights))
     pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])
     print("pictures:", *pictures, sep="\n  ")
     print(f"all on one page: {command.out / TESTED / PAGE}")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
-from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.choices import PoseFormat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,14 +50,9 @@ class EvaluateCommand:
     compare: tuple[Path, ...] = ()
     """Files of other methods on the same frames, to stand beside FILE."""
     data: Path | None = None
-    """A dataset with the frames as scans or images: the page then shows them."""
-    seq: str | None = None
-    """The sequence: which of --data, and the name of a FILE that has none of its own; published splits go by it."""
-    format: ScanFormat = "auto"
-    """What the scans of --data are, where their names do not tell."""
-    sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    """A dataset with the frames as scans or images: the page then shows them. --seq says which of its sequences, and
+    names a FILE that has no name of its own; published splits go by it."""
+    source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     weights: str | None = None
     """The name of shipped weights or a training run's folder: with --data the page then shows semantic maps and feature
     heat maps."""
@@ -83,7 +79,6 @@ def evaluate_file(command: EvaluateCommand) -> Path:
 
 def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     """Score, print and write; returns the paths written."""
-    from sglpr_jax.data import open_recording
     from sglpr_jax.data.formats.trajectory import read_trajectory
     from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.inputs.methods import read_methods
@@ -92,11 +87,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     from sglpr_jax.evaluation.scoring import evaluate_methods
     from sglpr_jax.models.weights_file import load
 
-    recording = (
-        None
-        if command.data is None
-        else open_recording(command.data, command.seq, format=command.format, sensor_height=command.sensor_height)
-    )
+    recording = None if command.data is None else command.source.open(command.data)
     params = None if command.weights is None else load(command.weights)
     poses = None
     if command.poses is not None:
@@ -105,7 +96,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
         (command.file, *command.compare),
         poses=poses,
         dataset=None if recording is None else poses_of(recording),
-        sequence=command.seq or (None if recording is None else recording.name),
+        sequence=command.source.seq or (None if recording is None else recording.name),
         distance=command.distance,
     )
     source = next(iter(methods.values()))
@@ -124,8 +115,8 @@ def _check_options(command: EvaluateCommand) -> None:
     from sglpr_jax.evaluation.protocols.choice import check_names
 
     if command.database is not None:
-        silent = ("poses", "times", "distance", "compare", "data", "seq", "weights")
-        given = [name for name in silent if getattr(command, name)]
+        silent = ("poses", "times", "distance", "compare", "data", "weights")
+        given = [name for name in silent if getattr(command, name)] + ["seq"] * bool(command.source.seq)
         if given:
             raise ValueError(f"expected descriptor files alone beside --database, found --{given[0]}")
         return

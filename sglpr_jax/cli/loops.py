@@ -9,14 +9,7 @@ import tyro
 
 from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
-from sglpr_jax.evaluation.page.of_loops import write_loops_page
-from sglpr_jax.loops.detector import DetectorConfig
-from sglpr_jax.loops.find import find_loops
-from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
-from sglpr_jax.loops.optimization import check_installed, optimize_trajectory
-from sglpr_jax.loops.unfinished import remove
-from sglpr_jax.models.weights_file import load
+from sglpr_jax.loops.choices import MIN_PROBABILITY, OdometryFormat
 
 UNFINISHED = "unfinished"
 """The folder, in that of the results, of a run that has not ended."""
@@ -53,7 +46,7 @@ class LoopsCommand:
     optimize: bool = False
     """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti; of thousands of frames a
     minute or two."""
-    min_probability: float = DetectorConfig().min_probability
+    min_probability: float = MIN_PROBABILITY
     """Of a loop."""
     skip_bad: bool = False
     """Report scans that cannot be read and go on without them."""
@@ -61,6 +54,17 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
+    from sglpr_jax.evaluation.page.of_loops import (
+        write_loops_page,  # these bring JAX and more, which --help does not need
+    )
+    from sglpr_jax.loops.detector import DetectorConfig
+    from sglpr_jax.loops.find import find_loops
+    from sglpr_jax.loops.folder import write_found
+    from sglpr_jax.loops.odometry import read_odometry
+    from sglpr_jax.loops.optimization import check_installed, optimize_trajectory
+    from sglpr_jax.loops.unfinished import remove
+    from sglpr_jax.models.weights_file import load
+
     if command.optimize and command.odometry is None:
         raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
     if command.optimize:

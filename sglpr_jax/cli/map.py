@@ -8,10 +8,7 @@ import tyro
 
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.loops.odometry import OdometryFormat, read_odometry
-from sglpr_jax.loops.places import SPACING_M, PlaceMap
-from sglpr_jax.models.weights import weights_hash
-from sglpr_jax.models.weights_file import load
+from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +39,11 @@ class MapCommand:
 
 def write_map(command: MapCommand) -> Path:
     """Do what the command says; returns the file written."""
+    from sglpr_jax.loops.odometry import read_odometry  # these bring JAX and more, which --help does not need
+    from sglpr_jax.loops.places import PlaceMap
+    from sglpr_jax.models.weights import weights_hash
+    from sglpr_jax.models.weights_file import load
+
     if command.out.suffix != ".safetensors":
         raise ValueError(f"expected --out to end in .safetensors, found {command.out}")
     params = load(command.weights)

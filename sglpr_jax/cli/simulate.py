@@ -3,10 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from sglpr_jax.cli.datasets import simulate
 from sglpr_jax.cli.runtime import parse_command, run
-from sglpr_jax.sim.drive import RATE_HZ
-from sglpr_jax.sim.simulation import SCANS
+from sglpr_jax.sim.choices import RATE_HZ, SCANS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +42,8 @@ class SimulateCommand:
 
 def write_simulation(command: SimulateCommand) -> Path:
     """Do what the command says; returns the dataset's folder."""
+    from sglpr_jax.cli.datasets import simulate  # this brings JAX and more, which --help does not need
+
     options = {field.name: getattr(command, field.name) for field in dataclasses.fields(command)}
     print(simulate(options.pop("out"), routes=options.pop("seq"), **options))
     return command.out

@@ -8,11 +8,7 @@ import tyro
 
 from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
-from sglpr_jax.data.corruption.corruptions import chosen_corruptions
-from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
 from sglpr_jax.methods.names import MethodName
-from sglpr_jax.methods.registry import methods_named
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +44,13 @@ class StressCommand:
 
 def run_stress_test(command: StressCommand) -> Path:
     """Do what the command says; returns the folder written."""
+    from sglpr_jax.data.corruption.corruptions import (
+        chosen_corruptions,  # these bring JAX and more, which --help does not need
+    )
+    from sglpr_jax.evaluation import figures
+    from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
+    from sglpr_jax.methods.registry import methods_named
+
     stress_protocols(command.protocol)  # what is wrong with these is said first
     chosen_corruptions(command.corruption)
     recording = command.source.open(command.data)

@@ -22,8 +22,9 @@ from sglpr_jax.cli.runtime import (
 from sglpr_jax.data import Recording
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.data.pseudo_labels import with_pseudo_labels
-from sglpr_jax.evaluation.final_test import BESIDE, BesideName, final_test
+from sglpr_jax.evaluation.final_test import final_test
 from sglpr_jax.evaluation.learning_curves import LearningCurves
+from sglpr_jax.methods.names import BESIDE, BesideName
 from sglpr_jax.training.callbacks import Callbacks
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.hosts import connected, is_first_host

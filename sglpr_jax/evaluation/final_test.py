@@ -3,9 +3,8 @@
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
-import jax
 from rich.console import Console, ConsoleOptions, RenderableType
 
 from sglpr_jax.data import Recording
@@ -14,26 +13,14 @@ from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.scoring import score
 from sglpr_jax.evaluation.semantic_score import SemanticScore, score_semantics
 from sglpr_jax.files import write_json
-from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import Method
-from sglpr_jax.methods.names import NETWORK
-from sglpr_jax.methods.registry import handcrafted, network
+from sglpr_jax.methods.names import BESIDE, NETWORK
+from sglpr_jax.methods.registry import method_beside, network
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-from sglpr_jax.models.weights_file import load
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.embed import embed
 
 ROTATION_SEED = 0
-UNTRAINED, SHIPPED = "untrained", "shipped"
-"""This network with fresh weights, and the weights that describe where none are named."""
-BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
-"""The methods that stand beside the trained network, where none are named."""
-if TYPE_CHECKING:
-    BesideName = str
-else:
-    BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED)]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -84,7 +71,7 @@ def final_test(
       print(final_test(result.params, recording, result.folder / "test"))
     """
     folder.mkdir(parents=True, exist_ok=True)
-    beside = {name: _method(name, params, recording, seed) for name in methods}
+    beside = {name: method_beside(params, name, recording, seed=seed) for name in methods}
     results = {}
     for title, rotation_seed in (("raw", None), ("rotated", ROTATION_SEED)):
         results[title] = _score({NETWORK: network(params), **beside}, recording, folder, title, rotation_seed, progress)
@@ -96,14 +83,6 @@ def final_test(
     found = FinalTest(recording.name, results, semantics)
     write_json(folder / "results.json", found.to_json())
     return found
-
-
-def _method(name: str, params: Params, recording: Recording, seed: int) -> Method:
-    if name == UNTRAINED:
-        return network(init(jax.random.key(seed + 1), config=params.config))
-    if name == SHIPPED:
-        return network(load(DEFAULT_WEIGHTS))
-    return handcrafted(name, recording, params.config.grid)
 
 
 def _score(

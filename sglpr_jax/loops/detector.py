@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen
+from sglpr_jax.loops.choices import MIN_PROBABILITY
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
@@ -20,7 +21,7 @@ from sglpr_jax.poses import are_rotations
 class DetectorConfig:
     """When a pair of scans is called a loop."""
 
-    min_probability: float = 0.99
+    min_probability: float = MIN_PROBABILITY
     """Of a loop that is returned."""
     min_neighbour_probability: float = 0.5
     """Of those beside it that speak for it."""

@@ -1,16 +1,13 @@
 """Odometry from files: a pose of the LiDAR for each scan, position and rotation, in a frame that stays."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.loops.choices import OdometryFormat
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
 from sglpr_jax.poses import are_rotations
-
-OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
-"""kitti, lidar: 12 numbers a line, in KITTI's camera axes or z up; tum: time, position, quaternion; g2o: vertices."""
 
 
 def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float[np.ndarray, "n 4 4"]:

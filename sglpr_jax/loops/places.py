@@ -14,6 +14,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.verification import VerificationConfig, align_all
@@ -21,9 +22,6 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.poses import NEGATIVE_M
 from sglpr_jax.retrieval.index import Index
 
-SPACING_M = 1.0
-"""Scans nearer than this to the last place of their own drive are left out of a map."""
-CANDIDATES = 5
 ARRAYS = ("images", "world_from_place", "mountings")
 """What a map's file holds beside the index."""
 

@@ -16,9 +16,14 @@ HANDCRAFTED_NAMES = (
 )
 METHODS = (NETWORK, *HANDCRAFTED_NAMES)
 """The names of all methods."""
+UNTRAINED, SHIPPED = "untrained", "shipped"
+"""Beside a network just trained: the same with fresh weights, and the weights that describe where none are named."""
+BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
+"""The methods that stand beside a network just trained, where none are named."""
 
 if TYPE_CHECKING:
-    MethodName = str
+    MethodName = BesideName = str
 else:
     MethodName = Literal[METHODS]
-"""One of `METHODS`: a command line lists them in its help and refuses others."""
+    BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED_NAMES)]
+"""One of these names: a command line lists them in its help and refuses others."""

@@ -4,17 +4,18 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 
 from sglpr_jax.bev import Grid
 from sglpr_jax.data import Recording
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
-from sglpr_jax.methods.names import NETWORK
+from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
@@ -31,6 +32,18 @@ def methods_named(names: Sequence[str], weights: str | None, recording: Recordin
     """Return these methods by name; before them the network, where weights or nothing at all are named."""
     described_first = [NETWORK] if weights is not None or not names else []
     return {name: method_named(name, weights, recording) for name in dict.fromkeys([*described_first, *names])}
+
+
+def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:
+    """Return a method to stand beside a network just trained, of `BesideName`: on images it has the same window.
+
+    `untrained` is the same network with fresh weights made from `seed`, `shipped` the `DEFAULT_WEIGHTS`.
+    """
+    if name == UNTRAINED:
+        return network(init(jax.random.key(seed + 1), config=trained.config))
+    if name == SHIPPED:
+        return network(load(DEFAULT_WEIGHTS))
+    return handcrafted(name, recording, trained.config.grid)
 
 
 def network(params: Params) -> ImageMethod:

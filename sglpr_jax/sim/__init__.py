@@ -1,12 +1,46 @@
 """A simulator of drives through a town: LiDAR scans with poses and semantic labels, free of anybody's licence."""
 
-from sglpr_jax.sim.dataset import write_dataset, write_sessions
-from sglpr_jax.sim.drive import PlanarPath, TimedPoses, plan_scan_path, poses_on, read_path
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
-from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
-from sglpr_jax.sim.sessions import Session, plan_sessions
-from sglpr_jax.sim.simulation import Simulated, simulate
-from sglpr_jax.sim.world import World, build_world
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sglpr_jax.sim.dataset import write_dataset, write_sessions
+    from sglpr_jax.sim.drive import PlanarPath, TimedPoses, plan_scan_path, poses_on, read_path
+    from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
+    from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
+    from sglpr_jax.sim.sessions import Session, plan_sessions
+    from sglpr_jax.sim.simulation import Simulated, simulate
+    from sglpr_jax.sim.world import World, build_world
+
+_HOME_OF = {
+    "SENSORS": "sensor",
+    "PlanarPath": "drive",
+    "Sensor": "sensor",
+    "Session": "sessions",
+    "Simulated": "simulation",
+    "SimulatedRecording": "recording",
+    "TimedPoses": "drive",
+    "World": "world",
+    "build_world": "world",
+    "plan_scan_path": "drive",
+    "plan_sessions": "sessions",
+    "poses_on": "drive",
+    "read_path": "drive",
+    "scan": "sensor",
+    "simulate": "simulation",
+    "simulate_recording": "recording",
+    "write_dataset": "dataset",
+    "write_sessions": "dataset",
+}
+"""Where each name is defined, to be imported when it is first asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    return globals()[name]
+
 
 __all__ = [
     "SENSORS",

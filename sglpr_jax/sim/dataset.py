@@ -9,7 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from sglpr_jax.files import read_json, replacing
-from sglpr_jax.sim.drive import RATE_HZ, name_of_path, read_path, thinned
+from sglpr_jax.sim.choices import RATE_HZ
+from sglpr_jax.sim.drive import name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.routes import ROLES

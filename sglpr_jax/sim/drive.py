@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.poses import positions_from_camera
+from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.routes import ROLES, STEP_M, plan_route, travelled
 
-RATE_HZ = 4.0
-"""Scans per second, so that at a car's speed they lie some 2 m apart; KITTI's car took 10."""
 PATH_HZ = 10.0
 """Poses per second, roughly, of the path between scans."""
 SHORTEST_S = 60.0

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import (
-    RATE_HZ,
     PlanarPath,
     TimedPoses,
     body_tilt,

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from sglpr_jax.sim.drive import RATE_HZ, PlanarPath, drive_seed, plan_path
+from sglpr_jax.sim.choices import RATE_HZ
+from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.layouts import to_utime
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
 from sglpr_jax.sim.sensor import SENSORS, Sensor

@@ -4,15 +4,15 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from sglpr_jax.sim.choices import RATE_HZ, SCANS
 from sglpr_jax.sim.dataset import VERSION, write_dataset, write_sessions
-from sglpr_jax.sim.drive import RATE_HZ, name_of_path
+from sglpr_jax.sim.drive import name_of_path
 from sglpr_jax.sim.layouts import LAYOUTS
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 
 ROUTES = ("00", "05", "08")
 """The routes that are driven where none is named."""
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
-SCANS = 300
 AZIMUTH_STEPS = 900
 """Firings per turn of the datasets that stand in for real ones."""
 BYTES_PER_RAY = {"scans": 16, "nclt": 5}

@@ -17,33 +17,7 @@ from sglpr_jax.sim import Sensor, write_dataset
 
 SCANS = 40
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
-PRESET = """
-import dataclasses
-
-from sglpr_jax.bev import Grid
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
-from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.presets import model_preset
-from sglpr_jax.training.config import OptimizerConfig, TrainConfig
-
-MODEL = dataclasses.replace(
-    model_preset("tiny"),
-    grid=Grid(resolution_m=3.2, height=16, width=16),
-    backbone=SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.1),
-    head=HeadConfig(channels=(16,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4),
-)
-CONFIG = TrainConfig(
-    model=MODEL,
-    sampling=TupleConfig(negatives=2, positive_m=16.0),
-    optimizer=OptimizerConfig(learning_rate=1e-3),
-    steps=4,
-    tuples=2,
-    max_points=512,
-    log_every=1,
-    score_every=2,
-)
-"""
+TINY = Path(__file__).resolve().parents[2] / "benchmarks" / "tiny.py"
 
 
 class Ended(NamedTuple):
@@ -127,11 +101,9 @@ def write_images(root: Path, *, labels: bool = False) -> None:
 
 
 @pytest.fixture(scope="session")
-def preset(tmp_path_factory) -> Path:
-    """A preset of one's own: a model of next to no arithmetic, four steps."""
-    path = tmp_path_factory.mktemp("presets") / "tiny.py"
-    path.write_text(PRESET)
-    return path
+def preset() -> Path:
+    """A preset that is no file of configs/: a model of next to no arithmetic, four steps."""
+    return TINY
 
 
 class Trained(NamedTuple):

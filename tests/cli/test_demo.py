@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from sglpr_jax.cli import demo
+from sglpr_jax.cli import datasets, demo
 from sglpr_jax.training.presets import load_preset
 
 
@@ -18,9 +18,9 @@ def tiny_demo(monkeypatch, town, preset):
         if not root.exists():
             root.symlink_to(town)
 
-    monkeypatch.setattr(demo, "simulate", simulate)
+    monkeypatch.setattr(datasets, "simulate", simulate)
     monkeypatch.setattr(demo, "WEIGHTS", None)  # the tests' model is another one
-    monkeypatch.setattr(demo, "load_preset", lambda name: load_preset({"demo": str(preset)}[name]))
+    monkeypatch.setattr(demo, "PRESET", str(preset))
     return asked
 
 

@@ -5,9 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from sglpr_jax.cli import loops as command_file
 from sglpr_jax.data import open_recording
-from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops import find
 from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, read_tum, write_kitti, write_tum
 from sglpr_jax.models.weights_file import load
 
@@ -53,6 +52,8 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
 
 @pytest.mark.slow
 def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, town, tmp_path, monkeypatch):
+    find_loops = find.find_loops
+
     def stopped(recording, params, *, should_stop, on_progress, **options):
         done = []
         return find_loops(
@@ -67,7 +68,7 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
         should_stop.signal = 2
         return True
 
-    monkeypatch.setattr(command_file, "find_loops", stopped)
+    monkeypatch.setattr(find, "find_loops", stopped)
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == 130
     assert ended.out.startswith("0 loops in 5 of 40 frames of 08")

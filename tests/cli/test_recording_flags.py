@@ -6,9 +6,11 @@ import pytest
 import tyro
 
 from sglpr_jax.cli.embed import EmbedCommand
+from sglpr_jax.cli.evaluate import EvaluateCommand
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.map import MapCommand
 from sglpr_jax.cli.recording import PosedRecordingOptions, RecordingOptions
+from sglpr_jax.cli.segment import SegmentCommand
 from sglpr_jax.cli.stress import StressCommand
 
 POSED = {
@@ -16,7 +18,11 @@ POSED = {
     StressCommand: ("--data", "scans", "--out", "a"),
     LoopsCommand: ("scans", "--out", "a"),
 }
-MAP = ("scans", "--out", "a.safetensors", "--poses", "poses.tum")
+UNPOSED = {
+    MapCommand: ("scans", "--out", "a.safetensors", "--poses", "poses.tum"),
+    EvaluateCommand: ("08.npz", "--poses", "poses.tum"),
+    SegmentCommand: ("--data", "scans", "--out", "a"),
+}
 
 
 @pytest.mark.parametrize("command", POSED, ids=lambda command: command.__name__)
@@ -28,9 +34,13 @@ def test_commands_share_the_flags_of_a_recording_and_its_poses(command):
     assert found == PosedRecordingOptions("07", "kitti", "nclt", 2.5, Path("p.csv"), "csv", Path("t.txt"))
 
 
-def test_a_maps_poses_are_its_own():
-    found = tyro.cli(MapCommand, args=(*MAP, "--seq", "08", "--sensor-height", "estimate"))
-    assert found.source == RecordingOptions("08", sensor_height="estimate") and found.poses == Path("poses.tum")
+@pytest.mark.parametrize("command", UNPOSED, ids=lambda command: command.__name__)
+def test_commands_with_poses_of_their_own_or_none_share_the_other_flags(command):
+    assert tyro.cli(command, args=UNPOSED[command]).source == RecordingOptions()
+    flags = ("--seq", "07", "--pose-source", "kitti", "--format", "nclt", "--sensor-height", "estimate")
+    found = tyro.cli(command, args=(*UNPOSED[command], *flags))
+    assert found.source == RecordingOptions("07", "kitti", "nclt", "estimate")
+    assert getattr(found, "poses", None) == (Path("poses.tum") if "--poses" in UNPOSED[command] else None)
 
 
 def test_the_recording_is_opened_as_they_say_and_described(town, capsys):

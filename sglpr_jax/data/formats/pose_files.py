@@ -46,6 +46,14 @@ def check_quaternions(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> None
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")
 
 
+def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
+    """Return the rotations that qx qy qz qw stand for; ValueError naming the first row of `path` with none."""
+    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+
+    check_quaternions(path, quaternions)
+    return Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
+
+
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
     """Return the times (n,) in seconds of a file with one number a line.
 

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from sglpr_jax.data.choices import PoseFormat
 from sglpr_jax.data.formats.pose_files import (
@@ -105,6 +104,8 @@ def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path
 
 def _nearest(positions: Float[np.ndarray, "n 3"]) -> float:
     """How far the nearest other pose is, in the middle of all."""
+    from scipy.spatial import KDTree  # takes longer than all else that opens a folder of scans
+
     return float(np.median(KDTree(positions).query(positions, k=2)[0][:, 1]))
 
 

@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows
-from sglpr_jax.data.formats.pose_files import check_quaternions
+from sglpr_jax.data.formats.pose_files import rotations_of
 from sglpr_jax.data.formats.scan_files import scan_id
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
@@ -86,12 +85,14 @@ def _scenes(tables: Path) -> dict[str, str]:
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
     """Where the LiDAR was: its place on the car, by the pose of the car."""
-    world_from_car = _poses(tables / "ego_pose.json", rows, "ego_pose_token")
-    car_from_lidar = _poses(tables / "calibrated_sensor.json", rows, "calibrated_sensor_token")
-    return world_from_car[0].apply(car_from_lidar[1]) + world_from_car[1]
+    world_from_car, cars = _poses(tables / "ego_pose.json", rows, "ego_pose_token")
+    _, lidars_in_car = _poses(tables / "calibrated_sensor.json", rows, "calibrated_sensor_token")
+    return (world_from_car @ lidars_in_car[:, :, None])[:, :, 0] + cars
 
 
-def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> tuple[Rotation, Float[np.ndarray, "n 3"]]:
+def _poses(
+    path: Path, rows: Sequence[dict[str, Any]], column: str
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """The rotations and translations in a table that a column of `rows` refers to."""
     tokens = column_of(path.with_name("sample_data.json"), rows, column)
     found = {row["token"]: row for row in table_rows(path, "token", set(tokens))}
@@ -100,8 +101,7 @@ def _poses(path: Path, rows: Sequence[dict[str, Any]], column: str) -> tuple[Rot
         raise ValueError(f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} such rows)")
     named = [found[token] for token in tokens]
     quaternions = numbers_of(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
-    check_quaternions(path, quaternions)
-    return Rotation.from_quat(quaternions), numbers_of(path, named, "translation", 3)
+    return rotations_of(path, quaternions), numbers_of(path, named, "translation", 3)
 
 
 READER = Reader(

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.arrays import read_npy
-from sglpr_jax.data.formats.pose_files import check_positions, check_quaternions, check_times, rows_of
+from sglpr_jax.data.formats.pose_files import check_positions, check_times, rotations_of, rows_of
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import Record
@@ -55,7 +54,7 @@ def open_recording(root: Path, name: str) -> Recording:
     times = _times(folder / "timestamps.json")
     seconds = times[rows_of(ids, rows=len(times), path=folder / "timestamps.json")]
     check_times(folder / "timestamps.json", seconds)
-    poses = {path: (rotations[row].as_matrix(), positions[row]) for path, row in zip(paths, rows, strict=True)}
+    poses = {path: (rotations[row], positions[row]) for path, row in zip(paths, rows, strict=True)}
     left = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
     return Recording(
         name=name,
@@ -69,7 +68,7 @@ def open_recording(root: Path, name: str) -> Recording:
     )
 
 
-def read_poses(path: Path) -> tuple[Rotation, Float[np.ndarray, "n 3"]]:
+def read_poses(path: Path) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Return the rotations (world from LiDAR) and positions (metres) of a file of poses; ValueError for others."""
     poses = read_json(path)
     try:
@@ -82,8 +81,7 @@ def read_poses(path: Path) -> tuple[Rotation, Float[np.ndarray, "n 3"]]:
     if not np.isfinite(positions).all():
         raise ValueError(f"{path}: expected finite positions, found others")
     check_positions(path, positions)
-    check_quaternions(path, turned)
-    return Rotation.from_quat(turned), positions
+    return rotations_of(path, turned), positions
 
 
 def _times(path: Path) -> Float[np.ndarray, " n"]:

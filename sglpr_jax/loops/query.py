@@ -1,0 +1,33 @@
+"""A scan or ready-made image from a file, to be found in a map."""
+
+import dataclasses
+from pathlib import Path
+
+from sglpr_jax.data.choices import ScanFormat, SensorHeight
+from sglpr_jax.data.mounting import Mounting, estimate_mounting
+from sglpr_jax.data.readers.bev_images import read_image
+from sglpr_jax.data.record import Record, scan_record
+from sglpr_jax.loops.places import PlaceMap
+
+
+def read_query(
+    path: Path, places: PlaceMap, *, format: ScanFormat = "auto", sensor_height: SensorHeight = "auto"
+) -> Record:
+    """Read what `places.relocate` looks for: a scan of this format, or an image (.png).
+
+    `sensor_height` is metres above the ground, "estimate" finds it and the tilt from the scan, "auto" takes the
+    mounting of the map's last place. Raises what `scan_record` and `read_image` do, and ValueError where there is no
+    ground to estimate from.
+    """
+    if path.suffix == ".png":
+        return Record(image=read_image(path))
+    record = scan_record(path, format=format)
+    if sensor_height == "auto":
+        return dataclasses.replace(record, mounting=places.mounting())
+    if sensor_height != "estimate":
+        return dataclasses.replace(record, mounting=Mounting(float(sensor_height)))
+    assert record.points is not None
+    found = estimate_mounting(record.points)
+    if found is None:
+        raise ValueError(f"{path}: expected ground that tells the sensor's height, found none: say how high")
+    return dataclasses.replace(record, mounting=found)

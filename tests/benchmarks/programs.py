@@ -1,0 +1,25 @@
+"""The benchmarks run for real, as a user runs them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from sglpr_jax.sim import Sensor
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+TINY = BENCHMARKS / "tiny.py"
+"""A preset of next to no arithmetic."""
+SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
+
+
+def printed(benchmark: str, *options: object) -> str:
+    """What a benchmark prints."""
+    command = (sys.executable, BENCHMARKS / benchmark, *map(str, options))
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def table(output: str) -> list[list[str]]:
+    """The rows of a printed table."""
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in output.splitlines() if "│" in line]

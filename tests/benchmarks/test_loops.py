@@ -1,0 +1,80 @@
+"""The benchmarks of loops: scored on drives and on images, timed, fitted, and beside the closures of maps."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import of_scans
+
+from sglpr_jax.sim import write_dataset
+from sglpr_jax.sim.drive import TimedPoses
+from sglpr_jax.sim.recording import SimulatedRecording
+
+from .programs import SENSOR, printed
+
+pytestmark = pytest.mark.slow
+SMALL = ("--scans", "100", "--azimuth-steps", "200", "--towns", "08:3")
+
+
+def test_loops_are_scored_on_simulated_drives():
+    output = printed("loops.py", "simulated", *SMALL, "--optimized")
+    assert "town 08:3: 100 frames" in output and "kept of the whole drive" in output and "recall of" in output
+    assert "trajectory: off by" in output and "pairs at 0.99 or more" in output
+
+
+def test_loops_are_scored_on_images(tmp_path):
+    write_dataset(tmp_path, names=("08",), scans=330, sensor=SENSOR, layout="images")
+    output = printed("loops.py", "images", "--data", str(tmp_path), "--seqs", "08", "--odometry")
+    assert "nearest descriptor: top-1 F1max" in output and "most probable of three: top-1 F1max" in output
+
+
+def test_the_parts_of_a_loop_are_timed():
+    output = printed("loops.py", "speed", "--frames", "300", "--repeats", "2", "--azimuth-steps", "90")
+    assert [line.split(":")[0] for line in output.splitlines()][-4:] == [
+        "image and descriptor",
+        "query",
+        "verification",
+        "all of it",
+    ]
+
+
+def test_models_of_loops_are_fitted_and_written(tmp_path):
+    output = printed("fit_loops.py", *SMALL, "--out", str(tmp_path / "models.json"))
+    assert "rings: LoopModel" in output
+    found = json.loads((tmp_path / "models.json").read_text())
+    assert len(found) == 2 and set(found[""]["weights"]) == {"correlation", "second"}
+
+
+def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
+    """A drive out and back along a line: the way back is revisited, and one closure in each list is wrong."""
+    monkeypatch.delitem(sys.modules, "loops", raising=False)  # the tests have a package of that name
+    closures = importlib.import_module("map_closures")
+    poses = np.tile(np.eye(4), (80, 1, 1))
+    poses[:, 0, 3] = 5.0 * np.r_[np.arange(40), np.arange(40)[::-1]]
+    poses[40:, :2, :2] *= -1  # the other way round
+    times = np.arange(80.0)
+    drive = of_scans({Path(str(i)): np.ones((1, 3)) for i in range(80)}, times=times)
+    drive = SimulatedRecording(**vars(drive), poses=TimedPoses(poses, times), render=lambda i: (np.ones((1, 4)), times))
+    right = np.linalg.inv(poses[60]) @ poses[0]
+    peer = {
+        "maps": [[0, 20], [20, 40], [40, 60], [60, 80]],
+        "closures": [
+            {"source": 0, "target": 3, "target_from_source": right.tolist()},
+            {"source": 0, "target": 2, "target_from_source": np.eye(4).tolist()},
+        ],
+        "seconds": {"odometry": 1.0, "maps and closures": 8.0},
+    }
+    maps = closures.score_maps(peer, drive)
+    assert maps.right.tolist() == [True, False] == (~maps.wrong).tolist() and maps.found == set(range(60, 80))
+    assert np.linalg.norm(maps.errors[0, :3, 3]) < 1e-9 and np.linalg.norm(maps.errors[1, :3, 3]) > 100
+    assert maps.seconds == 0.1
+    pairs = [(70, 9), (75, 40)]
+    scans = closures.score(pairs, [np.linalg.inv(poses[9]) @ poses[70], np.eye(4)], drive, 8.0)
+    assert scans.right.tolist() == [True, False] == (~scans.wrong).tolist() and scans.found == {70}
+    assert np.linalg.norm(scans.errors[0, :3, 3]) < 1e-9
+    closures.print_table("a line", {"maps": maps, "scans": scans}, drive)
+    table = capsys.readouterr().out
+    assert "0.500" in table and "maps" in table
