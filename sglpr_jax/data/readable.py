@@ -41,4 +41,5 @@ def _only(recording: Recording, rows: Sequence[int]) -> Recording:
         label_paths=tuple(recording.label_paths[row] for row in rows) if recording.label_paths else (),
         positions=None if recording.positions is None else recording.positions[list(rows)],
         times=None if recording.times is None else recording.times[list(rows)],
+        world_from_lidar=None if recording.world_from_lidar is None else recording.world_from_lidar[list(rows)],
     )

@@ -90,20 +90,25 @@ def find_loops(
         check_installed()
     detector = LoopDetector(params, model=model, config=config)
     given = functools.partial(_given, recording, odometry)
-    kept = None if kept_in is None else Unfinished.opened(Path(kept_in), settings(recording, detector, odometry))
-    if kept is not None:
-        kept.recall(detector, recording.mounting, given, missing=on_bad_scan is not None)
+    kept = None
+    if kept_in is not None:
+        kept = Unfinished.opened(Path(kept_in), settings(recording, detector.finder, odometry=odometry))
+
+        def add(seen: Seen | None, candidates: list[Candidate]) -> None:
+            detector.add_seen(seen, **given(len(detector)), candidates=candidates)
+
+        kept.recall(detector.finder, recording.mounting, add, missing=on_bad_scan is not None)
         if len(detector):
             on_progress(len(detector))
     for i in range(len(detector), len(recording)):
         if should_stop():
             break
-        detector.add_seen(_seen(detector, recording, i, on_bad_scan), **given(i))
+        detector.add_seen(detector.finder.seen_scan(recording, i, on_bad_scan), **given(i))
         if kept is not None:
-            kept.keep(detector)
+            kept.keep(detector.finder, detector.candidates)
         on_progress(i + 1)
     if kept is not None:
-        kept.keep(detector, all=True)
+        kept.keep(detector.finder, detector.candidates, all=True)
     skipped = tuple(recording.ids[i] for i in detector.finder.missing)
     if len(skipped) == len(recording):
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
@@ -116,17 +121,6 @@ def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i:
     """Time and odometry of a frame."""
     time = None if recording.times is None else float(recording.times[i])
     return {"time": time, "odometry": None if odometry is None else odometry[i]}
-
-
-def _seen(detector: LoopDetector, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
-    """What is seen of a scan; None where it cannot be read, which `on_bad_scan` is told."""
-    try:
-        return detector.finder.seen(recording.record(i, labels=False))
-    except (ValueError, OSError) as error:
-        if on_bad_scan is None:
-            raise
-        on_bad_scan(recording.ids[i], error)
-        return None
 
 
 def settled(

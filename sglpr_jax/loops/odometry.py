@@ -6,8 +6,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
 
+BAGS = (".bag", ".mcap", ".db3")
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """kitti, lidar: 12 numbers a line, in KITTI's camera axes or z up; tum: time, position, quaternion; g2o: vertices."""
 
@@ -30,7 +32,25 @@ def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float
     return poses
 
 
+def is_own(path: Path, root: Path) -> bool:
+    """Whether a user who names `path` for odometry means the poses of the recording itself, a bag."""
+    path, root = path.resolve(), root.resolve()
+    return path.exists() and (path == root or (path.suffix in BAGS and path.parent == root))
+
+
+def own_odometry(recording: Recording, root: Path) -> Float[np.ndarray, "n 4 4"]:
+    """The poses that a recording has by the messages of its bag. Raises ValueError where these tell no rotations."""
+    if recording.world_from_lidar is None:
+        raise ValueError(
+            f"{root}: expected a bag with poses (Odometry, PoseStamped or tf) that tell rotations, "
+            f"found {recording.pose_source or 'no poses'}"
+        )
+    return recording.world_from_lidar
+
+
 def _format_of(path: Path) -> OdometryFormat:
+    if path.suffix in BAGS:
+        raise ValueError(f"{path}: expected odometry from a file, or the bag that has the scans, found another bag")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected odometry, found no file")
     if path.suffix == ".g2o":

@@ -145,15 +145,15 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):
     recording, odometry = twice
-    detector = sglpr_jax.LoopDetector(params, config=CONFIG)
-    base = unfinished.settings(recording, detector, odometry)
+    finder = sglpr_jax.LoopDetector(params, config=CONFIG).finder
+    base = unfinished.settings(recording, finder, odometry=odometry)
     tilted = dataclasses.replace(recording, mounting=Mounting(2.0))
     others = (
-        unfinished.settings(tilted, detector, odometry),
-        unfinished.settings(recording, detector, odometry + 1e-9),
-        unfinished.settings(recording, detector, None),
-        unfinished.settings(recording, sglpr_jax.LoopDetector(params), odometry),
-        unfinished.settings(dataclasses.replace(recording, times=recording.times + 1), detector, odometry),
+        unfinished.settings(tilted, finder, odometry=odometry),
+        unfinished.settings(recording, finder, odometry=odometry + 1e-9),
+        unfinished.settings(recording, finder, odometry=None),
+        unfinished.settings(recording, sglpr_jax.LoopDetector(params).finder, odometry=odometry),
+        unfinished.settings(dataclasses.replace(recording, times=recording.times + 1), finder, odometry=odometry),
     )
-    assert base == unfinished.settings(recording, detector, odometry.copy())
+    assert base == unfinished.settings(recording, finder, odometry=odometry.copy())
     assert all(other != base for other in others)
