@@ -50,6 +50,8 @@ def relocalize(command: RelocalizeCommand) -> list[Relocated]:
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     found = places.relocate(params, _record(command, places), candidates=command.candidates)
+    if not found:
+        raise ValueError(f"{command.scan}: expected a scan that shows something, found one that shows next to nothing")
     if command.out is not None:
         write_json(command.out, [_as_json(one) for one in found])
     console().print(_table(command.scan, found))

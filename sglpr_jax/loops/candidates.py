@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
+from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.data.record import Record
@@ -139,10 +140,14 @@ class CandidateFinder:
     def seen_scan(self, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
         """What is seen of a recording's scan; None where it cannot be read, which `on_bad_scan(id, error)` is told.
 
-        Without `on_bad_scan` the error is raised.
+        So it is of a scan that cannot be one of a place: no finite points, no metres. Without `on_bad_scan` the error
+        is raised.
         """
         try:
-            return self.seen(recording.record(i, labels=False))
+            record = recording.record(i, labels=False)
+            if record.points is not None:
+                check_cloud(record.points, name=record.name)
+            return self.seen(record)
         except (ValueError, OSError) as error:
             if on_bad_scan is None:
                 raise

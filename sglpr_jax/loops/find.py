@@ -71,11 +71,11 @@ def find_loops(
     of the LiDAR's own frame, as the points have it, however the sensor is mounted.
 
     A scan that cannot be read raises its error or, given `on_bad_scan(id, error)`, is left out; frames keep their
-    numbers. With `kept_in`, a folder, what was seen of the scans is kept there, and a run that was killed goes on from
-    it, if the recording, the odometry, the weights and the settings are the same; the folder stays. Ends early, with
-    what was found, when `should_stop` says so. `on_progress` is told how many scans are done. Raises ValueError for
-    odometry of another length and where no scan can be read, ImportError without the extra, and what reading the scans
-    raises.
+    numbers. Scans that show next to nothing have no loops. With `kept_in`, a folder, what was seen of the scans is kept
+    there, and a run that was killed goes on from it, if the recording, the odometry, the weights and the settings are
+    the same; the folder stays. Ends early, with what was found, when `should_stop` says so. `on_progress` is told how
+    many scans are done. Raises ValueError for odometry of another length and where no scan can be read or shows
+    something, ImportError without the extra, and what reading the scans raises.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("rings"))
@@ -112,6 +112,8 @@ def find_loops(
     skipped = tuple(recording.ids[i] for i in detector.finder.missing)
     if len(skipped) == len(recording):
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+    if all(detector.finder.empty) and len(detector) == len(recording):
+        raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
     loops, refused = settled(recording, detector.loops, odometry, config, registered=registered)
     seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model}
     return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)

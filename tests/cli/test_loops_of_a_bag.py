@@ -127,4 +127,9 @@ def test_a_bag_without_rotations_is_no_odometry_and_another_bag_neither(command,
     run = ("loops", bag, "--out", tmp_path / "found", "--odometry")
     assert_one_line_error(command(*run, bag), "scans.bag: expected a bag with poses", "found no poses")
     assert_one_line_error(command(*run, mcap), "drive.mcap: expected odometry from a file", "found another bag")
+    still = write_bag(
+        tmp_path / "still.bag", "ros1", [("/tf", TRANSFORMS, START_S, transforms("ros1", START_S, [BASE]))]
+    )
+    ended = command("loops", still, "--out", tmp_path / "found")
+    assert_one_line_error(ended, "still.bag: expected a topic of point clouds", "found /tf (tf2_msgs/msg/TFMessage)")
     assert not (tmp_path / "found").exists()

@@ -1,5 +1,7 @@
+import errno
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,10 +126,51 @@ def places_file(tmp_path):
     return tmp_path / "one.safetensors"
 
 
+def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command, places_file, tmp_path):
+    scan = tmp_path / "dot.bin"
+    np.array([5, 0, 0, 1], np.float32).tofile(scan)
+    run = ("relocalize", scan, "--map", places_file)
+    assert_one_line_error(
+        command(*run, "--out", tmp_path / "pose.json"), "dot.bin: expected a scan that shows something"
+    )
+    assert not (tmp_path / "pose.json").exists()
+    assert_one_line_error(command(*run, "--weights", "sglpr"), "one.safetensors: expected descriptors of the weights")
+    content = places_file.read_bytes()
+    places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
+    assert_one_line_error(command(*run), "one.safetensors: expected an index as it was written, found a damaged one")
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_map_as_it_was_and_what_was_seen(
+    command, town, poses, places_file, tmp_path, monkeypatch
+):
+    before, write = places_file.read_bytes(), Path.write_bytes
+
+    def full(path, content):
+        if path.name.startswith(".one.safetensors."):
+            write(path, content[:100])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, content)
+
+    run = ("map", town, "--seq", "08", "--poses", poses, "--out", places_file, "--add-to", places_file)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        ended = command(*run)
+    assert_one_line_error(ended, "one.safetensors: expected to write it, found: No space left on device")
+    assert places_file.read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"one.safetensors", "one.unfinished", "poses.tum"}
+    assert command(*run).status == 0
+    assert len(PlaceMap.load(places_file)) > 1 and not (tmp_path / "one.unfinished").exists()
+
+
 def test_wrong_input_is_one_clear_error(command, town, poses, tmp_path):
     run = ("map", town, "--seq", "08", "--poses", poses)
     assert_one_line_error(command(*run, "--out", tmp_path / "town.npz"), "--out", ".safetensors", "town.npz")
     assert_one_line_error(command(*run, "--out", tmp_path / "a.safetensors", "--add-to", tmp_path / "none"), "none")
+    late = tmp_path / "late.tum"
+    late.write_text("0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    run = ("map", town, "--seq", "08", "--poses", late, "--out", tmp_path / "a.safetensors")
+    assert_one_line_error(command(*run), "late.tum, line 3: expected a time >= 2.0, found 1.0")
     scan = town / "sequences/08/velodyne/000020.bin"
     (tmp_path / "broken.safetensors").write_bytes(b"no map at all")
     ended = command("relocalize", scan, "--map", tmp_path / "broken.safetensors")

@@ -156,9 +156,12 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
     with pytest.raises(ValueError, match="expected a pose for each of 30 scans of a recording, found 3"):
         PlaceMap.of(recording, params, poses[:3])
     assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
-    empty = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
+    empty = with_points(recording, lambda path: np.full((1, 3), 5, np.float32))
     with pytest.raises(ValueError, match="08: expected scans that show something, found 30 empty ones"):
         PlaceMap.of(dataclasses.replace(empty, label_paths=()), params, poses)
+    at_origin = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
+    with pytest.raises(ValueError, match=r"scan 000000 of sequence 08: expected points around the sensor"):
+        PlaceMap.of(dataclasses.replace(at_origin, label_paths=()), params, poses)
     places.index.save(tmp_path / "index.safetensors")
     with pytest.raises(ValueError, match="expected a map of places, found an index without images"):
         PlaceMap.load(tmp_path / "index.safetensors")

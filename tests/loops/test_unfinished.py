@@ -141,6 +141,12 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     broken |= set(recording.paths)
     with pytest.raises(ValueError, match="expected at least one readable scan, found none"):
         find_loops(bad, params, config=CONFIG, on_bad_scan=lambda scan, error: None)
+    for cloud, words in (
+        (np.full((1, 3), 5, np.float32), "08: expected scans that show something, found 24 empty ones"),
+        (np.full((9, 3), np.nan, np.float32), "scan 000000 of sequence 08: expected finite points, found none among 9"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            find_loops(with_points(recording, lambda path, cloud=cloud: cloud), params, config=CONFIG)
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):
