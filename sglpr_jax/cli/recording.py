@@ -54,14 +54,21 @@ class PosedRecordingOptions(RecordingOptions):
 def open_with_poses(
     source: RecordingOptions, root: Path, path: Path, *, format: "OdometryFormat"
 ) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']]":
-    """Open a recording, with a pose for each scan from the file at `path` or, where that is the bag itself, from it."""
-    from sglpr_jax.loops.odometry import is_own, own_odometry, read_odometry
+    """Open a recording, with a pose for each scan from the file at `path` or, where that is the bag itself, from it.
+
+    Scans about whose times a tum file has no pose are left out, which is said.
+    """
+    from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
 
     if is_own(path, root):
         recording = source.open(root)
         return recording, own_odometry(recording, root)
     odometry = read_odometry(path, format=format)  # first, since a bag takes its time to open
-    return source.open(root), odometry
+    opened = source.open(root)
+    recording, poses = at_scans(opened, odometry, path, format=format)
+    if recording is not opened:
+        print(recording.found[-1], file=sys.stderr)
+    return recording, poses
 
 
 def report_bad_scan(scan: str, error: Exception) -> None:

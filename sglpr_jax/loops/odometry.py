@@ -1,14 +1,20 @@
 """Odometry from files: a pose of the LiDAR for each scan, position and rotation, in a frame that stays."""
 
+import dataclasses
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
+from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
+from sglpr_jax.loops.transforms import from_quaternions, quaternions
 
+LEAST_SHARE = 0.5
+"""Of the scans must have poses about their times, for a file to be their odometry."""
 BAGS = (".bag", ".mcap", ".db3")
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """kitti, lidar: 12 numbers a line, in KITTI's camera axes or z up; tum: time, position, quaternion; g2o: vertices."""
@@ -30,6 +36,34 @@ def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float
     if wrong.any():
         raise ValueError(f"{path}, pose {int(wrong.argmax())}: expected a rotation, found {turned[wrong][0].tolist()}")
     return poses
+
+
+def at_scans(
+    recording: Recording, odometry: Float[np.ndarray, "n 4 4"], path: Path, *, format: OdometryFormat
+) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
+    """The recording, and a pose for each of its scans from what `read_odometry` found at `path`.
+
+    Poses go with the scans row by row. A tum file of another length is interpolated at the times of the scans; those
+    more than 1 s between two poses, or before the first and after the last, are left out, which is told. Raises
+    ValueError where these are most.
+    """
+    tum = (_format_of(path) if format == "auto" else format) == "tum"
+    if len(odometry) == len(recording) or recording.times is None or not tum:
+        return recording, odometry
+    stamps, times = read_tum(path)[1], recording.times
+    kept, positions = interpolate(stamps, odometry[:, :3, 3], times)
+    if kept.mean() < LEAST_SHARE:
+        raise ValueError(
+            f"{path}: expected odometry of {len(recording)} poses, one for each scan of {recording.name}, or poses at "
+            f"most 1 s apart about the times of these, {times[0]:.1f} to {times[-1]:.1f} s, found {len(odometry)} of "
+            f"{stamps[0]:.1f} to {stamps[-1]:.1f} s"
+        )
+    turned = interpolate_turns(stamps, quaternions(odometry), times).as_quat()
+    missing = len(kept) - int(kept.sum())
+    left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
+    said = f"odometry: {len(odometry)} poses of {path.name}, interpolated at the times of the scans{left_out}"
+    chosen = only(recording, np.flatnonzero(kept).tolist())
+    return dataclasses.replace(chosen, found=(*chosen.found, said)), from_quaternions(positions, turned)[kept]
 
 
 def is_own(path: Path, root: Path) -> bool:
