@@ -61,8 +61,7 @@ def open_with_poses(
     from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
 
     if is_own(path, root):
-        recording = source.open(root)
-        return recording, own_odometry(recording, root)
+        return own_odometry(source.open(root), root)
     odometry = read_odometry(path, format=format)  # first, since a bag takes its time to open
     opened = source.open(root)
     recording, poses = at_scans(opened, odometry, path, format=format)

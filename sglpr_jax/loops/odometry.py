@@ -72,14 +72,17 @@ def is_own(path: Path, root: Path) -> bool:
     return path.exists() and (path == root or (path.suffix in BAGS and path.parent == root))
 
 
-def own_odometry(recording: Recording, root: Path) -> Float[np.ndarray, "n 4 4"]:
-    """The poses that a recording has by the messages of its bag. Raises ValueError where these tell no rotations."""
+def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
+    """The poses that a recording has by the messages of its bag, and the recording without: they judge nothing then.
+
+    Raises ValueError where they tell no rotations.
+    """
     if recording.world_from_lidar is None:
         raise ValueError(
             f"{root}: expected a bag with poses (Odometry, PoseStamped or tf) that tell rotations, "
             f"found {recording.pose_source or 'no poses'}"
         )
-    return recording.world_from_lidar
+    return dataclasses.replace(recording, positions=None, pose_source=None), recording.world_from_lidar
 
 
 def _format_of(path: Path) -> OdometryFormat:
