@@ -93,11 +93,7 @@ def find_loops(
     kept = None
     if kept_in is not None:
         kept = Unfinished.opened(Path(kept_in), settings(recording, detector.finder, odometry=odometry))
-
-        def add(seen: Seen | None, candidates: list[Candidate]) -> None:
-            detector.add_seen(seen, **given(len(detector)), candidates=candidates)
-
-        kept.recall(detector.finder, recording.mounting, add, missing=on_bad_scan is not None)
+        _recall(kept, detector, recording.mounting, given, missing=on_bad_scan is not None)
         if len(detector):
             on_progress(len(detector))
     for i in range(len(detector), len(recording)):
@@ -117,6 +113,22 @@ def find_loops(
     loops, refused = settled(recording, detector.loops, odometry, config, registered=registered)
     seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model}
     return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
+
+
+def _recall(
+    kept: Unfinished,
+    detector: LoopDetector,
+    mounting: Mounting | None,
+    given: Callable[[int], dict[str, Any]],
+    *,
+    missing: bool,
+) -> None:
+    """Add what an earlier run has seen to a detector; `given` has time and odometry of a frame."""
+
+    def add(seen: Seen | None, candidates: list[Candidate]) -> None:
+        detector.add_seen(seen, **given(len(detector)), candidates=candidates)
+
+    kept.recall(detector.finder, mounting, add, missing=missing)
 
 
 def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i: int) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from bags import TRANSFORMS, header, transforms, typestore, write_bag
 
 from sglpr_jax.loops.graph_files import read_g2o, read_tum, write_tum
 from sglpr_jax.loops.optimization import trajectory_error
+from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.transforms import inverse, quaternions, transform
 from sglpr_jax.sim import Sensor
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
@@ -118,6 +119,16 @@ def test_from_an_mcap_to_a_graph_and_a_corrected_trajectory(command, drive, mcap
     assert page.count("data:image/png;base64,") >= 3
     judged = given == "a file"  # by the poses of the bag, but not where these are the odometry themselves
     assert ("RMSE after alignment, by /odom" in page) == judged == ("<h2>Sure of it?</h2>" in page)
+
+
+def test_a_map_takes_the_poses_of_its_bag(command, mcap, odometry, tmp_path):
+    out = tmp_path / "town.safetensors"
+    ended = command("map", mcap, "--poses", mcap, "--spacing-m", "40", "--out", out)
+    assert ended.status == 0, ended.error
+    places = PlaceMap.load(out)
+    assert 3 <= len(places) <= 20
+    rows = [int(name.removeprefix("drive/")) for name in places.index.ids]
+    np.testing.assert_allclose(places.world_from_place, odometry[rows], atol=1e-4)
 
 
 def test_a_bag_without_rotations_is_no_odometry_and_another_bag_neither(command, drive, mcap, tmp_path):
