@@ -87,9 +87,9 @@ def interpolate_turns(
 ) -> Rotation:
     """Return the rotations at `times`, turning evenly between those at `stamps`, of which there are two or more."""
     order = np.argsort(stamps, kind="stable")
-    stamps, turned = stamps[order], Rotation.from_quat(quaternions[order])
+    stamps, quaternions = stamps[order], quaternions[order]
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    before, after = turned[later - 1], turned[later]
+    before, after = Rotation.from_quat(quaternions[later - 1]), Rotation.from_quat(quaternions[later])
     widths = stamps[later] - stamps[later - 1]
     shares = ((times - stamps[later - 1]) / np.where(widths > 0, widths, 1)).clip(0, 1)
     return before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())
