@@ -4,7 +4,7 @@
     python benchmarks/kill_map.py --kills 3 --scans 40
 
 Every second kill comes while the map is being written, the others at any time of a run. The map is one that grows
-(`--add-to` itself), so that a file is replaced, too.
+(`--add-to` itself, with other poses each time), so that a file is replaced, too.
 """
 
 import contextlib
@@ -48,10 +48,11 @@ def main(kills: int = 100, scans: int = 200, seed: int = 0) -> None:
         for kill in track(range(kills), description="kills"):
             grown = [*command, "--add-to", str(out)] if out.exists() else command
             places = len(PlaceMap.load(out)) if out.exists() else 0
+            write_poses(folder, x=float(kill))
             begin = time.monotonic()
             process = subprocess.Popen(grown, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             if kill % 2:
-                wait_for_write(process, folder)
+                wait_for_write(process, out)
                 time.sleep(rng.uniform(0, FINISHED_S))
             else:
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -59,7 +60,7 @@ def main(kills: int = 100, scans: int = 200, seed: int = 0) -> None:
             outcomes["ended before the kill" if process.poll() is not None else "killed"] += 1
             process.kill()
             process.wait()
-            outcomes["left half of a file beside it"] += bool(half_written(folder))
+            outcomes["left half of a file beside it"] += bool(half_written(out.parent, out.name))
             remove_half_written(folder)
             outcomes[state(out, places, scans)] += 1
             if places > 20 * scans:
@@ -71,13 +72,19 @@ def main(kills: int = 100, scans: int = 200, seed: int = 0) -> None:
 def prepared(folder: Path, scans: int) -> tuple[list[str], Path]:
     """A simulated recording with poses; the command that maps it, and the map."""
     write_dataset(folder / "town", names=("08",), scans=scans, sensor=SENSOR)
-    recording = sglpr_jax.open_recording(folder / "town", "08")
-    poses = np.tile(np.eye(4), (scans, 1, 1))
-    poses[:, :3, 3] = recording.positions
-    write_tum(folder / "poses.tum", poses, np.arange(float(scans)))
+    write_poses(folder)
     out = folder / "map" / "town.safetensors"
     command = [sys.executable, "-m", "sglpr_jax.cli.map", folder / "town", "--seq", "08", "--out", out]
     return [*map(str, command), "--poses", str(folder / "poses.tum"), "--spacing-m", "0"], out
+
+
+def write_poses(folder: Path, *, x: float = 0.0) -> None:
+    """The poses of the recording, all of them `x` metres aside: scans of other poses are other places."""
+    recording = sglpr_jax.open_recording(folder / "town", "08")
+    poses = np.tile(np.eye(4), (len(recording), 1, 1))
+    poses[:, :3, 3] = recording.positions
+    poses[:, 0, 3] += x
+    write_tum(folder / "poses.tum", poses, np.arange(float(len(recording))))
 
 
 def duration(command: list[str]) -> float:
@@ -88,9 +95,9 @@ def duration(command: list[str]) -> float:
     return time.monotonic() - begin
 
 
-def wait_for_write(process: subprocess.Popen, folder: Path) -> None:
+def wait_for_write(process: subprocess.Popen, out: Path) -> None:
     """Until the map's hidden file is there, or the process has ended."""
-    while process.poll() is None and not half_written(folder / "map"):
+    while process.poll() is None and not half_written(out.parent, out.name):
         time.sleep(0.001)
 
 

@@ -13,16 +13,19 @@ LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflec
 LIVOX = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 )
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
 """What a bag of each kind is called."""
 
 
 def typestore(kind: str) -> Any:
-    """The messages of a ROS, and those of both drivers of Livox."""
+    """The messages of a ROS, with those of tf and of both drivers of Livox."""
     types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     for package in ("livox_ros_driver", "livox_ros_driver2"):
         types.register(get_types_from_msg(LIVOX_POINT, f"{package}/msg/CustomPoint"))
         types.register(get_types_from_msg(LIVOX, f"{package}/msg/CustomMsg"))
+    if kind == "ros1":
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
     return types
 
 
@@ -31,6 +34,25 @@ def header(kind: str, seconds: float, frame: str) -> Any:
     store = typestore(kind).types
     stamp = store["builtin_interfaces/msg/Time"](sec=int(seconds), nanosec=round(seconds % 1 * 1e9))
     return store["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **({"seq": 7} if kind == "ros1" else {}))
+
+
+def transforms(kind: str, seconds: float, found: Iterable[tuple[str, str, Any, Any]]) -> Any:
+    """A message of tf: frame, child, position and quaternion (x, y, z, w) of each transform, at this time."""
+    store = typestore(kind).types
+    one = store["geometry_msgs/msg/TransformStamped"]
+    return store[TRANSFORMS](
+        transforms=[
+            one(
+                header=header(kind, seconds, frame),
+                child_frame_id=child,
+                transform=store["geometry_msgs/msg/Transform"](
+                    translation=store["geometry_msgs/msg/Vector3"](*map(float, at)),
+                    rotation=store["geometry_msgs/msg/Quaternion"](*map(float, turned)),
+                ),
+            )
+            for frame, child, at, turned in found
+        ]
+    )
 
 
 def write_bag(path: Path, kind: str, messages: Iterable[tuple[str, str, float, Any]]) -> Path:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
+from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.loops.choices import MIN_PROBABILITY, OdometryFormat
 
@@ -26,6 +26,7 @@ class LoopsCommand:
     Examples:
       bin/loops my_scans --out found
       bin/loops my_scans --odometry odometry.tum --out found
+      bin/loops drive.mcap --odometry drive.mcap --out found
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found --register
       bin/loops my_scans --odometry odometry.tum --optimize --out found
     """
@@ -35,7 +36,7 @@ class LoopsCommand:
     out: Path
     """The folder to write into."""
     odometry: Path | None = None
-    """A pose for each scan, drifting as it may. Without it, loops are judged by the scans alone."""
+    """A pose for each scan, drifting as it may, or the bag itself. Without it, loops are judged by the scans alone."""
     odometry_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
     weights: str = "rings"
@@ -54,23 +55,23 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
-    from sglpr_jax.evaluation.page.of_loops import (
-        write_loops_page,  # these bring JAX and more, which --help does not need
-    )
+    from sglpr_jax.evaluation.page.of_loops import write_loops_page
     from sglpr_jax.loops.detector import DetectorConfig
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.folder import write_found
-    from sglpr_jax.loops.odometry import read_odometry
     from sglpr_jax.loops.optimization import check_installed, optimize_trajectory
     from sglpr_jax.loops.unfinished import remove
-    from sglpr_jax.models.weights_file import load
+    from sglpr_jax.models.weights_file import load  # all these bring JAX, which --help does not need
 
     if command.optimize and command.odometry is None:
         raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
     if command.optimize:
         check_installed()
-    odometry = None if command.odometry is None else read_odometry(command.odometry, format=command.odometry_format)
-    recording = command.source.open(command.recording)
+    source, path = command.source, command.odometry
+    if path is None:
+        recording, odometry = source.open(command.recording), None
+    else:
+        recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
     params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(

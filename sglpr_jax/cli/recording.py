@@ -8,7 +8,11 @@ from typing import TYPE_CHECKING, Any
 from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
     from sglpr_jax.data import Recording
+    from sglpr_jax.loops.choices import OdometryFormat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +28,8 @@ class RecordingOptions:
     sensor_height: SensorHeight = "auto"
     """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
     does where the layout (a plain folder, a bag) does not tell."""
+    pose_topic: str | None = None
+    """The topic of a bag's poses, where it has several: /odom."""
 
     def open(self, root: Path) -> "Recording":
         """Open the recording, and say what was found. Raises what `data.open_recording` does."""
@@ -43,6 +49,25 @@ class PosedRecordingOptions(RecordingOptions):
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
     """Seconds, one number a line, where no times.txt lies beside the scans."""
+
+
+def open_with_poses(
+    source: RecordingOptions, root: Path, path: Path, *, format: "OdometryFormat"
+) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']]":
+    """Open a recording, with a pose for each scan from the file at `path` or, where that is the bag itself, from it.
+
+    Scans about whose times a tum file has no pose are left out, which is said.
+    """
+    from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
+
+    if is_own(path, root):
+        return own_odometry(source.open(root), root)
+    odometry = read_odometry(path, format=format)  # first, since a bag takes its time to open
+    opened = source.open(root)
+    recording, poses = at_scans(opened, odometry, path, format=format)
+    if recording is not opened:
+        print(recording.found[-1], file=sys.stderr)
+    return recording, poses
 
 
 def report_bad_scan(scan: str, error: Exception) -> None:

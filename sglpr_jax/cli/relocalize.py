@@ -54,6 +54,8 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
     found = places.relocate(params, record, candidates=command.candidates)
+    if not found:
+        raise ValueError(f"{command.scan}: expected a scan that shows something, found one that shows next to nothing")
     if command.out is not None:
         write_json(command.out, [_as_json(one) for one in found])
     console().print(_table(command.scan, found))

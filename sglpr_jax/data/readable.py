@@ -30,10 +30,11 @@ def readable(
         on_progress(row + 1)
     if not good:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
-    return recording if len(good) == len(recording) else _only(recording, good)
+    return recording if len(good) == len(recording) else only(recording, good)
 
 
-def _only(recording: Recording, rows: Sequence[int]) -> Recording:
+def only(recording: Recording, rows: Sequence[int]) -> Recording:
+    """The recording of some of its scans or images."""
     return dataclasses.replace(
         recording,
         ids=tuple(recording.ids[row] for row in rows),
@@ -41,4 +42,5 @@ def _only(recording: Recording, rows: Sequence[int]) -> Recording:
         label_paths=tuple(recording.label_paths[row] for row in rows) if recording.label_paths else (),
         positions=None if recording.positions is None else recording.positions[list(rows)],
         times=None if recording.times is None else recording.times[list(rows)],
+        world_from_lidar=None if recording.world_from_lidar is None else recording.world_from_lidar[list(rows)],
     )

@@ -20,6 +20,8 @@ class ReadOptions:
     pose_format: PoseFormat = "auto"
     times: Path | None = None
     """Seconds, one number a line."""
+    pose_topic: str | None = None
+    """The topic of a bag's poses, where it has several."""
 
 
 @dataclass(frozen=True)
@@ -38,3 +40,5 @@ class Reader:
     """Where two layouts fit one folder, that of the lower rank is taken; then the first by name of its file."""
     takes_poses: bool = False
     """Whether `ReadOptions.poses` and `times` concern it; else the layout has pose files of its own."""
+    takes_pose_topic: bool = False
+    """Whether `ReadOptions.pose_topic` concerns it."""

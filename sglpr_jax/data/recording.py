@@ -43,6 +43,8 @@ class Recording:
     """Whether `read` gives what the files hold: not where it is packed, corrupted or simulated."""
     mounting: Mounting | None = None
     """The sensor's height and tilt, where they are not those that models know; None: as the points are."""
+    world_from_lidar: Float[np.ndarray, "n 4 4"] | None = None
+    """Poses of the LiDAR, where a bag's messages tell rotations too, in the frame of these; None of other layouts."""
     found: tuple[str, ...] = ()
     """What the reader found, for a person: the format of the scans, what was left aside."""
 

@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
+from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import image_view, picture, view
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
@@ -20,6 +22,7 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.poses import NEGATIVE_M
+from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
@@ -133,6 +136,23 @@ class CandidateFinder:
         else:
             bev = view(record, model.grid, image=model.image).image
         return Seen(np.asarray(describe(self.params, bev)), _kept(whole), record.mounting)
+
+    def seen_scan(self, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
+        """What is seen of a recording's scan; None where it cannot be read, which `on_bad_scan(id, error)` is told.
+
+        So it is of a scan that cannot be one of a place: no finite points, no metres. Without `on_bad_scan` the error
+        is raised.
+        """
+        try:
+            record = recording.record(i, labels=False)
+            if record.points is not None:
+                check_cloud(record.points, name=record.name)
+            return self.seen(record)
+        except (ValueError, OSError) as error:
+            if on_bad_scan is None:
+                raise
+            on_bad_scan(recording.ids[i], error)
+            return None
 
     def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
         """Whether an image shows too little to tell a place by."""

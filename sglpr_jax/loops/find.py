@@ -71,11 +71,11 @@ def find_loops(
     of the LiDAR's own frame, as the points have it, however the sensor is mounted.
 
     A scan that cannot be read raises its error or, given `on_bad_scan(id, error)`, is left out; frames keep their
-    numbers. With `kept_in`, a folder, what was seen of the scans is kept there, and a run that was killed goes on from
-    it, if the recording, the odometry, the weights and the settings are the same; the folder stays. Ends early, with
-    what was found, when `should_stop` says so. `on_progress` is told how many scans are done. Raises ValueError for
-    odometry of another length and where no scan can be read, ImportError without the extra, and what reading the scans
-    raises.
+    numbers. Scans that show next to nothing have no loops. With `kept_in`, a folder, what was seen of the scans is kept
+    there, and a run that was killed goes on from it, if the recording, the odometry, the weights and the settings are
+    the same; the folder stays. Ends early, with what was found, when `should_stop` says so. `on_progress` is told how
+    many scans are done. Raises ValueError for odometry of another length and where no scan can be read or shows
+    something, ImportError without the extra, and what reading the scans raises.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("rings"))
@@ -90,43 +90,51 @@ def find_loops(
         check_installed()
     detector = LoopDetector(params, model=model, config=config)
     given = functools.partial(_given, recording, odometry)
-    kept = None if kept_in is None else Unfinished.opened(Path(kept_in), settings(recording, detector, odometry))
-    if kept is not None:
-        kept.recall(detector, recording.mounting, given, missing=on_bad_scan is not None)
+    kept = None
+    if kept_in is not None:
+        kept = Unfinished.opened(Path(kept_in), settings(recording, detector.finder, odometry=odometry))
+        _recall(kept, detector, recording.mounting, given, missing=on_bad_scan is not None)
         if len(detector):
             on_progress(len(detector))
     for i in range(len(detector), len(recording)):
         if should_stop():
             break
-        detector.add_seen(_seen(detector, recording, i, on_bad_scan), **given(i))
+        detector.add_seen(detector.finder.seen_scan(recording, i, on_bad_scan), **given(i))
         if kept is not None:
-            kept.keep(detector)
+            kept.keep(detector.finder, detector.candidates)
         on_progress(i + 1)
     if kept is not None:
-        kept.keep(detector, all=True)
+        kept.keep(detector.finder, detector.candidates, all=True)
     skipped = tuple(recording.ids[i] for i in detector.finder.missing)
     if len(skipped) == len(recording):
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+    if all(detector.finder.empty) and len(detector) == len(recording):
+        raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
     loops, refused = settled(recording, detector.loops, odometry, config, registered=registered)
     seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model}
     return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
+
+
+def _recall(
+    kept: Unfinished,
+    detector: LoopDetector,
+    mounting: Mounting | None,
+    given: Callable[[int], dict[str, Any]],
+    *,
+    missing: bool,
+) -> None:
+    """Add what an earlier run has seen to a detector; `given` has time and odometry of a frame."""
+
+    def add(seen: Seen | None, candidates: list[Candidate]) -> None:
+        detector.add_seen(seen, **given(len(detector)), candidates=candidates)
+
+    kept.recall(detector.finder, mounting, add, missing=missing)
 
 
 def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i: int) -> dict[str, Any]:
     """Time and odometry of a frame."""
     time = None if recording.times is None else float(recording.times[i])
     return {"time": time, "odometry": None if odometry is None else odometry[i]}
-
-
-def _seen(detector: LoopDetector, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
-    """What is seen of a scan; None where it cannot be read, which `on_bad_scan` is told."""
-    try:
-        return detector.finder.seen(recording.record(i, labels=False))
-    except (ValueError, OSError) as error:
-        if on_bad_scan is None:
-            raise
-        on_bad_scan(recording.ids[i], error)
-        return None
 
 
 def settled(

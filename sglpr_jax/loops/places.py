@@ -1,7 +1,7 @@
 """A map of places on disk, in which tomorrow's scan finds itself: an index, and an image and a pose for each place."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,13 +13,15 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Seen
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
+from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.verification import VerificationConfig, align_all
 from sglpr_jax.models.params import Params
 from sglpr_jax.poses import NEGATIVE_M
+from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
 
 ARRAYS = ("images", "world_from_place", "mountings")
@@ -75,28 +77,9 @@ class PlaceMap:
     ) -> "PlaceMap":
         """The map of a recording whose poses (LiDAR frame, in the world) are known.
 
-        A place's id is `RECORDING/SCAN`. Scans that show next to nothing are left out. Raises ValueError for poses of
-        another length, and for a recording without scans that show something.
+        Errors are those of `map_recording`, which can also leave out bad scans and go on after a kill.
         """
-        if len(poses) != len(recording) or not len(recording):
-            raise ValueError(f"expected a pose for each of {len(recording)} scans of a recording, found {len(poses)}")
-        finder = CandidateFinder(params)
-        rows, images, last = [], [], None
-        for i in range(len(recording)):
-            here = poses[i, :3, 3]
-            if last is None or np.linalg.norm(here - last) >= spacing_m:
-                seen = finder.seen(recording.record(i, labels=False))
-                if not finder.is_empty(seen.image):
-                    finder.index.add(seen.descriptor, ids=f"{recording.name}/{recording.ids[i]}", positions=here)
-                    rows.append(i)
-                    images.append(seen.image)
-                    last = here
-            on_progress(i + 1)
-        if not rows:
-            raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
-        sensor = recording.mounting or Mounting(MODEL_HEIGHT_M)
-        mountings = np.tile([sensor.height_m, *sensor.up], (len(rows), 1))
-        return cls(finder.index, np.stack(images), np.asarray(poses, np.float64)[rows], mountings)
+        return map_recording(recording, params, poses, spacing_m=spacing_m, on_progress=on_progress).places
 
     def mounting(self, row: int = -1) -> Mounting:
         """How the sensor of a place was mounted; without `row` that of the place added last."""
@@ -104,13 +87,19 @@ class PlaceMap:
         return Mounting(height, tuple(up))
 
     def merged(self, other: "PlaceMap") -> "PlaceMap":
-        """The places of both, in one world frame; ValueError where other weights or images made them."""
+        """The places of both, in one world frame; those of `other` that are here already are taken once.
+
+        Raises ValueError where other weights or images made them.
+        """
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
+        known = set(self._contents())
+        new = [row for row, content in enumerate(other._contents()) if content not in known]
         index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
-        for one in (self.index, other.index):
-            index.add(one.descriptors, ids=one.ids, positions=one.positions, weights_hash=one.weights_hash)
-        both = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS)
+        for one, rows in ((self, list(range(len(self)))), (other, new)):
+            places = {"ids": [one.index.ids[row] for row in rows], "positions": one.world_from_place[rows, :3, 3]}
+            index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
+        both = (np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in ARRAYS)
         return PlaceMap(index, *both)
 
     def relocate(
@@ -158,7 +147,105 @@ class PlaceMap:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
         return cls(index, *(more[name] for name in ARRAYS))
 
+    def _contents(self) -> Iterator[tuple[str, bytes, bytes]]:
+        """What tells each place from every other one."""
+        for name, descriptor, pose in zip(self.index.ids, self.index.descriptors, self.world_from_place, strict=True):
+            yield name, descriptor.tobytes(), pose.tobytes()
+
     def _other_place(self, descriptor: Float[np.ndarray, " d"], row: int) -> float:
         near = np.linalg.norm(self.world_from_place[:, :3, 3] - self.world_from_place[row, :3, 3], axis=1) <= NEGATIVE_M
         distance = float(self.index.query(descriptor, exclude=near).distances[0])
         return distance if np.isfinite(distance) else np.nan
+
+
+class Mapped(NamedTuple):
+    """The map of a recording, and what was not put into it."""
+
+    places: PlaceMap
+    scans: int
+    """So many of the recording's scans were gone through: all, unless it was stopped."""
+    skipped: tuple[str, ...]
+    """The ids of scans that could not be read."""
+
+
+def map_recording(
+    recording: Recording,
+    params: Params,
+    poses: Float[np.ndarray, "n 4 4"],
+    *,
+    spacing_m: float = SPACING_M,
+    on_bad_scan: OnBadScan | None = None,
+    kept_in: Path | str | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Mapped:
+    """Make the map of a recording whose poses (LiDAR frame, in the world) are known.
+
+    A place's id is `RECORDING/SCAN`. Scans nearer than `spacing_m` to the last place are not read; those that show next
+    to nothing are left out. `on_bad_scan`, `kept_in`, `should_stop` and `on_progress` are as in `find_loops`. Raises
+    ValueError for poses of another length, and for a recording without scans that show something.
+    """
+    if len(poses) != len(recording) or not len(recording):
+        raise ValueError(f"expected a pose for each of {len(recording)} scans of a recording, found {len(poses)}")
+    poses = np.asarray(poses, np.float64)
+    finder = CandidateFinder(params)
+    kept = None if kept_in is None else _recalled(Path(kept_in), finder, recording, poses, spacing_m, on_bad_scan)
+    looked_at: list[int] = []  # rows of the recording, whose frames the finder has
+    frames: list[int] = []  # of those, the places
+    rows: list[int] = []
+    done = 0
+    for i in range(len(recording)):
+        if not rows or np.linalg.norm(poses[i, :3, 3] - poses[rows[-1], :3, 3]) >= spacing_m:
+            if len(looked_at) == len(finder.index):  # not seen by an earlier run
+                if should_stop():
+                    break
+                finder.add_seen(finder.seen_scan(recording, i, on_bad_scan), candidates=[])
+                if kept is not None:
+                    kept.keep(finder)
+            if not finder.empty[len(looked_at)]:
+                frames.append(len(looked_at))
+                rows.append(i)
+            looked_at.append(i)
+        done = i + 1
+        on_progress(done)
+    if kept is not None:
+        kept.keep(finder, all=True)
+    if not rows and done == len(recording):
+        raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
+    skipped = tuple(recording.ids[looked_at[row]] for row in finder.missing)
+    return Mapped(_places(finder, recording, poses, frames, rows), done, skipped)
+
+
+def _recalled(
+    folder: Path,
+    finder: CandidateFinder,
+    recording: Recording,
+    poses: Float[np.ndarray, "n 4 4"],
+    spacing_m: float,
+    on_bad_scan: OnBadScan | None,
+) -> Unfinished:
+    """The folder of what an earlier run has seen, which the finder has now."""
+    kept = Unfinished.opened(folder, settings(recording, finder, poses=poses, spacing_m=spacing_m))
+
+    def add(seen: Seen | None, candidates: list[Candidate]) -> None:
+        finder.add_seen(seen, candidates=candidates)
+
+    kept.recall(finder, recording.mounting, add, missing=on_bad_scan is not None)
+    return kept
+
+
+def _places(
+    finder: CandidateFinder,
+    recording: Recording,
+    poses: Float[np.ndarray, "n 4 4"],
+    frames: list[int],
+    rows: list[int],
+) -> PlaceMap:
+    """The map of some `rows` of a recording, which are these `frames` of the finder."""
+    index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
+    ids = [f"{recording.name}/{recording.ids[row]}" for row in rows]
+    index.add(finder.index.descriptors[frames], ids=ids, positions=poses[rows, :3, 3])
+    images = [finder.images[frame] for frame in frames]
+    sensor = recording.mounting or Mounting(MODEL_HEIGHT_M)
+    mountings = np.tile([sensor.height_m, *sensor.up], (len(rows), 1))
+    return PlaceMap(index, np.stack(images) if images else np.zeros((0, 0, 0), np.uint8), poses[rows], mountings)

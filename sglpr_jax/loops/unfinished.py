@@ -1,4 +1,4 @@
-"""What a search for loops has seen so far, in a folder: a run that was killed goes on there and ends as if it had not.
+"""What was seen of a recording's scans so far, in a folder: a run that was killed goes on there and ends as if not.
 
 All that takes time is kept: descriptors, images, and how those of the candidates lie to each other. A file holds some
 frames, is called by the first of them, and is written whole or not at all; the frames after the last file are looked at
@@ -9,19 +9,17 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
-from sglpr_jax.files import read_json, remove_half_written, replacing, write_json
-from sglpr_jax.loops.candidates import Candidate, Seen
-from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.files import alone_in, read_json, remove_half_written, replacing, write_json, writing
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Seen
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
@@ -36,20 +34,17 @@ FRAMES = 50
 """In a file."""
 
 
-def settings(
-    recording: Recording, detector: LoopDetector, odometry: Float[np.ndarray, "n 4 4"] | None
-) -> dict[str, Any]:
-    """All that decides what is seen of a recording's scans, as JSON has it."""
-    finder = detector.finder
+def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray | float | None) -> dict[str, Any]:
+    """All that decides what is seen of a recording's scans, as JSON has it: `given` is what the user said of them."""
     found = {
         "format": FORMAT,
         "recording": fingerprint(recording),
         "sensor": None if recording.mounting is None else dataclasses.asdict(recording.mounting),
         "times": _digest(recording.times),
-        "odometry": _digest(odometry),
         "weights": finder.index.weights_hash,
         "candidates": dataclasses.asdict(finder.config),
         "verification": dataclasses.asdict(finder.verification),
+        **{name: _digest(value) if isinstance(value, np.ndarray) else value for name, value in given.items()},
     }
     return json.loads(json.dumps(found))
 
@@ -60,7 +55,7 @@ def _digest(values: np.ndarray | None) -> str | None:
 
 @dataclasses.dataclass
 class Unfinished:
-    """The folder of a search that goes on."""
+    """The folder of a search, or of a map in the making, that goes on."""
 
     folder: Path
     kept: int = 0
@@ -70,33 +65,33 @@ class Unfinished:
     def opened(cls, folder: Path, wanted: dict[str, Any]) -> "Unfinished":
         """The folder, emptied where other settings filled it, which is told. Raises WriteError."""
         path = folder / SETTINGS
-        if folder.exists():
+        if folder.is_dir() and any(folder.iterdir()):
             try:
                 other = [name for name, value in wanted.items() if read_json(path).get(name) != value]
             except (ValueError, OSError, AttributeError):
                 other = ["format"]
             if other:
                 warn(f"{folder}: expected what a run with the same settings has kept, found another {', '.join(other)}")
-                remove(folder)
+                _empty(folder)
         write_json(path, wanted)
         return cls(folder)
 
     def recall(
         self,
-        detector: LoopDetector,
+        finder: CandidateFinder,
         mounting: Mounting | None,
-        given: Callable[[int], dict[str, Any]],
+        add: Callable[[Seen | None, list[Candidate]], None],
         *,
         missing: bool,
     ) -> None:
-        """Add what is kept to an empty detector; `given` has time and odometry of a frame.
+        """Call `add`, which adds to the `finder`, an empty one, with what is kept of each frame and its candidates.
 
         Ends at the first file that is not there or damaged and, unless scans may be `missing`, at the first frame whose
         scan could not be read.
         """
         while self._path.is_file():
             try:
-                frames, more = Index.load_with(self._path, weights_hash=detector.finder.index.weights_hash)
+                frames, more = Index.load_with(self._path, weights_hash=finder.index.weights_hash)
             except ValueError:
                 return
             shown, images = set(more["shown"].tolist()), iter(more["images"])
@@ -105,13 +100,12 @@ class Unfinished:
                 seen = Seen(np.array(descriptor), next(images), mounting) if row in shown else None
                 if seen is None and not missing:
                     return
-                found = [one for one in candidates if one.query == row]
-                detector.add_seen(seen, **given(row), candidates=found)
-            self.kept = len(detector)
+                add(seen, [one for one in candidates if one.query == row])
+            self.kept = len(finder.index)
 
-    def keep(self, detector: LoopDetector, *, all: bool = False) -> None:
+    def keep(self, finder: CandidateFinder, candidates: Sequence[Candidate] = (), *, all: bool = False) -> None:
         """Write the frames that are not kept, as soon as they fill a file, or `all` of them. Raises WriteError."""
-        finder, first, end = detector.finder, self.kept, len(detector)
+        first, end = self.kept, len(finder.index)
         if end - first < (1 if all else FRAMES):
             return
         frames = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
@@ -119,7 +113,7 @@ class Unfinished:
         shown = sorted(set(range(first, end)) - set(finder.missing))
         images = [finder.images[row] for row in shown]
         more = {"shown": np.array(shown, np.int64), "images": np.stack(images) if images else np.zeros(0, np.uint8)}
-        content = frames.to_bytes(more | _columns([one for one in detector.candidates if one.query >= first]))
+        content = frames.to_bytes(more | _columns([one for one in candidates if one.query >= first]))
         with replacing(self._path) as temporary:
             temporary.write_bytes(content)
         self.kept = end
@@ -130,14 +124,34 @@ class Unfinished:
         return self.folder / f"{self.kept:06d}{ENDING}"
 
 
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Make the folder, keep other processes out of it, and remove it in the end where nothing is in it.
+
+    Raises BlockingIOError where another process has it.
+    """
+    with writing(folder, *folder.parents):
+        folder.mkdir(parents=True, exist_ok=True)
+    with alone_in(folder):
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
 def remove(folder: Path) -> None:
     """Remove what is kept in a folder, and the folder where nothing else is in it."""
+    _empty(folder)
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def _empty(folder: Path) -> None:
     (folder / SETTINGS).unlink(missing_ok=True)  # first, so that what a kill here leaves is of no settings
     for path in folder.glob(f"[0-9]*{ENDING}"):
         path.unlink()
     remove_half_written(folder)
-    with contextlib.suppress(OSError):
-        folder.rmdir()
 
 
 def _columns(candidates: list[Candidate]) -> dict[str, np.ndarray]:

@@ -22,6 +22,7 @@ from sglpr_jax.data.density_image import (
     MAX_VOXELS,
     REACH_M,
 )
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.files import replacing, write_json
 from sglpr_jax.models.config import ModelConfig
@@ -99,7 +100,9 @@ def input_description(config: ModelConfig) -> dict[str, str]:
     return {
         "input": f"bev: float32 [b, {grid.height}, {grid.width}]",
         "output": f"descriptor: float32 [b, {config.head.descriptor_size}] of length 1; compared by Euclidean distance",
-        "points": "metres in the LiDAR frame: x forward, y left, z up",
+        "points": "finite ones, metres in the LiDAR frame: x forward, y left, z up, of an upright sensor "
+        f"{MODEL_HEIGHT_M} m above the ground; of one that is h m above it, with the direction n of up in its frame "
+        f"(length 1): R p + (0, 0, h - {MODEL_HEIGHT_M}), R being the smallest rotation that turns n to (0, 0, 1)",
         **(_counts_of_points(grid) if config.image == "points" else _counts_of_voxels(grid)),
     }
 

@@ -111,6 +111,12 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     assert_one_line_error(command(*run, flat, "--odometry-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
     assert_one_line_error(command("loops", tmp_path, "--out", tmp_path / "found"), tmp_path)
+    folder = tmp_path / "late" / "sequences" / "08"
+    shutil.copytree(town / "sequences" / "08", folder)
+    times = (folder / "times.txt").read_text().splitlines()
+    (folder / "times.txt").write_text("\n".join([*times[:3], times[1], *times[4:]]))
+    ended = command("loops", tmp_path / "late", "--out", tmp_path / "found")
+    assert_one_line_error(ended, "times.txt, line 4: expected a time >=")
     assert not (tmp_path / "found").exists()
 
 

@@ -1,4 +1,4 @@
-"""bin/loops that is killed again and again ends with the same files, to the byte, as one that was not."""
+"""bin/loops and bin/map, killed again and again, end with the same files, to the byte, as if they had not been."""
 
 import os
 import subprocess
@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sglpr_jax.data import open_recording
+from sglpr_jax.loops.graph_files import write_tum
 from sglpr_jax.sim import Sensor, write_dataset
 
 pytestmark = pytest.mark.slow
@@ -25,15 +27,15 @@ def arguments(tmp_path_factory) -> tuple[object, ...]:
     return (folder / "town", "--min-probability", "0.5")
 
 
-def start(arguments: tuple[object, ...], out: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "sglpr_jax.cli.loops", *arguments, "--out", out]
+def start(name: str, arguments: tuple[object, ...], out: Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", f"sglpr_jax.cli.{name}", *arguments, "--out", out]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     with (out.parent / "errors.txt").open("w") as errors:
         return subprocess.Popen(list(map(str, command)), stdout=subprocess.DEVNULL, stderr=errors, env=environment)
 
 
 def finish(arguments: tuple[object, ...], out: Path) -> dict[str, bytes]:
-    assert start(arguments, out).wait(TIMEOUT_S) == 0, (out.parent / "errors.txt").read_text()
+    assert start("loops", arguments, out).wait(TIMEOUT_S) == 0, (out.parent / "errors.txt").read_text()
     return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
@@ -49,7 +51,7 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(arguments, tmp_
     rng = np.random.default_rng(0)
     written = set()
     for name in ("000000.safetensors", "000050.safetensors"):
-        process = start(arguments, out)
+        process = start("loops", arguments, out)
         wait_for(process, out / "unfinished" / name)
         time.sleep(rng.uniform(0, 0.3))
         process.kill()
@@ -59,3 +61,23 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(arguments, tmp_
     found = finish(arguments, out)
     assert found == whole
     assert len(whole["loops.jsonl"].splitlines()) > 3
+
+
+def test_a_map_killed_again_and_again_ends_like_one_that_was_not(arguments, tmp_path):
+    positions = open_recording(arguments[0], "08").positions
+    poses = np.tile(np.eye(4), (SCANS, 1, 1))
+    poses[:, :3, 3] = positions
+    write_tum(tmp_path / "poses.tum", poses, np.arange(float(SCANS)))
+    given = (arguments[0], "--poses", tmp_path / "poses.tum", "--spacing-m", "0")
+    whole, out = tmp_path / "whole.safetensors", tmp_path / "killed.safetensors"
+    for name in ("000000.safetensors", "000050.safetensors"):
+        process = start("map", given, out)
+        wait_for(process, tmp_path / "killed.unfinished" / name)
+        process.kill()
+        process.wait()
+        assert not out.exists()
+    for path in (whole, out):
+        assert start("map", given, path).wait(TIMEOUT_S) == 0, (tmp_path / "errors.txt").read_text()
+    assert out.read_bytes() == whole.read_bytes()
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"whole.safetensors", "killed.safetensors", "poses.tum", "errors.txt"}

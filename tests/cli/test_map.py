@@ -1,12 +1,17 @@
+import errno
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sglpr_jax
+from sglpr_jax.cli import map as command_file
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops.graph_files import write_tum
-from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.loops.places import PlaceMap, map_recording
+from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.index import Index
 
@@ -44,8 +49,63 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, town, poses, tmp_path):
     assert best["place"] == "08/000020" and best["world_from_query"][2][3] == pytest.approx(position[2] + 0.1, abs=1e-6)
 
     again = ("map", town, "--seq", "08", "--poses", poses, "--add-to", out, "--out", out)
-    assert command(*again).status == 0
-    assert len(PlaceMap.load(out)) > 40
+    for _ in range(2):  # the same scans are taken once
+        assert command(*again).out == f"{out}: 40 places, 0 of them from 40 scans of 08\n"
+    assert len(PlaceMap.load(out)) == 40
+    assert {path.name for path in tmp_path.iterdir()} == {"town.safetensors", "poses.tum", "pose.json", "higher.json"}
+
+
+@pytest.mark.slow
+def test_bad_scans_are_told_and_skipped(command, town, poses, tmp_path):
+    folder = tmp_path / "town"
+    shutil.copytree(town / "sequences" / "08", folder / "sequences" / "08")
+    for scan in ("000003", "000021"):
+        (folder / "sequences/08/velodyne" / f"{scan}.bin").write_bytes(b"half")
+    out = tmp_path / "town.safetensors"
+    run = ("map", folder, "--poses", poses, "--out", out, "--spacing-m", "0")
+    assert_one_line_error(command(*run), "000003.bin")
+    assert not out.exists()
+    ended = command(*run, "--skip-bad")
+    assert ended.status == 0, ended.error
+    assert ended.out == f"{out}: 38 places, 38 of them from 40 scans of 08, 2 scans skipped\n"
+    assert [line[:14] for line in ended.error.splitlines() if "skipped" in line] == ["skipped 000003", "skipped 000021"]
+    assert not out.with_suffix(".unfinished").exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_was_found_and_the_same_command_goes_on(command, town, poses, tmp_path, monkeypatch):
+    def stopped(recording, params, given, *, should_stop, on_progress, **options):
+        def show(done):
+            on_progress(done)
+            if done == stop_at:
+                should_stop.signal = 2
+
+        return map_recording(recording, params, given, **options, should_stop=should_stop, on_progress=show)
+
+    out, other = tmp_path / "town.safetensors", tmp_path / "whole.safetensors"
+    run = ("map", town, "--seq", "08", "--poses", poses, "--spacing-m", "0")
+    assert command(*run, "--out", other).status == 0
+    monkeypatch.setattr(command_file, "map_recording", stopped)
+    add_to = ()
+    for stop_at, words in ((10, "10 places, 10 of them from 10 of 40"), (25, "25 places, 15 of them from 25 of 40")):
+        ended = command(*run, *add_to, "--out", out)
+        assert ended.status == 130 and ended.out == f"{out}: {words} scans of 08\n"
+        assert "the same command goes on from here" in ended.error
+        add_to = ("--add-to", out)
+        assert out.with_suffix(".unfinished").is_dir() and len(PlaceMap.load(out)) == stop_at
+    stop_at = 0
+    ended = command(*run, *add_to, "--out", out)
+    assert ended.status == 0 and ended.out == f"{out}: 40 places, 15 of them from 40 scans of 08\n"
+    assert out.read_bytes() == other.read_bytes()
+    assert not out.with_suffix(".unfinished").exists()
+
+
+def test_two_processes_do_not_make_one_map(command, town, poses, tmp_path):
+    out = tmp_path / "town.safetensors"
+    with alone(out.with_suffix(".unfinished")):
+        ended = command("map", town, "--seq", "08", "--poses", poses, "--out", out)
+    assert_one_line_error(ended, "town.unfinished: expected to be alone in it, found another process at work")
+    assert [path.name for path in tmp_path.iterdir()] == ["poses.tum"]
 
 
 def test_a_scan_without_ground_tells_no_height(command, places_file, tmp_path):
@@ -66,10 +126,51 @@ def places_file(tmp_path):
     return tmp_path / "one.safetensors"
 
 
+def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command, places_file, tmp_path):
+    scan = tmp_path / "dot.bin"
+    np.array([5, 0, 0, 1], np.float32).tofile(scan)
+    run = ("relocalize", scan, "--map", places_file)
+    assert_one_line_error(
+        command(*run, "--out", tmp_path / "pose.json"), "dot.bin: expected a scan that shows something"
+    )
+    assert not (tmp_path / "pose.json").exists()
+    assert_one_line_error(command(*run, "--weights", "sglpr"), "one.safetensors: expected descriptors of the weights")
+    content = places_file.read_bytes()
+    places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
+    assert_one_line_error(command(*run), "one.safetensors: expected an index as it was written, found a damaged one")
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_map_as_it_was_and_what_was_seen(
+    command, town, poses, places_file, tmp_path, monkeypatch
+):
+    before, write = places_file.read_bytes(), Path.write_bytes
+
+    def full(path, content):
+        if path.name.startswith(".one.safetensors."):
+            write(path, content[:100])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, content)
+
+    run = ("map", town, "--seq", "08", "--poses", poses, "--out", places_file, "--add-to", places_file)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        ended = command(*run)
+    assert_one_line_error(ended, "one.safetensors: expected to write it, found: No space left on device")
+    assert places_file.read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"one.safetensors", "one.unfinished", "poses.tum"}
+    assert command(*run).status == 0
+    assert len(PlaceMap.load(places_file)) > 1 and not (tmp_path / "one.unfinished").exists()
+
+
 def test_wrong_input_is_one_clear_error(command, town, poses, tmp_path):
     run = ("map", town, "--seq", "08", "--poses", poses)
     assert_one_line_error(command(*run, "--out", tmp_path / "town.npz"), "--out", ".safetensors", "town.npz")
     assert_one_line_error(command(*run, "--out", tmp_path / "a.safetensors", "--add-to", tmp_path / "none"), "none")
+    late = tmp_path / "late.tum"
+    late.write_text("0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    run = ("map", town, "--seq", "08", "--poses", late, "--out", tmp_path / "a.safetensors")
+    assert_one_line_error(command(*run), "late.tum, line 3: expected a time >= 2.0, found 1.0")
     scan = town / "sequences/08/velodyne/000020.bin"
     (tmp_path / "broken.safetensors").write_bytes(b"no map at all")
     ended = command("relocalize", scan, "--map", tmp_path / "broken.safetensors")

@@ -29,9 +29,9 @@ UNPOSED = {
 def test_commands_share_the_flags_of_a_recording_and_its_poses(command):
     assert tyro.cli(command, args=POSED[command]).source == PosedRecordingOptions()
     flags = ("--seq", "07", "--pose-source", "kitti", "--format", "nclt", "--sensor-height", "2.5")
-    flags += ("--poses", "p.csv", "--pose-format", "csv", "--times", "t.txt")
+    flags += ("--pose-topic", "/odom", "--poses", "p.csv", "--pose-format", "csv", "--times", "t.txt")
     found = tyro.cli(command, args=(*POSED[command], *flags)).source
-    assert found == PosedRecordingOptions("07", "kitti", "nclt", 2.5, Path("p.csv"), "csv", Path("t.txt"))
+    assert found == PosedRecordingOptions("07", "kitti", "nclt", 2.5, "/odom", Path("p.csv"), "csv", Path("t.txt"))
 
 
 @pytest.mark.parametrize("command", UNPOSED, ids=lambda command: command.__name__)
@@ -49,3 +49,5 @@ def test_the_recording_is_opened_as_they_say_and_described(town, capsys):
     assert "sensor: 2.00 m above the ground, as said" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"p\.csv: expected poses named for a plain folder"):
         PosedRecordingOptions("08", poses=Path("p.csv")).open(town)
+    with pytest.raises(ValueError, match="expected a bag, whose topic of poses is named, /odom, found sequences/NN"):
+        RecordingOptions("08", pose_topic="/odom").open(town)

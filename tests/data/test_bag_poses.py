@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from bags import FILES, header, typestore, write_bag
+from bags import FILES, TRANSFORMS, header, transforms, typestore, write_bag
+from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data import open_recording
-from sglpr_jax.data.formats.timed_poses import interpolate
+from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
 from sglpr_jax.data.warning import DataWarning
 
 CLOUD, ODOMETRY, POSE = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
@@ -31,11 +32,20 @@ def cloud(kind, seconds):
     )
 
 
-def pose(kind, seconds, position, name=ODOMETRY):
+def turned(seconds):
+    """A quaternion that goes about an axis that is no axis of the frame, by .2 radians a second."""
+    return Rotation.from_rotvec(0.2 * seconds * np.array([0.1, 0.2, 0.9])).as_quat()
+
+
+def never(seconds):
+    return (0.0, 0.0, 0.0, 1.0)
+
+
+def pose(kind, seconds, position, name=ODOMETRY, quaternion=(0.0, 0.0, 0.0, 1.0)):
     store = typestore(kind).types
     at = store["geometry_msgs/msg/Point"](x=position[0], y=position[1], z=position[2])
     plain = store["geometry_msgs/msg/Pose"](
-        position=at, orientation=store["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        position=at, orientation=store["geometry_msgs/msg/Quaternion"](*map(float, quaternion))
     )
     if name == POSE:
         return store[POSE](header=header(kind, seconds, "map"), pose=plain)
@@ -53,24 +63,37 @@ def scans(kind, seconds):
     return [("/points", CLOUD, LATE_S + t, cloud(kind, t)) for t in seconds]
 
 
-def poses(kind, topic, seconds, *, name=ODOMETRY, late=LATE_S, where=lambda t: (10 * t, -2 * t, 0.5)):
-    return [(topic, name, late + t, pose(kind, t, where(t), name)) for t in seconds]
+def poses(kind, topic, seconds, *, name=ODOMETRY, late=LATE_S, where=lambda t: (10 * t, -2 * t, 0.5), turns=turned):
+    return [(topic, name, late + t, pose(kind, t, where(t), name, turns(t))) for t in seconds]
 
 
-def opened(tmp_path, kind, messages):
+def tf(kind, topic, seconds, *found):
+    return [(topic, TRANSFORMS, LATE_S + t, transforms(kind, t, [one(t) for one in found])) for t in seconds]
+
+
+def expected_poses(times, base_from_lidar):
+    world_from_base = np.tile(np.eye(4), (len(times), 1, 1))
+    world_from_base[:, :3, :3] = Rotation.from_quat([turned(t) for t in times]).as_matrix()
+    world_from_base[:, :3, 3] = np.stack([10 * times, -2 * times, 0 * times + 0.5], 1)
+    return world_from_base @ base_from_lidar
+
+
+def opened(tmp_path, kind, messages, **options):
     messages = sorted(messages, key=lambda message: message[2])
-    return open_recording(write_bag(tmp_path / FILES[kind], kind, messages), sensor_height=1.7)
+    return open_recording(write_bag(tmp_path / FILES[kind], kind, messages), sensor_height=1.7, **options)
 
 
 @pytest.mark.parametrize("kind", FILES)
-@pytest.mark.parametrize(("name", "frames"), [(ODOMETRY, "base_link in odom"), (POSE, "in map")])
+@pytest.mark.parametrize(("name", "frames"), [(ODOMETRY, "base_link in odom"), (POSE, "a body in map")])
 def test_positions_are_interpolated_at_the_times_of_the_scans(tmp_path, kind, name, frames):
     times = np.arange(5.03, 6.9, 0.1)
     recording = opened(tmp_path, kind, scans(kind, times) + poses(kind, "/odom", np.arange(5.0, 7.1, 0.25), name=name))
     np.testing.assert_allclose(recording.times, times)
     np.testing.assert_allclose(recording.positions, np.stack([10 * times, -2 * times, 0 * times + 0.5], 1), atol=1e-5)
-    assert recording.pose_source == f"/odom ({frames}, interpolated)"
-    assert f"poses: /odom ({frames}, interpolated), over 18 x 4 m and 0 m of height" in recording.description[-1]
+    np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, np.eye(4)), atol=1e-5)
+    how = "interpolated" if name == POSE else "interpolated; taken as poses of lidar, since tf does not join the two"
+    assert recording.pose_source == f"/odom (9 poses of {frames}, {how})"
+    assert f"poses: /odom (9 poses of {frames}, {how}), over 18 x 4 m and 0 m of height" in recording.description[-1]
 
 
 def test_scans_without_a_pose_are_left_out_and_counted(tmp_path):
@@ -79,9 +102,11 @@ def test_scans_without_a_pose_are_left_out_and_counted(tmp_path):
     assert recording.ids == tuple(f"{i:06d}" for i in range(3, 8)) and len(recording.paths) == 5
     np.testing.assert_allclose(recording.times, times[3:])
     assert recording.pose_source == (
-        "/odom (base_link in odom, interpolated; 3 of 8 scans left out, which have no pose)"
+        "/odom (6 poses of base_link in odom, interpolated; taken as poses of lidar, since tf does not join the two; "
+        "3 of 8 scans left out, which have no pose)"
     )
     assert recording.points(4).shape == (4, 3)
+    np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times[3:], np.eye(4)), atol=1e-5)
 
 
 def test_the_topic_with_most_scans_is_taken_and_a_goal_is_none(tmp_path):
@@ -90,8 +115,14 @@ def test_the_topic_with_most_scans_is_taken_and_a_goal_is_none(tmp_path):
     half = poses("ros1", "/a_half", np.arange(5.0, 6.05, 0.1), where=lambda t: (0.0, 0.0, 0.0))
     all_of_them = poses("ros1", "/odom", times)
     recording = opened(tmp_path, "ros1", scans("ros1", times) + goal + half + all_of_them)
-    assert recording.pose_source == "/odom (base_link in odom, interpolated)"
+    assert recording.pose_source.startswith("/odom (20 poses of base_link in odom, interpolated")
     assert "poses not used: /a_half (poses for 60% of the scans), /goal (poses for 0% of the scans)" in recording.found
+    (tmp_path / "named").mkdir()
+    chosen = opened(tmp_path / "named", "ros1", scans("ros1", times) + half + all_of_them, pose_topic="/a_half")
+    assert len(chosen) == 12 and not chosen.positions.any() and chosen.pose_source.startswith("/a_half (11 poses of ")
+    for topic, words in (("/goal", "poses of most scans on /goal, found 0% of them"), ("/no", "/goal, /odom")):
+        with pytest.raises(ValueError, match=rf"drive\.bag: expected .*{words}"):
+            open_recording(tmp_path / FILES["ros1"], pose_topic=topic)
     (tmp_path / FILES["ros1"]).unlink()
     recording = opened(tmp_path, "ros1", scans("ros1", times) + goal)
     assert recording.positions is None and recording.pose_source is None and len(recording) == 20
@@ -111,9 +142,60 @@ def test_where_clocks_of_sensors_do_not_meet_the_recorders_is_taken(tmp_path):
 def test_poses_that_are_not_finite_are_none(tmp_path):
     times = np.arange(5.0, 6.0, 0.1)
     where = {5.0: (np.nan, 0.0, 0.0)}
-    track = poses("ros1", "/odom", times, where=lambda t: where.get(t, (1.0, 2.0, 3.0)))
+    track = poses("ros1", "/odom", times, where=lambda t: where.get(t, (1.0, 2.0, 3.0)), turns=never)
     recording = opened(tmp_path, "ros1", scans("ros1", times) + track)
     np.testing.assert_array_equal(recording.positions, np.tile([1.0, 2.0, 3.0], (10, 1)))
+
+
+QUARTER = Rotation.from_euler("xyz", [3.0, 1.0, 90.0], degrees=True).as_quat()
+BASE_FROM_LIDAR = np.eye(4)
+BASE_FROM_LIDAR[:3, :3], BASE_FROM_LIDAR[:3, 3] = Rotation.from_quat(QUARTER).as_matrix(), (1.0, 0.2, 1.5)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_poses_of_the_vehicle_become_those_of_the_lidar_where_tf_says_how_it_is_mounted(tmp_path, kind):
+    times = np.arange(5.03, 6.9, 0.1)
+    mast = ("base_link", "mast", (1.0, 0.2, 1.5), (0, 0, 0, 1))
+    down = Rotation.from_quat(QUARTER).inv().as_quat()
+    fixed = tf(kind, "/tf_static", [5.0], lambda t: mast, lambda t: ("lidar", "/mast", (0, 0, 0), down))
+    wheel = tf(kind, "/tf", np.arange(5.0, 7.1, 0.25), lambda t: ("base_link", "wheel", (0, 0, 0), turned(9 * t)))
+    track = poses(kind, "/odom", np.arange(5.0, 7.1, 0.25))
+    recording = opened(tmp_path, kind, scans(kind, times) + fixed + wheel + track)
+    np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, BASE_FROM_LIDAR), atol=1e-5)
+    np.testing.assert_array_equal(recording.positions, recording.world_from_lidar[:, :3, 3])
+    assert recording.pose_source == "/odom (9 poses of base_link in odom, interpolated, moved to lidar by tf)"
+
+
+def test_without_a_topic_of_poses_tf_is_one(tmp_path):
+    """Even where its fixed transforms are said again and again, as ROS 1 did."""
+    times, often = np.arange(5.0, 9.0, 0.1), np.arange(4.9, 9.2, 0.05)
+    found = (
+        lambda t: ("odom", "base_link", (10 * t, -2 * t, 0.5), turned(t)),
+        lambda t: ("base_link", "lidar", (1.0, 0.2, 1.5), QUARTER),
+        lambda t: ("base_link", "arm", (t, 0.0, 0.0), (0, 0, 0, 1)),
+    )
+    recording = opened(tmp_path, "ros1", scans("ros1", times) + tf("ros1", "/tf", often, *found))
+    np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, BASE_FROM_LIDAR), atol=1e-5)
+    said = "/tf/odom/base_link (86 poses of base_link in odom, interpolated, moved to lidar by tf)"
+    assert recording.pose_source == said
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (np.nan, 0.0, 0.0, 1.0)])
+def test_rotations_that_nobody_measured_are_none(tmp_path, quaternion):
+    times = np.arange(5.0, 6.0, 0.1)
+    track = poses("ros2", "/gps", times, turns=lambda t: quaternion)
+    recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
+    assert recording.world_from_lidar is None and len(recording.positions) == len(times)
+    assert recording.pose_source.endswith("interpolated; its rotations never change or are none)")
+
+
+def test_rotations_between_two_are_those_of_an_even_turn():
+    stamps = np.array([2.0, 0.0, 1.0, 2.0])
+    quaternions = np.stack([turned(t) for t in stamps]) * np.array([[1], [1], [-1], [1]])  # -q turns as q does
+    times = np.array([-1.0, 0.0, 0.25, 1.0, 1.9, 2.5])
+    found = interpolate_turns(stamps, quaternions, times)
+    true = Rotation.from_quat([turned(t) for t in times.clip(0, 2)])
+    assert (found * true.inv()).magnitude().max() < 1e-9
 
 
 def test_heights_that_run_as_far_as_a_road_are_warned_of(tmp_path):

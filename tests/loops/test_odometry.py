@@ -1,10 +1,14 @@
 """Odometry of every format is the same poses; what is none is one clear error."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
+from recordings import of_scans
 
 from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_tum
-from sglpr_jax.loops.odometry import read_odometry
+from sglpr_jax.loops.odometry import at_scans, read_odometry
 from sglpr_jax.loops.transforms import transform
 
 
@@ -21,6 +25,36 @@ def test_every_format_gives_the_same_poses(tmp_path, poses):
     for name, format in (("kitti", "kitti"), ("tum", "auto"), ("tum", "tum"), ("lidar", "lidar")):
         np.testing.assert_allclose(read_odometry(tmp_path / f"{name}.txt", format=format), poses, atol=1e-6)
     np.testing.assert_allclose(read_odometry(tmp_path / "graph.g2o"), poses, atol=1e-6)
+
+
+def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses):
+    times = np.array([-0.5, 0.5, 1.25, 4.0, 4.05, 6.0])
+    clouds = {Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(len(times))}
+    recording = of_scans(clouds, times=times, positions=np.arange(18.0).reshape(6, 3))
+    path = tmp_path / "odometry.tum"
+    write_tum(path, poses, np.arange(5.0))
+    found, given = at_scans(recording, read_odometry(path), path, format="auto")
+    assert found.ids == ("1", "2", "3", "4")
+    np.testing.assert_array_equal(found.positions, recording.positions[1:5])
+    at = np.array([0.5, 1.25, 4.0, 4.0])
+    between = np.stack([transform(x, 0.1 * x, 0.3 * x) for x in at])
+    np.testing.assert_allclose(given, between, atol=1e-6)
+    assert found.found == (
+        "odometry: 5 poses of odometry.tum, interpolated at the times of the scans; 2 of 6 scans left out, which have "
+        "no pose",
+    )
+    late = dataclasses.replace(recording, times=times + 3)
+    with pytest.raises(
+        ValueError, match=r"odometry\.tum: expected odometry of 6 poses.* 2\.5 to 9\.0 s, found 5 of 0\.0 to"
+    ):
+        at_scans(late, poses, path, format="tum")
+    write_kitti(tmp_path / "kitti.txt", poses)
+    for same, name, format in (
+        (recording, "kitti.txt", "kitti"),
+        (dataclasses.replace(recording, times=None), "odometry.tum", "tum"),
+    ):
+        unchanged = at_scans(same, poses, tmp_path / name, format=format)
+        assert unchanged[0] is same and unchanged[1] is poses
 
 
 @pytest.mark.parametrize(

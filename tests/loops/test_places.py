@@ -9,7 +9,9 @@ from recordings import with_points
 import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import rotated
-from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops import unfinished
+from sglpr_jax.loops.places import PlaceMap, map_recording
 from sglpr_jax.loops.transforms import inverse, yaw_of
 
 MAPPED = 60
@@ -57,20 +59,94 @@ def test_a_scan_from_elsewhere_is_improbable(drive, places, params):
 
 
 @pytest.mark.slow
-def test_a_map_comes_back_from_its_file_and_two_are_merged(drive, places, params, tmp_path):
+def test_a_map_comes_back_from_its_file(places, tmp_path):
     path = tmp_path / "town.safetensors"
     places.save(path)
     again = PlaceMap.load(path, weights_hash=places.index.weights_hash)
     assert len(again) == len(places) == MAPPED // 2 and again.index.ids == places.index.ids
     np.testing.assert_array_equal(again.images, places.images)
     np.testing.assert_array_equal(again.world_from_place, places.world_from_place)
-    both = again.merged(places)
-    assert len(both) == MAPPED and both.relocate(params, drive.record(20))[0].probability > 0.99
     whole = path.read_bytes()
     for place in np.linspace(0, len(whole) - 1, 20).astype(int):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         with pytest.raises(ValueError, match=r"town\.safetensors: expected an index"):
             PlaceMap.load(path)
+
+
+@pytest.mark.slow
+def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, first, places, params):
+    recording, poses = first
+    sunday = dataclasses.replace(recording, name="sunday")
+    shifted = poses.copy()
+    shifted[:, 2, 3] += 1.0
+    other = PlaceMap.of(sunday, params, shifted)
+    both = places.merged(other)
+    assert both.index.ids == places.index.ids + other.index.ids
+    np.testing.assert_array_equal(both.index.positions, both.world_from_place[:, :3, 3])
+    np.testing.assert_array_equal(both.world_from_place[MAPPED // 2 :], shifted)
+    found = both.relocate(params, drive.record(20), candidates=2)
+    assert {one.place.split("/")[0] for one in found} == {"08", "sunday"}
+    assert min(one.probability for one in found) > 0.99
+
+    again = both.merged(places).merged(other)
+    assert again.index.to_bytes() == both.index.to_bytes()
+    np.testing.assert_array_equal(again.images, both.images)
+    moved = dataclasses.replace(places, world_from_place=shifted)
+    assert len(both.merged(moved)) == 3 * MAPPED // 2
+
+
+@pytest.mark.slow
+def test_a_map_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(first, places, params, tmp_path, monkeypatch):
+    monkeypatch.setattr(unfinished, "FRAMES", 5)
+    recording, poses = first
+    reached, seen = [], []
+    read = with_points(recording, lambda path: seen.append(path) or recording.read(path, None, False).points)
+    for scans in (0, 4, 9, 100):
+        asked = []
+        made = map_recording(
+            read,
+            params,
+            poses,
+            kept_in=tmp_path / "kept",
+            should_stop=lambda asked=asked, scans=scans: asked.append(None) or len(asked) > scans,
+        )
+        reached.append((len(made.places), made.scans))
+    assert reached == [(0, 0), (4, 4), (13, 13), (MAPPED // 2, MAPPED // 2)]
+    assert len(seen) == MAPPED // 2  # no scan was read twice
+    made.places.save(tmp_path / "stopped.safetensors")
+    places.save(tmp_path / "whole.safetensors")
+    assert (tmp_path / "stopped.safetensors").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
+
+    with pytest.warns(DataWarning, match="the same settings has kept, found another spacing_m"):
+        other = map_recording(read, params, poses, spacing_m=30.0, kept_in=tmp_path / "kept")
+    assert 1 < len(other.places) < MAPPED // 2
+    moved = poses.copy()
+    moved[:, 0, 3] += 1
+    with pytest.warns(DataWarning, match="the same settings has kept, found another poses"):
+        map_recording(read, params, moved, spacing_m=30.0, kept_in=tmp_path / "kept", should_stop=lambda: True)
+
+
+@pytest.mark.slow
+def test_scans_that_cannot_be_read_are_left_out_of_a_map(first, places, params, tmp_path):
+    recording, poses = first
+    broken = {recording.paths[row] for row in (0, 7)}
+
+    def points_of(path):
+        if path in broken:
+            raise ValueError("expected a whole scan, found half of one")
+        return recording.read(path, None, False).points
+
+    bad, said = with_points(recording, points_of), []
+    with pytest.raises(ValueError, match="found half of one"):
+        PlaceMap.of(bad, params, poses)
+    options = {"on_bad_scan": lambda scan, error: said.append(scan), "kept_in": tmp_path / "kept"}
+    for _ in range(2):  # the second one reads nothing
+        made = map_recording(bad, params, poses, **options)
+        assert made.skipped == (recording.ids[0], recording.ids[7]) == tuple(said)
+        names = [name for row, name in enumerate(places.index.ids) if row not in (0, 7)]
+        assert made.places.index.ids == names
+    with pytest.raises(ValueError, match="found half of one"):  # without leave to skip, the scan is read again
+        map_recording(bad, params, poses, kept_in=tmp_path / "kept")
 
 
 @pytest.mark.slow
@@ -80,9 +156,12 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
     with pytest.raises(ValueError, match="expected a pose for each of 30 scans of a recording, found 3"):
         PlaceMap.of(recording, params, poses[:3])
     assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
-    empty = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
+    empty = with_points(recording, lambda path: np.full((1, 3), 5, np.float32))
     with pytest.raises(ValueError, match="08: expected scans that show something, found 30 empty ones"):
         PlaceMap.of(dataclasses.replace(empty, label_paths=()), params, poses)
+    at_origin = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
+    with pytest.raises(ValueError, match=r"scan 000000 of sequence 08: expected points around the sensor"):
+        PlaceMap.of(dataclasses.replace(at_origin, label_paths=()), params, poses)
     places.index.save(tmp_path / "index.safetensors")
     with pytest.raises(ValueError, match="expected a map of places, found an index without images"):
         PlaceMap.load(tmp_path / "index.safetensors")

@@ -141,19 +141,25 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     broken |= set(recording.paths)
     with pytest.raises(ValueError, match="expected at least one readable scan, found none"):
         find_loops(bad, params, config=CONFIG, on_bad_scan=lambda scan, error: None)
+    for cloud, words in (
+        (np.full((1, 3), 5, np.float32), "08: expected scans that show something, found 24 empty ones"),
+        (np.full((9, 3), np.nan, np.float32), "scan 000000 of sequence 08: expected finite points, found none among 9"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            find_loops(with_points(recording, lambda path, cloud=cloud: cloud), params, config=CONFIG)
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):
     recording, odometry = twice
-    detector = sglpr_jax.LoopDetector(params, config=CONFIG)
-    base = unfinished.settings(recording, detector, odometry)
+    finder = sglpr_jax.LoopDetector(params, config=CONFIG).finder
+    base = unfinished.settings(recording, finder, odometry=odometry)
     tilted = dataclasses.replace(recording, mounting=Mounting(2.0))
     others = (
-        unfinished.settings(tilted, detector, odometry),
-        unfinished.settings(recording, detector, odometry + 1e-9),
-        unfinished.settings(recording, detector, None),
-        unfinished.settings(recording, sglpr_jax.LoopDetector(params), odometry),
-        unfinished.settings(dataclasses.replace(recording, times=recording.times + 1), detector, odometry),
+        unfinished.settings(tilted, finder, odometry=odometry),
+        unfinished.settings(recording, finder, odometry=odometry + 1e-9),
+        unfinished.settings(recording, finder, odometry=None),
+        unfinished.settings(recording, sglpr_jax.LoopDetector(params).finder, odometry=odometry),
+        unfinished.settings(dataclasses.replace(recording, times=recording.times + 1), finder, odometry=odometry),
     )
-    assert base == unfinished.settings(recording, detector, odometry.copy())
+    assert base == unfinished.settings(recording, finder, odometry=odometry.copy())
     assert all(other != base for other in others)

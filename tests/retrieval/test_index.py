@@ -55,6 +55,13 @@ def test_it_comes_back_from_its_file_and_goes_on_growing(tmp_path):
     assert again.query(draw(1, seed=9)[0]).rows.tolist() == [300] and again.ids[-1] == "new" and len(index) == 300
 
 
+def test_equal_places_are_equal_bytes():
+    index = Index.empty(4)
+    index.add(np.eye(4), positions=np.zeros((4, 3)))
+    contents = {index.to_bytes({"more": np.arange(n)}) for n in (3,) * 20}
+    assert len(contents) == 1
+
+
 def test_an_empty_index_can_be_kept(tmp_path):
     Index.empty(WIDTH).save(tmp_path / "empty.safetensors")
     again = Index.load(tmp_path / "empty.safetensors")

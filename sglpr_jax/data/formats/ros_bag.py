@@ -5,48 +5,19 @@ import threading
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.livox import CUSTOM_MSG, POINT, read_custom_msg
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
 from sglpr_jax.data.formats.ros_message import RosMessage
-from sglpr_jax.data.formats.ros_poses import POSES
+from sglpr_jax.data.formats.ros_poses import POSES, TRANSFORMS, read_transforms
+from sglpr_jax.data.formats.ros_tracks import Stamps, Track, tracks_of
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
 """Types of messages that are scans."""
-
-
-class Stamps(NamedTuple):
-    """When the messages of a topic were made."""
-
-    recorded: Int64[np.ndarray, " n"]
-    """By the recorder, nanoseconds."""
-    own: Float[np.ndarray, " n"]
-    """By their own headers, seconds."""
-
-    @property
-    def orderly(self) -> bool:
-        """Whether their own times are some, and do not go back."""
-        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all())
-
-    @property
-    def seconds(self) -> Float[np.ndarray, " n"]:
-        """Their own times where these are orderly, else the recorder's."""
-        return self.own if self.orderly else self.recorded / 1e9
-
-
-class Track(NamedTuple):
-    """The positions on a topic of poses."""
-
-    stamps: Stamps
-    positions: Float[np.ndarray, "n 3"]
-    """Metres."""
-    frames: str
-    """What was where: "base_link in odom"."""
 
 
 class RosBag:
@@ -88,14 +59,22 @@ class RosBag:
         return Stamps(np.array([time for time, _ in found], np.int64), np.array([time for _, time in found], float))
 
     def track(self, topic: str) -> Track:
-        """The positions on a topic of poses, those that are finite. Reads the bag once."""
+        """The poses on a topic of poses, those that are finite. Reads the bag once."""
         read = POSES[self.topics[topic]]
         with self._lock, _broken(self.paths[0]):
-            found = [(time, read(message)) for time, message in self._messages(topic)]
-        finite = [(time, pose) for time, pose in found if np.isfinite(pose.position).all()]
-        stamps = Stamps(np.array([t for t, _ in finite], np.int64), np.array([pose.time for _, pose in finite], float))
-        positions = np.array([pose.position for _, pose in finite], np.float64).reshape(-1, 3)
-        return Track(stamps, positions, finite[0][1].frames if finite else "")
+            return Track.of((time, read(message)) for time, message in self._messages(topic))
+
+    def transforms(self) -> list[Track]:
+        """What tf says: the poses of each frame in its parent's. Reads the bag once for each topic of tf."""
+        topics = sorted(topic for topic, kind in self.topics.items() if kind in TRANSFORMS)
+        with self._lock, _broken(self.paths[0]):
+            messages = [pair for topic in topics for pair in self._messages(topic)]
+            return tracks_of((time, pose) for time, message in messages for pose in read_transforms(message))
+
+    def frame(self, topic: str, time: int) -> str:
+        """The frame of a message recorded at this time (ns), as its header says."""
+        with self._lock, _broken(self.paths[0]):
+            return next(self._messages(topic, time))[1].header().frame
 
     def cloud(self, topic: str, time: int, nth: int) -> Records:
         """The `nth` cloud of a topic among those recorded at this time (ns). Raises ValueError for a broken one."""

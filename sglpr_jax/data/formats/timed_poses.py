@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
+from scipy.spatial.transform import Rotation
 
 WIDEST_S = 1.0
 """Between poses farther apart in time nothing is interpolated."""
@@ -79,3 +80,16 @@ def interpolate(
     near = stamps[later] - stamps[later - 1] <= WIDEST_S
     within = (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
     return Interpolated(near & within, np.stack([np.interp(times, stamps, axis) for axis in positions.T], axis=1))
+
+
+def interpolate_turns(
+    stamps: Float[np.ndarray, " n"], quaternions: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
+) -> Rotation:
+    """Return the rotations at `times`, turning evenly between those at `stamps`, of which there are two or more."""
+    order = np.argsort(stamps, kind="stable")
+    stamps, quaternions = stamps[order], quaternions[order]
+    later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
+    before, after = Rotation.from_quat(quaternions[later - 1]), Rotation.from_quat(quaternions[later])
+    widths = stamps[later] - stamps[later - 1]
+    shares = ((times - stamps[later - 1]) / np.where(widths > 0, widths, 1)).clip(0, 1)
+    return before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())

@@ -42,6 +42,7 @@ def open_recording(
     poses: Path | str | None = None,
     pose_format: PoseFormat = "auto",
     times: Path | str | None = None,
+    pose_topic: str | None = None,
 ) -> Recording:
     """Open one sequence of `root`, whatever its layout.
 
@@ -49,8 +50,8 @@ def open_recording(
     and is not used for the others; `format` tells what each point of a .bin is. `sensor_height` (metres over the
     ground) says how the sensor was mounted; "auto" estimates it, and the tilt, from some scans where the layout does
     not tell. `poses` and `times` are the pose file of a plain folder and its file of seconds, where they do not lie
-    beside the scans. Raises FileNotFoundError where something is missing, ValueError where a file is malformed, or
-    poses are named for a layout that has its own.
+    beside the scans; `pose_topic` is the topic of a bag's poses, where it has several. Raises FileNotFoundError where
+    something is missing, ValueError where a file is malformed, or poses are named for a layout that has its own.
 
     Example:
       recording = open_recording("KITTI", "08")
@@ -65,8 +66,11 @@ def open_recording(
     given = next((path for path in (poses, times) if path is not None), None)
     if given is not None and not reader.takes_poses:
         raise ValueError(f"{given}: expected poses named for a plain folder of scans, found {root}: {reader.layout}")
+    if pose_topic is not None and not reader.takes_pose_topic:
+        raise ValueError(f"{root}: expected a bag, whose topic of poses is named, {pose_topic}, found {reader.layout}")
     pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
-    recording = reader.open(root, name, ReadOptions(pose_source, format, pose_file, pose_format, times_file))
+    options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, pose_topic)
+    recording = reader.open(root, name, options)
     return mounted(recording, sensor_height, known=reader.knows_mounting)
 
 

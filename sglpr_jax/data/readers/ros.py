@@ -1,8 +1,8 @@
 """Recordings of ROS: a .bag, an .mcap, a folder of ROS 2 (metadata.yaml), or a folder of .bag or .mcap files.
 
 A topic of point clouds is a recording. Where there is one, it has the bag's name; of several, each has its topic's,
-with _ for /. Positions are those of the topic of poses that most scans have a pose on, interpolated; not the LiDAR's,
-but those of the frame that the topic is about.
+with _ for /. Poses are those of the topic of poses that most scans have a pose on, interpolated. They are moved to the
+LiDAR where tf says how it is mounted; else they stay those of the frame that the topic is about.
 """
 
 import dataclasses
@@ -10,9 +10,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
-from sglpr_jax.data.formats.ros_bag import RosBag, Stamps
-from sglpr_jax.data.formats.timed_poses import Interpolated, interpolate
+from sglpr_jax.data.formats.ros_bag import RosBag
+from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform, poses_of
+from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
 from sglpr_jax.data.formats.trajectory import check_height
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
@@ -33,11 +35,11 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(_topics(root, RosBag(paths))) if paths else ()
 
 
-def open_recording(root: Path, name: str) -> Recording:
-    """Open the point clouds of one topic, with poses where the bag has them.
+def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> Recording:
+    """Open the point clouds of one topic, with poses where the bag has them, of `pose_topic` where it is named.
 
-    Reads the bag once for the times, and once for each topic of poses; where poses are found, scans without one are
-    left out. Raises as `recording_names` does.
+    Reads the bag once for the times, and once for each topic of poses and of tf; where poses are found, scans without
+    one are left out. Raises as `recording_names` does, and ValueError where `pose_topic` has no poses of most scans.
     """
     bag = RosBag(bag_files(root))
     topic = _topics(root, bag)[name]
@@ -60,7 +62,8 @@ def open_recording(root: Path, name: str) -> Recording:
         on_disk=False,
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
-    return _with_poses(recording, bag, stamps)
+    lidar = bag.frame(topic, int(recorded[0])).strip("/")
+    return _with_poses(recording, bag, stamps, pose_topic, lidar)
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
@@ -80,39 +83,82 @@ def _topics(root: Path, bag: RosBag) -> dict[str, str]:
     return {topic.strip("/").replace("/", "_"): topic for topic in topics}
 
 
-def _with_poses(recording: Recording, bag: RosBag, scans: Stamps) -> Recording:
-    """The recording with the positions of the topic that has most of its scans, and the others in words."""
-    tracks = {topic: _positions(bag, topic, scans) for topic in bag.pose_topics}
-    shares = {topic: float(found.kept.mean()) for topic, (found, _) in tracks.items()}
-    best = max(shares, key=lambda topic: shares[topic], default="")
+def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
+    """The recording with the poses of `topic` or, without it, of that which most scans have a pose on.
+
+    `lidar` is the frame of the scans. The other topics are told.
+    """
+    transforms = bag.transforms()
+    tracks = {one: bag.track(one) for one in bag.pose_topics} | _tracks_of_lidar(transforms, lidar)
+    if topic is not None and topic not in tracks:
+        found = ", ".join(tracks) or "none"
+        raise ValueError(f"{bag.paths[0]}: expected a topic of poses {topic}, found {found}")
+    clocks = {one: _clocks(track, scans) for one, track in tracks.items()}
+    placed = {one: interpolate(clocks[one][0], track.positions, clocks[one][1]) for one, track in tracks.items()}
+    shares = {one: float(found.kept.mean()) for one, found in placed.items()}
+    best = max(shares, key=lambda one: shares[one], default="") if topic is None else topic
     used = best if shares.get(best, 0) >= LEAST_SHARE else ""
-    others = [f"{topic} (poses for {share:.0%} of the scans)" for topic, share in shares.items() if topic != used]
+    if topic is not None and not used:
+        raise ValueError(f"{bag.paths[0]}: expected poses of most scans on {topic}, found {shares[topic]:.0%} of them")
+    others = [f"{one} (poses for {share:.0%} of the scans)" for one, share in shares.items() if one != used]
     said = (*recording.found, *([f"poses not used: {', '.join(others)}"] if others else []))
     if not used:
         return dataclasses.replace(recording, found=said)
-    (kept, positions), frames = tracks[used]
+    kept, positions = placed[used]
     check_height(positions[kept], path=bag.paths[0])
-    missing = len(kept) - int(kept.sum())
-    left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
     chosen = np.flatnonzero(kept)
+    poses, how = _of_lidar(tracks[used], clocks[used], positions, transforms, lidar)
+    missing = len(kept) - len(chosen)
+    left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
     return dataclasses.replace(
         recording,
         ids=tuple(recording.ids[i] for i in chosen),
         paths=tuple(recording.paths[i] for i in chosen),
-        positions=positions[kept],
+        positions=positions[kept] if poses is None else poses[kept, :3, 3],
         times=scans.seconds[kept],
-        pose_source=f"{used} ({frames}, interpolated{left_out})",
+        pose_source=f"{used} ({tracks[used]}, {how}{left_out})",
+        world_from_lidar=None if poses is None else poses[kept],
         found=said,
     )
 
 
-def _positions(bag: RosBag, topic: str, scans: Stamps) -> tuple[Interpolated, str]:
-    """Where the scans were by a topic: by the messages' own times or, where those do not meet, by the recorder's."""
-    track = bag.track(topic)
-    own = interpolate(track.stamps.own, track.positions, scans.own)
-    if scans.orderly and track.stamps.orderly and own.kept.mean() >= LEAST_SHARE:
-        return own, track.frames
-    return interpolate(track.stamps.recorded / 1e9, track.positions, scans.recorded / 1e9), track.frames
+def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
+    """The transforms of tf that move the LiDAR's frame, by names like those of topics."""
+    moving = (track for track in transforms if track.moves)
+    return {
+        f"/tf/{track.frame}/{track.child}": track
+        for track in moving
+        if fixed_transform(transforms, track.child, lidar) is not None
+    }
+
+
+def _clocks(track: Track, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
+    """Seconds of the poses and of the scans: by the messages' own times or, where those do not meet, the recorder's."""
+    if scans.orderly and track.stamps.orderly:
+        own = interpolate(track.stamps.own, track.positions, scans.own)
+        if own.kept.mean() >= LEAST_SHARE:
+            return track.stamps.own, scans.own
+    return track.stamps.recorded / 1e9, scans.recorded / 1e9
+
+
+def _of_lidar(
+    track: Track,
+    clocks: tuple[np.ndarray, np.ndarray],
+    positions: Float[np.ndarray, "q 3"],
+    transforms: list[Track],
+    lidar: str,
+) -> tuple[Float[np.ndarray, "q 4 4"] | None, str]:
+    """The LiDAR's poses by a track that tells rotations, None by another one; and how they were made, in words."""
+    if not track.turned:
+        return None, "interpolated; its rotations never change or are none"
+    poses = poses_of(positions, interpolate_turns(clocks[0], track.quaternions, clocks[1]))
+    child = track.child.strip("/")
+    if not child or child == lidar:
+        return poses, "interpolated"
+    child_from_lidar = fixed_transform(transforms, child, lidar)
+    if child_from_lidar is None:
+        return poses, f"interpolated; taken as poses of {lidar or 'the LiDAR'}, since tf does not join the two"
+    return poses @ child_from_lidar, f"interpolated, moved to {lidar} by tf"
 
 
 def _read(
@@ -135,7 +181,8 @@ def _read(
 READER = Reader(
     layout="*.bag, *.mcap or a folder of ROS 2 (ROS)",
     recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name),
+    open=lambda root, name, options: open_recording(root, name, pose_topic=options.pose_topic),
     knows_mounting=False,
     rank=8,
+    takes_pose_topic=True,
 )

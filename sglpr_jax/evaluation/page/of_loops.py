@@ -78,7 +78,7 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
 def _sure(found: FoundLoops) -> str:
     """How many of the pairs of each probability are loops, where true positions are known."""
     if found.recording.positions is None or found.model is None:
-        return missing("How many of the pairs are loops is not known: the recording has no poses.")
+        return missing("How many of the pairs are loops is not known: the recording has no poses to judge by.")
     bins = reliability_of(found.candidates, found.model, found.recording.positions)
     if not bins:
         return missing("No pair was looked at.")
