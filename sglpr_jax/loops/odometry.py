@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
+from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.choices import OdometryFormat
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
-from sglpr_jax.loops.transforms import from_quaternions, quaternions
+from sglpr_jax.loops.transforms import quaternions
 from sglpr_jax.poses import are_rotations
 
 LEAST_SHARE = 0.5
@@ -57,12 +57,12 @@ def at_scans(
             f"most 1 s apart about the times of these, {times[0]:.1f} to {times[-1]:.1f} s, found {len(odometry)} of "
             f"{stamps[0]:.1f} to {stamps[-1]:.1f} s"
         )
-    turned = interpolate_turns(stamps, quaternions(odometry), times).as_quat()
+    turned = interpolate_turns(stamps, quaternions(odometry), times)
     missing = len(kept) - int(kept.sum())
     left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
     said = f"odometry: {len(odometry)} poses of {path.name}, interpolated at the times of the scans{left_out}"
     chosen = only(recording, np.flatnonzero(kept).tolist())
-    return dataclasses.replace(chosen, found=(*chosen.found, said)), from_quaternions(positions, turned)[kept]
+    return dataclasses.replace(chosen, found=(*chosen.found, said)), poses_of(positions, turned)[kept]
 
 
 def is_own(path: Path, root: Path) -> bool:

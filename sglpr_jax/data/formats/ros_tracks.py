@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
-from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.ros_poses import StampedPose
+from sglpr_jax.data.formats.timed_poses import poses_of
 
 UNIT = 0.01
 """A quaternion's length may be off by so much."""
@@ -88,10 +88,13 @@ def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
 
 def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
     """frame_from_other, through frames that do not move to each other; None where these do not join the two."""
+    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+
     steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
         if len(track) and not track.moves and abs(np.linalg.norm(track.quaternions[0]) - 1) <= UNIT:
-            frame_from_child = poses_of(track.positions[:1], Rotation.from_quat(track.quaternions[:1]))[0]
+            turned = Rotation.from_quat(track.quaternions[:1]).as_matrix()
+            frame_from_child = poses_of(track.positions[:1], turned)[0]
             steps[track.frame].append((track.child, frame_from_child))
             steps[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
     reached, queue = {frame: np.eye(4)}, [frame]
@@ -101,11 +104,3 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
                 reached[there] = reached[here] @ here_from_there
                 queue.append(there)
     return reached.get(other)
-
-
-def poses_of(positions: Float[np.ndarray, "n 3"], turned: Rotation) -> Float[np.ndarray, "n 4 4"]:
-    """Positions and rotations as matrices."""
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, :3, :3] = turned.as_matrix()
-    poses[:, :3, 3] = positions
-    return poses

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
-from scipy.spatial.transform import Rotation
 
 WIDEST_S = 1.0
 """Between poses farther apart in time nothing is interpolated."""
@@ -84,12 +83,22 @@ def interpolate(
 
 def interpolate_turns(
     stamps: Float[np.ndarray, " n"], quaternions: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
-) -> Rotation:
+) -> Float[np.ndarray, "q 3 3"]:
     """Return the rotations at `times`, turning evenly between those at `stamps`, of which there are two or more."""
+    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+
     order = np.argsort(stamps, kind="stable")
     stamps, quaternions = stamps[order], quaternions[order]
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
     before, after = Rotation.from_quat(quaternions[later - 1]), Rotation.from_quat(quaternions[later])
     widths = stamps[later] - stamps[later - 1]
     shares = ((times - stamps[later - 1]) / np.where(widths > 0, widths, 1)).clip(0, 1)
-    return before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())
+    turned = before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())
+    return turned.as_matrix().reshape(-1, 3, 3)
+
+
+def poses_of(positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4 4"]:
+    """Positions and rotations as poses."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, positions
+    return poses

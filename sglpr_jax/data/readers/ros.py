@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.ros_bag import RosBag
-from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform, poses_of
-from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
+from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform
+from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.formats.trajectory import check_height
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
