@@ -43,17 +43,18 @@ class Growth:
     """The exponent of an algorithm that wastes nothing."""
 
 
-def main(*, preset: str = "sglpr", largest: int = 5, repeats: int = 5) -> None:
+def main(*, preset: str = "sglpr", sectors: int = 64, largest: int = 5, repeats: int = 5) -> None:
     """Print seconds by size, and the exponent between them.
 
     Args:
         preset: the model that describes.
+        sectors: those of the smallest polar image; 0 where the model sees none.
         largest: how often each size is doubled.
         repeats: how often each is timed.
     """
     doubled = 2 ** np.arange(largest + 1)
     table = Table("what grows", "from", "to", "ms at first", "ms at last", "exponent", "last doubling", "aimed at")
-    for growth in growths(preset, doubled):
+    for growth in growths(preset, sectors, doubled):
         seconds = measured(growth, repeats)
         table.add_row(
             growth.what,
@@ -65,13 +66,14 @@ def main(*, preset: str = "sglpr", largest: int = 5, repeats: int = 5) -> None:
     Console(width=140).print(table)
 
 
-def growths(preset: str, doubled: np.ndarray) -> list[Growth]:
+def growths(preset: str, sectors: int, doubled: np.ndarray) -> list[Growth]:
     """What is looked at."""
     points, places = 15_000 * doubled, 3_125 * doubled
+    polar = Growth("sectors of a polar image, describe", sectors * doubled[:4], lambda n: describing(preset, sectors=n))
     return [
         Growth("points of a scan, point counts", points, counting),
         Growth("points of a scan, density image", points, density),
-        Growth("sectors of the polar image, describe", 64 * doubled[:4], lambda n: describing(preset, sectors=n)),
+        *([polar] if sectors else []),
         Growth("images of a batch, describe", doubled, lambda n: describing(preset, batch=n)),
         Growth("places of an index, one query", places, asking),
         Growth("frames of a recording, each among those before it", places[:-1] // 4, searching, expected=2.0),
@@ -84,7 +86,7 @@ def counting(n: int) -> Job:
 
 
 def density(n: int) -> Job:
-    cloud = random_scans(n, grid=Grid(0.4, 151, 151))[0]
+    cloud = random_scans(n, grid=Grid(0.4, 152, 152))[0]
     return lambda: density_image(cloud)
 
 

@@ -8,7 +8,7 @@ knows from its method what the numbers of a row are.
 import difflib
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, Int
 
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import DistanceFn
@@ -35,6 +35,18 @@ def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n
         return np.divide(rows, lengths, out=np.zeros(rows.shape), where=lengths > 0)
 
     return in_blocks(lambda q, d: 1 - q @ d.T, queries, database, block=BLOCK, prepare=unit)
+
+
+def smallest(values: Float[np.ndarray, "q n"], k: int) -> Int[np.ndarray, "q {k}"]:
+    """Return the columns of the k smallest values of each row, rising; equal ones in the order of their columns."""
+    if k == 1:
+        return np.argmin(values, axis=1)[:, None]
+    columns = np.sort(np.argpartition(values, k - 1, axis=1)[:, :k], axis=1)
+    largest = np.take_along_axis(values, columns, axis=1).max(axis=1, keepdims=True)
+    for row in np.flatnonzero((values <= largest).sum(axis=1) > k):  # others are as small as the last
+        columns[row] = np.sort(np.argsort(values[row], kind="stable")[:k])
+    order = np.argsort(np.take_along_axis(values, columns, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(columns, order, axis=1)
 
 
 DISTANCES: dict[str, DistanceFn] = {

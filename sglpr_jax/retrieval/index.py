@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.files import replacing
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.retrieval.index_rows import (
     COLUMNS,
     Found,
@@ -203,7 +203,7 @@ class Index:
         if self.distance != "l2":
             rows = np.flatnonzero(allowed)
             every = distance_function(self.distance)(queries, self.descriptors[rows])
-            order = np.argsort(every, axis=1, kind="stable")[:, :k]
+            order = smallest(every, k)
             return rows[order], np.take_along_axis(every, order, axis=1)
         rough = self._squares()[None] - 2 * queries @ self.descriptors.T
         rough[:, ~allowed] = np.inf

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
-from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.retrieval.distances import distance_function, smallest
 
 BLOCK = 512
 """Queries compared with the whole database at a time."""
@@ -71,7 +71,7 @@ def nearest(
         found = compare(queries.descriptors[block], database.descriptors)
         if own:
             found = np.where(_old_enough(queries, block, exclude_frames, exclude_s), found, np.float32(np.inf))
-        order = np.argsort(found, axis=1, kind="stable")[:, :k_there]
+        order = smallest(found, k_there)
         distances[block, :k_there] = np.take_along_axis(found, order, axis=1)
         rows[block, :k_there] = np.where(np.isfinite(distances[block, :k_there]), order, -1)
     return Nearest(queries, database, rows, distances)

@@ -104,3 +104,11 @@ def test_missing_torch_is_one_clear_error(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(SystemExit, match=r"PyTorch.*pip install 'sglpr-jax\[torch\]'"):
         importlib.import_module(name).main()
+
+
+def test_growth_tells_the_exponent_of_everything():
+    growth = importlib.import_module("growth")
+    assert growth.exponent([1, 2, 4], [3.0, 12.0, 48.0]) == pytest.approx(2)
+    rows = table(printed("growth.py", "--preset", "tiny", "--sectors", 0, "--largest", 1, "--repeats", 1))
+    assert len(rows) == 5 and rows[0][:3] == ["points of a scan, point counts", "15,000", "30,000"]
+    assert all(np.isfinite(float(row[5])) for row in rows)

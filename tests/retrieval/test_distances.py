@@ -1,8 +1,11 @@
+import hypothesis
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.retrieval.distances import DISTANCES, cosine, distance_function, l2
+from sglpr_jax.retrieval.distances import DISTANCES, cosine, distance_function, l2, smallest
 
 
 @pytest.fixture
@@ -21,6 +24,13 @@ def test_cosine_is_the_cosine_distance(rows):
     expected = [[1 - a @ b / np.linalg.norm(a) / np.linalg.norm(b) for b in rows] for a in 2 * rows]
     np.testing.assert_allclose(cosine(2 * rows, rows), expected, atol=1e-6)
     assert (cosine(zero, rows) == 1).all() and (cosine(rows, zero) == 1).all()
+
+
+@hypothesis.given(
+    hnp.arrays(np.float32, (6, 9), elements=st.sampled_from([0.0, 1.0, 2.0, 3.0, np.inf])), st.integers(1, 9)
+)
+def test_the_smallest_are_those_of_a_stable_sort(values, k):
+    np.testing.assert_array_equal(smallest(values, k), np.argsort(values, axis=1, kind="stable")[:, :k])
 
 
 def test_every_baseline_has_a_distance():

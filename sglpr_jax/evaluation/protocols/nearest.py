@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.evaluation.protocols.source import Source, TopK
-from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.revisits import Near
 
 BLOCK = 512
@@ -41,7 +41,7 @@ def nearest_descriptors(
         rows = slice(start, start + BLOCK)
         ranking = compare(queries[rows])
         ranking[np.arange(len(database)) >= ends[rows, None]] = np.inf
-        nearest[rows, : min(k, len(database))] = _smallest(ranking, min(k, len(database)))
+        nearest[rows, : min(k, len(database))] = smallest(ranking, min(k, len(database)))
         best[rows] = np.take_along_axis(ranking, nearest[rows, :1], axis=1)[:, 0]
     if distance == "l2":
         best = np.linalg.norm(queries - database[nearest[:, 0]], axis=1).astype(np.float64)
@@ -69,12 +69,3 @@ def first_hits(
 def first_true(flags: Bool[np.ndarray, "q k"]) -> Int[np.ndarray, " q"]:
     """Return the first true column of each row; k where none is."""
     return np.where(flags.any(axis=1), np.argmax(flags, axis=1), flags.shape[1])
-
-
-def _smallest(values: Float[np.ndarray, "q n"], k: int) -> Int[np.ndarray, "q {k}"]:
-    """Return the columns of the k smallest values of each row, rising."""
-    if k == 1:
-        return np.argmin(values, axis=1)[:, None]
-    columns = np.sort(np.argpartition(values, k - 1, axis=1)[:, :k], axis=1)
-    order = np.argsort(np.take_along_axis(values, columns, axis=1), axis=1, kind="stable")
-    return np.take_along_axis(columns, order, axis=1)
