@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.cli import map as command_file
 from sglpr_jax.data import open_recording
+from sglpr_jax.loops import places
 from sglpr_jax.loops.graph_files import write_tum
 from sglpr_jax.loops.places import PlaceMap, map_recording
 from sglpr_jax.loops.unfinished import alone
@@ -85,7 +85,7 @@ def test_ctrl_c_keeps_what_was_found_and_the_same_command_goes_on(command, town,
     out, other = tmp_path / "town.safetensors", tmp_path / "whole.safetensors"
     run = ("map", town, "--seq", "08", "--poses", poses, "--spacing-m", "0")
     assert command(*run, "--out", other).status == 0
-    monkeypatch.setattr(command_file, "map_recording", stopped)
+    monkeypatch.setattr(places, "map_recording", stopped)
     add_to = ()
     for stop_at, words in ((10, "10 places, 10 of them from 10 of 40"), (25, "25 places, 15 of them from 25 of 40")):
         ended = command(*run, *add_to, "--out", out)
