@@ -42,8 +42,8 @@ class Writer:
     line: str
     """Its arguments."""
     varies: tuple[str, ...] = ()
-    """Files with the time of day or measured seconds in them, or that are added to while the command runs: patterns of
-    their paths below `OUT`."""
+    """Files with the time of day or measured seconds in them, that are added to while the command runs, or that only a
+    killed run leaves for the next: patterns of their paths below `OUT`."""
     resumed_by: str = ""
     """Where this file is there already, --resume has it go on."""
     refuses: str = ""
@@ -74,9 +74,17 @@ WRITERS = {
             f"--weights rings --format stablehlo --out {OUT}/mine",
             refuses="does not exist yet",
         ),
-        Writer("map", f"{TOWN} --seq 08 --poses {POSES} --pose-format kitti --out {OUT}/town.safetensors"),
+        Writer(
+            "map",
+            f"{TOWN} --seq 08 --poses {POSES} --pose-format kitti --out {OUT}/town.safetensors",
+            varies=("town.unfinished/*",),
+        ),
         Writer("relocalize", f"{TOWN}/{SCANS}/000003.bin --map ../{INPUTS}/town.safetensors --out {OUT}/pose.json"),
-        Writer("loops", f"{TOWN} --seq 08 --odometry {POSES} --odometry-format kitti --out {OUT}/found"),
+        Writer(
+            "loops",
+            f"{TOWN} --seq 08 --odometry {POSES} --odometry-format kitti --out {OUT}/found",
+            varies=("found/unfinished/*",),
+        ),
         Writer("segment", f"--weights sglpr --data {TOWN} --seq 08 --out {OUT}/maps"),
         Writer(
             "stress", f"--method solid --data {TOWN} --seq 08 --out {OUT}/stress --corruption rotation occlusion-45"

@@ -1,11 +1,13 @@
 """`describe` with its weights inside, as a program for runtimes that do not know this package: StableHLO and ONNX."""
 
+import contextlib
 import dataclasses
 import hashlib
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -73,7 +75,21 @@ def stablehlo(params: Params) -> bytes:
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))
-    return bytes(jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32)).serialize())
+    with _no_source_locations():
+        exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32))
+        return bytes(exported.serialize())
+
+
+@contextlib.contextmanager
+def _no_source_locations() -> Iterator[None]:
+    """Leave out of programs where the files of their author lie: the same weights give the same bytes anywhere."""
+    limit = "jax_traceback_in_locations_limit"
+    before = getattr(jax.config, limit)
+    jax.config.update(limit, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(limit, before)
 
 
 def onnx(params: Params) -> bytes:
