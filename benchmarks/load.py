@@ -8,6 +8,7 @@
 Each part prints a table and, with --out, keeps it as JSON; with --quick it takes few scans, commands and tries.
 """
 
+import abc
 import dataclasses
 import os
 import shlex
@@ -47,7 +48,7 @@ class Part:
 
 
 @dataclasses.dataclass(frozen=True)
-class OfCommands(Part):
+class OfCommands(Part, abc.ABC):
     """What is done to the commands that write."""
 
     commands: tuple[str, ...] = ()
@@ -57,9 +58,9 @@ class OfCommands(Part):
     seed: int = 0
     title: ClassVar[str]
 
+    @abc.abstractmethod
     def rows(self, writer: Writer, folder: Path, times: int) -> Iterator[Row]:
         """Disturb a command so often; what came of it."""
-        raise NotImplementedError
 
     def run(self) -> None:
         names, rows = self.commands or (QUICK if self.quick else tuple(WRITERS)), []

@@ -23,20 +23,9 @@ from rich.table import Table
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 
-COMMANDS = (
-    "convert",
-    "demo",
-    "embed",
-    "evaluate",
-    "export",
-    "loops",
-    "map",
-    "relocalize",
-    "reproduce",
-    "segment",
-    "simulate",
-    "stress",
-    "train",
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = tuple(
+    sorted(path.stem for path in (ROOT / "sglpr_jax" / "cli").glob("*.py") if (ROOT / "bin" / path.stem).exists())
 )
 
 
