@@ -31,8 +31,8 @@ class SimulateCommand:
     rate_hz: float = RATE_HZ
     """Scans per second of a route; KITTI's rate is 10."""
     sensor: str | None = None
-    """The LiDAR: hdl64e (KITTI's), hdl32e, hdl32e-nclt (NCLT's, upside down) or vlp16. None: hdl64e, or hdl32e-nclt for
-    --sessions."""
+    """The LiDAR: hdl64e (KITTI's), hdl32e, hdl32e-nclt (NCLT's, upside down), vlp16, xt32 or os1-64. None: hdl64e, or
+    hdl32e-nclt for --sessions."""
     azimuth_steps: int | None = None
     """Firings per turn; fewer make smaller files. None: as many as the real sensor's."""
     images: bool = False

@@ -18,7 +18,7 @@ from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
 from sglpr_jax.sim.sessions import plan_sessions
 
 SETTINGS_FILE = "simulation.json"
-VERSION = 2
+VERSION = 3
 """Of what the simulator makes of a seed; a change in its scans needs a new one."""
 WORKERS = 2
 """Threads that render; the compiled program leaves other threads room."""
@@ -144,7 +144,7 @@ def _write_drive(
     recording = simulate()
 
     def write_scan(i: int) -> None:
-        contents = layout.scan_contents(*recording.render(i))
+        contents = layout.scan_contents(*recording.render(i), recording.mounting)
         for file, content in zip(layout.files_of_scan(root, name, ids[i]), contents, strict=True):
             _write(file, content)
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.formats.bin_records import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
 
@@ -26,8 +27,8 @@ class Layout(NamedTuple):
     """Of the drive `{name}`."""
     scan_files: tuple[str, ...]
     """Of scan `{id}`."""
-    scan_contents: Callable[[np.ndarray, np.ndarray], tuple[bytes, ...]]
-    """What is in them, from points (n, 4) and labels (n,)."""
+    scan_contents: Callable[[np.ndarray, np.ndarray, Mounting], tuple[bytes, ...]]
+    """What is in them, from points (n, 4), labels (n,), and how the sensor was mounted."""
     drive_contents: Callable[[TimedPoses], dict[str, bytes]]
     """The files of the drive as a whole, by their names, written when all its scans are there."""
     last_file: str
@@ -46,13 +47,16 @@ class Layout(NamedTuple):
         return self.file_of_drive(root, name, self.last_file).exists()
 
 
-def _points_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray) -> tuple[bytes, ...]:
+def _points_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray, _mounting: Mounting) -> tuple[bytes, ...]:
     return points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()
 
 
-def _image_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray) -> tuple[bytes, ...]:
-    """A density image and the raw ids of what its pixels show; an empty pixel shows nothing."""
-    xyz = points[:, :3].astype(np.float32)
+def _image_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting) -> tuple[bytes, ...]:
+    """A density image and the raw ids of what its pixels show; an empty pixel shows nothing.
+
+    Images are those of a sensor at the height that models know, as those made of the drive's scans are.
+    """
+    xyz = mounting.level(points[:, :3].astype(np.float32))
     image = density_image(xyz)
     shown = np.where(image > 0, density_label_image(xyz, labels), 0)
     return _png(image), _png(shown.astype(np.uint16))
@@ -86,7 +90,7 @@ def _bevplace_files(poses: TimedPoses) -> dict[str, bytes]:
     return {"pose.txt": "".join(_row(pose) for pose in poses.world_from_lidar).encode()}
 
 
-def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray) -> tuple[bytes, ...]:
+def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting) -> tuple[bytes, ...]:
     """Return the bytes of a scan in NCLT's body frame: x forward, y right, z down, from the ground below the sensor.
 
     `points` are metres from the sensor, z up, and reflectivities 0 to 1. Lasers are not told apart. NCLT's numbers

@@ -23,6 +23,8 @@ HDL32E_DEG = tuple(np.linspace(10.67, -30.67, 32).tolist())
 NCLT_DEG = tuple(-elevation for elevation in HDL32E_DEG)
 NCLT_HEIGHT_M = 1.03
 VLP16_DEG = tuple(np.linspace(15.0, -15.0, 16).tolist())
+XT32_DEG = tuple(np.linspace(15.0, -16.0, 32).tolist())
+OS1_64_DEG = tuple(np.linspace(22.5, -22.5, 64).tolist())
 TURN_S = 0.1
 LASERS_AT_A_TIME = 16
 """At most; must divide their number, else the largest common divisor is taken."""
@@ -76,6 +78,8 @@ SENSORS = {
     # Upside down on a Segway: elevations and height are those that fit a real scan of NCLT.
     "hdl32e-nclt": Sensor(NCLT_DEG, azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
     "vlp16": Sensor(VLP16_DEG, min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
+    "xt32": Sensor(XT32_DEG, azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
+    "os1-64": Sensor(OS1_64_DEG, azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
 }
 """Real sensors, by the names that the command line knows."""
 

@@ -1,5 +1,6 @@
 """Simulated drives on disk and on the fly: layouts, the same bytes for the same seed, resumable, whole or not there."""
 
+import dataclasses
 import json
 import resource
 import shutil
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data import open_recording
-from sglpr_jax.data.density_image import density_image, density_label_image
+from sglpr_jax.data.density_image import density_bev, density_image, density_label_image
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
@@ -80,6 +82,14 @@ def test_a_drive_on_the_fly_is_the_one_on_disk(dataset, drive):
     for i in range(SCANS):
         np.testing.assert_array_equal(drive.points(i), on_disk.points(i))
         np.testing.assert_array_equal(drive.labels(i), on_disk.labels(i))
+
+
+def test_images_are_as_of_a_sensor_at_the_height_that_models_know(tmp_path):
+    low = dataclasses.replace(TINY, height_m=0.8)
+    image = open_recording(write(tmp_path, names=("08",), sensor=low, layout="images"), "08").image(0)
+    drive = simulate_recording("08", scans=SCANS, sensor=low, seed=1)
+    np.testing.assert_array_equal(image, density_bev(drive.points(0) + np.float32([0, 0, 0.8 - MODEL_HEIGHT_M])))
+    assert image.sum() < density_bev(drive.points(0)).sum()  # there with all of the road
 
 
 def test_points_and_labels_of_a_scan_cost_one_rendering(monkeypatch):

@@ -179,8 +179,11 @@ def test_the_tables_of_elevations():
         "hdl32e": 32,
         "hdl32e-nclt": 32,
         "vlp16": 16,
+        "xt32": 32,
+        "os1-64": 64,
     }
     np.testing.assert_allclose(np.diff(SENSORS["vlp16"].elevations_deg), -2)
+    np.testing.assert_allclose(np.diff(SENSORS["xt32"].elevations_deg), -1)
     np.testing.assert_allclose(np.diff(SENSORS["hdl32e"].elevations_deg), -1.3335, atol=1e-3)
     assert HDL64E.elevations_deg[0] == 2.0 and HDL64E.elevations_deg[-1] == -24.8
 
