@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim import SENSORS, Sensor, plan_sessions, write_sessions
 from sglpr_jax.sim.drive import plan_path
@@ -119,7 +120,8 @@ def test_the_ground_truth_turns_forward_right_down_to_north_east_down(dataset, d
 def test_a_scan_comes_back_as_its_rounded_self(tmp_path_factory, points):
     path = tmp_path_factory.mktemp("scan") / "velodyne_sync" / "1.bin"
     path.parent.mkdir()
-    (content,) = nclt_scan(np.pad(points, ((0, 0), (0, 1)), constant_values=0.5), np.zeros(20, int))
+    intensities = np.full((20, 1), 0.5)
+    (content,) = nclt_scan(np.hstack([points, intensities]), np.zeros(20, int), Mounting(NCLT_HEIGHT_M))
     path.write_bytes(content)
     body = np.add(points.astype(np.float64), [0, 0, NCLT_HEIGHT_M]) * [1, -1, -1]
     rounded = np.round((body + 100) / 0.005) * 0.005 - 100
