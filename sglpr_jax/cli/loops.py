@@ -55,18 +55,26 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
-    from sglpr_jax.evaluation.page.of_loops import write_loops_page
-    from sglpr_jax.loops.detector import DetectorConfig
-    from sglpr_jax.loops.find import find_loops
-    from sglpr_jax.loops.folder import write_found
-    from sglpr_jax.loops.optimization import check_installed, optimize_trajectory
-    from sglpr_jax.loops.unfinished import remove
-    from sglpr_jax.models.weights_file import load  # all these bring JAX, which --help does not need
+    from sglpr_jax.loops.optimization import check_installed
+    from sglpr_jax.loops.unfinished import alone  # these bring JAX and more, which --help does not need
 
     if command.optimize and command.odometry is None:
         raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
     if command.optimize:
         check_installed()
+    with alone(command.out / UNFINISHED):
+        return _search(command)
+
+
+def _search(command: LoopsCommand) -> int:
+    from sglpr_jax.evaluation.page.of_loops import write_loops_page
+    from sglpr_jax.loops.detector import DetectorConfig
+    from sglpr_jax.loops.find import find_loops
+    from sglpr_jax.loops.folder import write_found
+    from sglpr_jax.loops.optimization import optimize_trajectory
+    from sglpr_jax.loops.unfinished import remove
+    from sglpr_jax.models.weights_file import load
+
     source, path = command.source, command.odometry
     if path is None:
         recording, odometry = source.open(command.recording), None

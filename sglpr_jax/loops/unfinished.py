@@ -126,10 +126,11 @@ class Unfinished:
 
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Make the folder, keep other processes out of it, and remove it in the end where nothing is in it.
+    """Make the folder, keep other processes out of it, and remove in the end what was made where nothing is in it.
 
     Raises BlockingIOError where another process has it.
     """
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
     with writing(folder, *folder.parents):
         folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
@@ -137,7 +138,8 @@ def alone(folder: Path) -> Iterator[None]:
             yield
         finally:
             with contextlib.suppress(OSError):
-                folder.rmdir()
+                for one in made or [folder]:
+                    one.rmdir()
 
 
 def remove(folder: Path) -> None:

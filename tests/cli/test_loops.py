@@ -8,6 +8,7 @@ import pytest
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops import find
 from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, read_tum, write_kitti, write_tum
+from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights_file import load
 
 from .conftest import SCANS, assert_one_line_error
@@ -121,6 +122,14 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
 
 
 @pytest.mark.slow
+def test_two_processes_do_not_search_into_one_folder(command, town, tmp_path):
+    out = tmp_path / "found"
+    with alone(out / "unfinished"):
+        ended = command("loops", town, "--seq", "08", "--out", out)
+    assert_one_line_error(ended, "unfinished: expected to be alone in it, found another process at work")
+    assert not out.exists()
+
+
 def test_images_cannot_be_registered(command, images, tmp_path):
     ended = command("loops", images, "--seq", "06", "--out", tmp_path / "found", "--register")
     assert_one_line_error(ended, "expected scans to register, found ready-made images")
