@@ -1,14 +1,15 @@
 """Weights on disk: a folder with config.json and model.safetensors, so that they never travel without their model."""
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import safetensors
-import safetensors.numpy
 
+from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.files import in_short, read_json, replacing
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.config_dict import config_from_dict
@@ -20,6 +21,9 @@ CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 CHECKSUM = "sha256"
 """Under this name the header of the weights has the `hash_of` what is stored."""
+CHECKED_FOR = "config_sha256"
+"""Under this name it has the checksum of the configuration whose weights they are: to ask the model what it expects
+takes half a second, and need not be done each time."""
 STORED = ("F32", "F16")
 """The types that weights are stored in, as safetensors calls them."""
 
@@ -41,7 +45,7 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
     values = {name: _halved(name, leaf) for name, leaf in values.items()} if half else values
     with replacing(folder) as new:
         new.mkdir()
-        content = safetensors.numpy.save(values, {CHECKSUM: hash_of(values)})
+        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), CHECKED_FOR: _hash_of(params.config)})
         (new / WEIGHTS_FILE).write_bytes(content)  # save_file hides the OSError of a full disk
         (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
     return folder
@@ -72,11 +76,13 @@ def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
     try:
         with safetensors.safe_open(path, framework="np") as file:
             about = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-            _check_shapes({name: tuple(part.get_shape()) for name, part in about.items()}, config, source=path)
+            metadata = file.metadata() or {}
+            if metadata.get(CHECKED_FOR) != _hash_of(config):
+                _check_shapes({name: tuple(part.get_shape()) for name, part in about.items()}, config, source=path)
             for name, part in about.items():
                 if part.get_dtype() not in STORED:
                     raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)}, found {part.get_dtype()}")
-            values, metadata = {name: file.get_tensor(name) for name in about}, file.metadata() or {}
+            values = {name: file.get_tensor(name) for name in about}
     except safetensors.SafetensorError as error:
         raise ValueError(
             f"{path}: expected a whole safetensors file, found a damaged one ({in_short(error)})"
@@ -87,6 +93,10 @@ def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
         said = metadata.get(CHECKSUM, "none")
         raise ValueError(f"{path}: expected weights of SHA-256 {said}, as its header says, found {found}")
     return values
+
+
+def _hash_of(config: ModelConfig) -> str:
+    return hashlib.sha256(json.dumps(dataclasses.asdict(config), sort_keys=True).encode()).hexdigest()
 
 
 def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, source: Path) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import safetensors
-import safetensors.numpy
 from jaxtyping import Bool, Float
 
+from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.files import replacing
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
@@ -172,7 +172,7 @@ class Index:
         about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash, "distance": self.distance}
         text = json.dumps({**about, "ids": self.ids})
         arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-        return _in_order(safetensors.numpy.save(arrays, metadata={"about": text, "sha256": _checksum(text, arrays)}))
+        return tensors_as_bytes(arrays, {"about": text, "sha256": _checksum(text, arrays)})
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "Index":
@@ -231,16 +231,6 @@ def _appended(old: np.ndarray | None, new: np.ndarray, n: int) -> np.ndarray:
         old = grown
     old[n : n + len(new)] = new
     return old
-
-
-def _in_order(content: bytes) -> bytes:
-    """What safetensors writes, its metadata, which have any order there, in one: equal places are equal bytes."""
-    size = int.from_bytes(content[:8], "little")
-    header = json.loads(content[8 : 8 + size])
-    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # the arrays behind it stand at multiples of 8
-    return b"".join([len(text).to_bytes(8, "little"), text, memoryview(content)[8 + size :]])
 
 
 def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from sglpr_jax.models import weights_file
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.weights import graft, weights_hash
+from sglpr_jax.models.weights import graft, weight_shapes, weights_hash
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 
@@ -131,6 +132,22 @@ def test_the_weights_of_another_preset_are_refused(params, tmp_path):
     (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("small"))))
     with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected the weights of its configuration, \S+ of shape"):
         load(folder)
+
+
+def test_what_was_checked_when_it_was_written_is_not_checked_again(params, tmp_path, monkeypatch):
+    folder = save(params, tmp_path / "weights")
+    asked = []
+    monkeypatch.setattr(weights_file, "weight_shapes", lambda config: asked.append(config) or weight_shapes(config))
+    chex.assert_trees_all_equal(load(folder), params)
+    assert asked == []
+    other = dataclasses.replace(params.config, blind_m=1.0)  # of the same weights
+    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(other)))
+    assert load(folder).config == other and asked == [other]
+
+
+def test_equal_weights_are_equal_files(params, tmp_path):
+    files = {(save(params, tmp_path / f"{i}") / WEIGHTS_FILE).read_bytes() for i in range(8)}
+    assert len(files) == 1
 
 
 def test_a_weight_too_many_or_too_few_is_named(params, tmp_path):
