@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import tyro
 from inputs import comparable_model, random_params, random_scans
-from ratio import Contender, Job, alternate, check_equal, report, require_torch, warn_if_busy
+from ratio import Contender, Job, alternate, check_equal, report, report_memory, require_torch, warn_if_busy
 
 from sglpr_jax.bev import rasterize
 from sglpr_jax.models.input_image import prepare
@@ -46,9 +46,12 @@ def main(
     expected = other.run()[0]
     for contender in ours:
         check_equal(f"descriptors, {contender.name}", contender.run()[0], expected, tolerance=1e-4)
+    for contender in (other, *ours):
+        contender.forget_peak()
     seconds = alternate([other, *ours], repeats=repeats)
     rows = [(contender.name, seconds[:, i], seconds[:, 0]) for i, contender in enumerate(ours, start=1)]
     report(f"describe, {preset}, {batch} image(s)", rows, other="PyTorch", packages=("jax", "torch"), threads=threads)
+    report_memory([other, *ours])
 
 
 def jax_job(params: Params, bev: np.ndarray, chunk: int) -> Job:

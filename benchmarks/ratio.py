@@ -14,6 +14,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,19 +52,44 @@ class Contender:
         except (EOFError, OSError) as error:
             raise SystemExit(f"{self.name}: its process ended, for the reason above or for want of memory") from error
 
+    def forget_peak(self) -> None:
+        """Let `peak_mb` begin anew: compiling needs memory, too."""
+        self._pipe.send("forget peak")
+        self._pipe.recv()
+
+    def peak_mb(self) -> float:
+        """The most resident memory of the process, in 10^6 bytes, since `forget_peak` or its start."""
+        self._pipe.send("peak")
+        return self._pipe.recv()
+
 
 def _serve(pipe, threads: int, make_job: Callable[..., Job], arguments: tuple) -> None:
     os.environ["NPROC"] = os.environ["OMP_NUM_THREADS"] = str(threads)  # XLA's and PyTorch's
     job = make_job(*arguments)
     while True:
         try:
-            pipe.recv()
+            asked = pipe.recv()
         except EOFError:
             return
+        if asked != "run":
+            pipe.send(_PEAK[asked]())
+            continue
         start = time.perf_counter()
         value = job()
         seconds = time.perf_counter() - start
         pipe.send((value, seconds))
+
+
+def _peak_mb() -> float:
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status["VmHWM"].split()[0]) * 1024 / 1e6
+
+
+def _forget_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")  # of all that it can clear: VmHWM
+
+
+_PEAK = {"peak": _peak_mb, "forget peak": _forget_peak}
 
 
 def require_torch() -> None:
@@ -97,6 +123,12 @@ def alternate(contenders: Sequence[Contender], *, repeats: int) -> np.ndarray:
         for i in range(len(contenders))[:: -1 if repeat % 2 else 1]:
             seconds[repeat, i] = contenders[i].run()[1]
     return seconds
+
+
+def report_memory(contenders: Sequence[Contender]) -> None:
+    """Print the peak of each process since its first runs, all of it: interpreter, framework, arguments and work."""
+    peaks = "; ".join(f"{contender.name} {contender.peak_mb():.0f} MB" for contender in contenders)
+    print(f"Peak of resident memory after the first runs: {peaks}")
 
 
 def report(

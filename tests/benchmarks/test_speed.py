@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import json
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -29,6 +30,19 @@ def test_different_results_are_not_timed(monkeypatch):
     ratio.check_equal("same", np.array([1.0, 2.0]), np.array([1.0, 2.0]), tolerance=0)
     with pytest.raises(SystemExit, match="do not agree"):
         ratio.check_equal("unlike", np.array([1.0, 2.0]), np.array([1.0, 2.1]), tolerance=1e-3)
+
+
+def _fills(megabytes: int) -> Callable[[], float]:
+    return lambda: np.ones(megabytes * 125_000).sum()
+
+
+def test_the_peak_of_a_process_is_that_of_its_last_runs():
+    contender = importlib.import_module("ratio").Contender("numpy", _fills, 400, threads=1)
+    before = contender.peak_mb()
+    contender.run()
+    assert 300 < contender.peak_mb() - before < 500
+    contender.forget_peak()
+    assert contender.peak_mb() < before + 100
 
 
 def test_allocator_prints_ratios_and_what_each_setting_costs():
