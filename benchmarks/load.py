@@ -69,6 +69,7 @@ class OfCommands(Part, abc.ABC):
             for name in track(names, console=Console(stderr=True), disable=not sys.stderr.isatty()):
                 found = self.rows(WRITERS[name], Path(folder), 4 if self.quick else self.times)
                 rows += [{"command": name, **row} for row in found]
+                keep(self.title, rows, self.out)
         report(self.title, rows, self.out)
 
 
@@ -142,10 +143,18 @@ def report(title: str, rows: Sequence[Row], out: Path | None) -> None:
     for row in rows:
         table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values()))
     Console(width=None if sys.stdout.isatty() else 140).print(table)
-    command = shlex.join(["python", *sys.argv])
-    print(f"Command: {command}\n{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
+    print(f"Command: {_command()}\n{os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
+    keep(title, rows, out)
+
+
+def keep(title: str, rows: Sequence[Row], out: Path | None) -> None:
+    """Write what there is of a table, where a file is named: hours of it may end early."""
     if out is not None:
-        write_json(out, {"title": title, "command": command, "rows": rows})
+        write_json(out, {"title": title, "command": _command(), "rows": rows})
+
+
+def _command() -> str:
+    return shlex.join(["python", *sys.argv])
 
 
 def _timed(job: Callable[[], T]) -> tuple[T, float]:
