@@ -8,9 +8,10 @@ LiDAR where tf says how it is mounted; else they stay those of the frame that th
 import dataclasses
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sglpr_jax.data.formats.ros_bag import RosBag
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform
@@ -83,6 +84,28 @@ def _topics(root: Path, bag: RosBag) -> dict[str, str]:
     return {topic.strip("/").replace("/", "_"): topic for topic in topics}
 
 
+class _Placed(NamedTuple):
+    """A track, and what it says at the times of the scans."""
+
+    track: Track
+    clocks: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]
+    """Seconds of its poses and of the scans."""
+    kept: Bool[np.ndarray, " q"]
+    """Which scans have a pose."""
+    positions: Float[np.ndarray, "q 3"]
+
+    @classmethod
+    def at(cls, scans: Stamps, track: Track) -> "_Placed":
+        """The track at the times of the scans."""
+        clocks = _clocks(track, scans)
+        return cls(track, clocks, *interpolate(clocks[0], track.positions, clocks[1]))
+
+    @property
+    def share(self) -> float:
+        """Of the scans, those that have a pose."""
+        return float(self.kept.mean())
+
+
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
     """The recording with the poses of `topic` or, without it, of that which most scans have a pose on.
 
@@ -90,36 +113,43 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     """
     transforms = bag.transforms()
     tracks = {one: bag.track(one) for one in bag.pose_topics} | _tracks_of_lidar(transforms, lidar)
-    if topic is not None and topic not in tracks:
-        found = ", ".join(tracks) or "none"
-        raise ValueError(f"{bag.paths[0]}: expected a topic of poses {topic}, found {found}")
-    clocks = {one: _clocks(track, scans) for one, track in tracks.items()}
-    placed = {one: interpolate(clocks[one][0], track.positions, clocks[one][1]) for one, track in tracks.items()}
-    shares = {one: float(found.kept.mean()) for one, found in placed.items()}
-    best = max(shares, key=lambda one: shares[one], default="") if topic is None else topic
-    used = best if shares.get(best, 0) >= LEAST_SHARE else ""
-    if topic is not None and not used:
-        raise ValueError(f"{bag.paths[0]}: expected poses of most scans on {topic}, found {shares[topic]:.0%} of them")
-    others = [f"{one} (poses for {share:.0%} of the scans)" for one, share in shares.items() if one != used]
+    placed = {one: _Placed.at(scans, track) for one, track in tracks.items()}
+    used = _chosen(placed, topic, bag.paths[0])
+    others = [f"{one} (poses for {found.share:.0%} of the scans)" for one, found in placed.items() if one != used]
     said = (*recording.found, *([f"poses not used: {', '.join(others)}"] if others else []))
+    recording = dataclasses.replace(recording, found=said)
     if not used:
-        return dataclasses.replace(recording, found=said)
-    kept, positions = placed[used]
+        return recording
+    kept, positions = placed[used].kept, placed[used].positions
     check_height(positions[kept], path=bag.paths[0])
-    chosen = np.flatnonzero(kept)
-    poses, how = _of_lidar(tracks[used], clocks[used], positions, transforms, lidar)
-    missing = len(kept) - len(chosen)
+    poses, how = _of_lidar(placed[used], transforms, lidar)
+    missing = len(kept) - int(kept.sum())
     left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
+    rows = np.flatnonzero(kept)
     return dataclasses.replace(
         recording,
-        ids=tuple(recording.ids[i] for i in chosen),
-        paths=tuple(recording.paths[i] for i in chosen),
+        ids=tuple(recording.ids[i] for i in rows),
+        paths=tuple(recording.paths[i] for i in rows),
         positions=positions[kept] if poses is None else poses[kept, :3, 3],
         times=scans.seconds[kept],
         pose_source=f"{used} ({tracks[used]}, {how}{left_out})",
         world_from_lidar=None if poses is None else poses[kept],
-        found=said,
     )
+
+
+def _chosen(placed: dict[str, _Placed], topic: str | None, bag: Path) -> str:
+    """The topic whose poses are used: the one that is asked for, else the fullest; "" where none has enough.
+
+    Raises ValueError, naming the bag, where the one that is asked for has not.
+    """
+    if topic is None:
+        best = max(placed, key=lambda one: placed[one].share, default="")
+        return best if best and placed[best].share >= LEAST_SHARE else ""
+    if topic not in placed:
+        raise ValueError(f"{bag}: expected a topic of poses {topic}, found {', '.join(placed) or 'none'}")
+    if placed[topic].share < LEAST_SHARE:
+        raise ValueError(f"{bag}: expected poses of most scans on {topic}, found {placed[topic].share:.0%} of them")
+    return topic
 
 
 def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
@@ -141,17 +171,12 @@ def _clocks(track: Track, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float
     return track.stamps.recorded / 1e9, scans.recorded / 1e9
 
 
-def _of_lidar(
-    track: Track,
-    clocks: tuple[np.ndarray, np.ndarray],
-    positions: Float[np.ndarray, "q 3"],
-    transforms: list[Track],
-    lidar: str,
-) -> tuple[Float[np.ndarray, "q 4 4"] | None, str]:
+def _of_lidar(placed: _Placed, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "q 4 4"] | None, str]:
     """The LiDAR's poses by a track that tells rotations, None by another one; and how they were made, in words."""
+    track, (poses_s, scans_s) = placed.track, placed.clocks
     if not track.turned:
         return None, "interpolated; its rotations never change or are none"
-    poses = poses_of(positions, interpolate_turns(clocks[0], track.quaternions, clocks[1]))
+    poses = poses_of(placed.positions, interpolate_turns(poses_s, track.quaternions, scans_s))
     child = track.child.strip("/")
     if not child or child == lidar:
         return poses, "interpolated"
