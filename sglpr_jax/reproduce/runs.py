@@ -1,5 +1,6 @@
 """The trained models and descriptors behind the tables: made where they are missing, kept in one folder per run."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,12 @@ ROTATION_SEED = 0
 BATCH = 16
 DONE_FILE = "trained.json"
 WITHOUT_TRAINING = "without-training"
+
+
+@functools.cache
+def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
+    """A recording, listed once: a scan that vanishes later is missed, where another list would do without it."""
+    return open_recording(data, seq, pose_source=pose_source)
 
 
 @dataclass(frozen=True)
@@ -82,7 +89,7 @@ class Runs:
 
     def recording(self, seq: str) -> Recording:
         """A recording of the dataset."""
-        return open_recording(self.data, seq, pose_source=self.pose_source)
+        return _opened(self.data, seq, self.pose_source)
 
     def recordings_but(self, seq: str) -> list[Recording]:
         """The recordings that the runs for `seq` train on."""

@@ -1,11 +1,13 @@
 """bin/reproduce: leave-one-out runs on the small town, and the tables and figures made of them."""
 
 import json
+import shutil
 
 import pytest
 
 from sglpr_jax.evaluation.published import KITTI, TABLES
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
+from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.reproduce.scores import published_rows
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import write_sessions
@@ -33,6 +35,15 @@ def reproduced(town, preset, sessions, tmp_path_factory):
     ended = run_command("reproduce", *WANTED, *options)
     assert ended.status == 0, ended.error
     return folder, ended, options
+
+
+def test_a_scan_that_vanishes_on_the_way_is_missed(town, preset, tmp_path):
+    data = shutil.copytree(town, tmp_path / "town")
+    runs = Runs(tmp_path / "out", data, str(preset), load_preset(str(preset)))
+    scan = runs.recording("08").paths[1]
+    scan.unlink()
+    with pytest.raises(FileNotFoundError, match=scan.name):
+        runs.descriptors("polar-fft", "08")
 
 
 @pytest.mark.slow
