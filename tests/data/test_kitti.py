@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.readers.kitti import open_recording, read_trajectory, recording_names
 
 
@@ -87,6 +88,21 @@ def test_a_sequence_without_scans_is_refused(kitti_root):
     assert recording_names(kitti_root) == ("08", "09")
     with pytest.raises(FileNotFoundError, match=r"09/velodyne: expected scans \(\*\.bin\), found none"):
         open_recording(kitti_root, "09")
+
+
+def test_simulated_drives_know_how_high_their_sensor_stood(kitti_root):
+    settings = kitti_root / "simulation.json"
+    settings.write_text('{"sensor": {"height_m": 0.8}}')
+    sequence = open_recording(kitti_root, "08")
+    assert sequence.mounting == Mounting(0.8) and sequence.found[-1] == "sensor: 0.80 m above the ground, as simulated"
+    lowered = sequence.record(0).points - [0, 0, MODEL_HEIGHT_M - 0.8]
+    np.testing.assert_allclose(sequence.record(0).upright_points, lowered, rtol=1e-6)
+    settings.write_text(f'{{"sensor": {{"height_m": {MODEL_HEIGHT_M}}}}}')
+    assert open_recording(kitti_root, "08").mounting is None
+    for damaged in ("[]", '{"sensor": 1}', '{"sensor": {"height_m": "high"}}'):
+        settings.write_text(damaged)
+        with pytest.raises(ValueError, match=r"simulation\.json: expected the settings of a simulated dataset"):
+            open_recording(kitti_root, "08")
 
 
 def test_the_real_layout(shared):

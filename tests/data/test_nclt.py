@@ -13,6 +13,7 @@ from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import Corruption
 from sglpr_jax.data.formats.bin_records import NCLT_RECORD
 from sglpr_jax.data.formats.timed_poses import nearest_rows
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.readers import nclt
 
 DATE = "2012-01-15"
@@ -49,6 +50,11 @@ def test_each_scan_has_the_nearest_pose_and_those_without_are_left_out(root):
     np.testing.assert_allclose(session.times, [FIRST / 1e6, FIRST / 1e6 + 0.1], rtol=1e-12)
     assert session.pose_source == f"groundtruth_{DATE}.csv (1 of 3 scans left out: no pose within 0.5 s)"
     assert not session.has_labels and session.points(1).shape == (3, 3)
+
+
+def test_points_are_brought_to_the_height_that_models_know(root):
+    scan = open_recording(root, DATE).record(0)
+    np.testing.assert_allclose(scan.upright_points, scan.points - [0, 0, MODEL_HEIGHT_M], rtol=1e-6)
 
 
 def test_the_largest_gap_can_be_chosen(root):

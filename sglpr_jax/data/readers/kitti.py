@@ -21,10 +21,15 @@ from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 from sglpr_jax.data.formats.record_size import unusual_record
 from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import read_json
 from sglpr_jax.poses import positions_from_camera
+
+SIMULATION = "simulation.json"
+"""Beside the sequences that `bin/simulate` wrote: what they were made with."""
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -46,6 +51,9 @@ def open_recording(
     ids = tuple(path.stem for path in scan_paths)
     positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
+    reading, mounting = _read(scan_paths, format), _mounting(root)
+    if mounting is not None:
+        reading["found"] += (f"sensor: {mounting}, as simulated",)
     return Recording(
         name=name,
         ids=ids,
@@ -54,8 +62,22 @@ def open_recording(
         pose_source=pose_file,
         paths=scan_paths,
         label_paths=tuple(labels.get(scan) for scan in ids),
-        **_read(scan_paths, format),
+        mounting=mounting,
+        **reading,
     )
+
+
+def _mounting(root: Path) -> Mounting | None:
+    """Of simulated drives, whose sensor may have stood higher or lower than KITTI's; else None: as models know it."""
+    path = root / SIMULATION
+    if not path.is_file():
+        return None
+    settings = read_json(path)
+    sensor = settings.get("sensor") if isinstance(settings, dict) else None
+    height = sensor.get("height_m") if isinstance(sensor, dict) else None
+    if not isinstance(height, int | float):
+        raise ValueError(f"{path}: expected the settings of a simulated dataset with the sensor's height_m, found none")
+    return None if height == MODEL_HEIGHT_M else Mounting(float(height))
 
 
 def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:

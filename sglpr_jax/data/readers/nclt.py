@@ -19,6 +19,7 @@ from jaxtyping import Float, Int64
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN
 from sglpr_jax.data.formats.timed_poses import match_times
 from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
@@ -29,6 +30,8 @@ MAX_GAP_S = 0.5
 LATEST_US = 1e17
 """Times beyond the year 5000 are none."""
 
+BODY = Mounting(0.0)
+"""Points are given in the body's frame, whose origin is on the ground, and not from the sensor."""
 _DATE = "[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]"
 _COLUMNS = ("utime", "x", "y", "z", "roll", "pitch", "yaw")
 
@@ -58,6 +61,8 @@ def open_recording(root: Path, name: str, *, max_gap_s: float = MAX_GAP_S) -> Re
         pose_source=matched.described(truth.name, max_gap_s=max_gap_s),
         paths=kept_paths,
         read=scan_record,
+        mounting=BODY,
+        found=("sensor: points are given from the ground below it",),
     )
 
 
