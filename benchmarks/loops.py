@@ -52,7 +52,7 @@ class Simulated:
     """Routes and seeds, ROUTE:SEED."""
     scans: int = 600
     azimuth_steps: int = 900
-    weights: str = "rings"
+    weights: str = "sglpr"
     odometry: bool = True
     """Hand in drifting odometry."""
     registered: bool = False
@@ -88,7 +88,7 @@ class Images:
     data: Path
     """A folder in the layout NN/imgs/*.png with NN/pose.txt."""
     seqs: tuple[str, ...] = ("06",)
-    weights: str = "rings"
+    weights: str = "sglpr"
     odometry: bool = False
     """Hand in drifting odometry made from the poses."""
     seed: int = 0
@@ -123,7 +123,7 @@ class Speed:
     frames: int = 4541
     repeats: int = 20
     azimuth_steps: int = 900
-    weights: str = "rings"
+    weights: str = "sglpr"
 
     def run(self) -> None:
         detector = LoopDetector(sglpr_jax.load(self.weights))

@@ -10,6 +10,7 @@ import tyro
 from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.loops.choices import MIN_PROBABILITY, OdometryFormat
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 UNFINISHED = "unfinished"
 """The folder, in that of the results, of a run that has not ended."""
@@ -39,7 +40,7 @@ class LoopsCommand:
     """A pose for each scan, drifting as it may, or the bag itself. Without it, loops are judged by the scans alone."""
     odometry_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
-    weights: str = "rings"
+    weights: str = DEFAULT_WEIGHTS
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     register: bool = False

@@ -10,6 +10,7 @@ import tyro
 from sglpr_jax.cli.recording import RecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
     from sglpr_jax.models.params import Params
@@ -41,7 +42,7 @@ class MapCommand:
     """A map in the same world frame, of the same weights, whose places the new one has too."""
     spacing_m: float = SPACING_M
     """Scans nearer than this to the last place are left out."""
-    weights: str = "rings"
+    weights: str = DEFAULT_WEIGHTS
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     skip_bad: bool = False

@@ -11,6 +11,7 @@ from rich.table import Table
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.loops.choices import CANDIDATES
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
     from sglpr_jax.loops.places import Relocated
@@ -33,7 +34,7 @@ class RelocalizeCommand:
     """A JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
     candidates: int = CANDIDATES
     """How many places are looked at."""
-    weights: str = "rings"
+    weights: str = DEFAULT_WEIGHTS
     """The weights that made the map."""
     format: ScanFormat = "auto"
     """What the scan is, where its name does not tell."""

@@ -40,7 +40,7 @@ class LoopDetector:
     returned one frame late, together with the second.
 
     Example:
-      detector = LoopDetector(sglpr_jax.load("rings"))
+      detector = LoopDetector(sglpr_jax.load("sglpr"))
       for i in range(len(recording)):
           for loop in detector.add(recording.points(i), time=recording.times[i]):
               print(loop.query, loop.match, loop.match_from_query, loop.probability)

@@ -78,7 +78,7 @@ def find_loops(
     something, ImportError without the extra, and what reading the scans raises.
 
     Example:
-      found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("rings"))
+      found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
     if odometry is not None and len(odometry) != len(recording):
         raise ValueError(

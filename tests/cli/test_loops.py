@@ -37,7 +37,7 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
         "trajectory-optimized.tum",
         "trajectory-optimized.kitti",
     }
-    expected = find.find_loops(open_recording(town, "08"), load("rings"), odometry=odometry)
+    expected = find.find_loops(open_recording(town, "08"), load("sglpr"), odometry=odometry)
     found = read_loops_jsonl(out / "loops.jsonl")
     assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
     assert ended.out.splitlines()[0] == str(expected)

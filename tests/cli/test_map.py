@@ -118,7 +118,7 @@ def test_a_scan_without_ground_tells_no_height(command, places_file, tmp_path):
 @pytest.fixture
 def places_file(tmp_path):
     """A map of one place, made without describing a scan."""
-    params = sglpr_jax.load("rings")
+    params = sglpr_jax.load("sglpr")
     index = Index.empty(256, weights_hash=weights_hash(params))
     index.add(np.ones(256), positions=np.zeros(3))
     mountings = np.array([[1.73, 0, 0, 1.0]])
@@ -134,7 +134,7 @@ def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command,
         command(*run, "--out", tmp_path / "pose.json"), "dot.bin: expected a scan that shows something"
     )
     assert not (tmp_path / "pose.json").exists()
-    assert_one_line_error(command(*run, "--weights", "sglpr"), "one.safetensors: expected descriptors of the weights")
+    assert_one_line_error(command(*run, "--weights", "rings"), "one.safetensors: expected descriptors of the weights")
     content = places_file.read_bytes()
     places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
     assert_one_line_error(command(*run), "one.safetensors: expected an index as it was written, found a damaged one")
