@@ -4,8 +4,8 @@
     python benchmarks/readme_on_bare_machine.py --of wheel
 
 The commit that is checked out is cloned into a new folder, with a home of its own and empty caches; or a wheel of it is
-installed into a new environment, and bin/embed is sglpr-embed. The folders that the README takes for granted, KITTI and
-my_scans, are simulated there. It ends at the first command that fails. Needs nothing but Python and git, and hours:
+installed into a new environment, and bin/embed is sglpr-embed. What the README takes for granted (KITTI, my_scans,
+odometry.tum) is simulated there. It ends at the first command that fails. Needs nothing but Python and git, and hours:
 bin/test and a training are among the blocks (--but leaves commands out).
 """
 
@@ -27,6 +27,13 @@ KEPT = ("PATH", "LANG", "TMPDIR", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE")
 """What a new user's environment has too; beside these, how pip finds its index."""
 NOT_INSTALLED = ("bin/test", "bin/docs", "pip install")
 """Blocks of whoever has a checkout."""
+ODOMETRY = """
+from pathlib import Path
+import sglpr_jax
+from sglpr_jax.loops.graph_files import write_tum
+poses = sglpr_jax.read_odometry("KITTI/sequences/08/poses.txt", format="kitti")
+write_tum(Path("odometry.tum"), poses, sglpr_jax.open_recording("KITTI", "08").times)
+"""
 MANUAL = "http://localhost:8000"
 DOCS_S = 1200
 
@@ -54,7 +61,7 @@ def main() -> None:
         start = time.perf_counter()
         place, python = prepared(folder, options.of, environment)
         seconds = time.perf_counter() - start
-        make_data(place, options.of, options.scans, environment)
+        make_data(place, python, options.of, options.scans, environment)
         print(f"| line | command | seconds |\n|---|---|---|\n| | (until it is there) | {seconds:.1f} |")
         for step in steps((ROOT / "README.md").read_text(), python, of_wheel=options.of == "wheel"):
             if not any(step.shown.startswith(other) for other in options.but):
@@ -80,13 +87,14 @@ def prepared(folder: Path, of: str, environment: dict[str, str]) -> tuple[Path, 
     return place, venv / "bin/python"
 
 
-def make_data(place: Path, of: str, scans: int, environment: dict[str, str]) -> None:
-    """Write KITTI/ and my_scans/, which the reader has."""
+def make_data(place: Path, python: Path, of: str, scans: int, environment: dict[str, str]) -> None:
+    """Write KITTI/, my_scans/ and odometry.tum, which the reader has."""
     simulate = "bin/simulate" if of == "clone" else "sglpr-simulate"
     _run([simulate, "--out", "KITTI", "--scans", str(scans), "--azimuth-steps", "900"], place, environment)
     (place / "my_scans").mkdir()
     for scan in sorted((place / "KITTI/sequences/08/velodyne").iterdir())[:50]:
         shutil.copy(scan, place / "my_scans")
+    _run([str(python), "-c", ODOMETRY], place, environment)
 
 
 def steps(text: str, python: Path, *, of_wheel: bool) -> list[Step]:
