@@ -27,8 +27,8 @@ class Layout(NamedTuple):
     """Of the drive `{name}`."""
     scan_files: tuple[str, ...]
     """Of scan `{id}`."""
-    scan_contents: Callable[[np.ndarray, np.ndarray, Mounting], tuple[bytes, ...]]
-    """What is in them, from points (n, 4), labels (n,), and how the sensor was mounted."""
+    scan_contents: Callable[[np.ndarray, np.ndarray, Mounting | None], tuple[bytes, ...]]
+    """What is in them, from points (n, 4), labels (n,), and how the sensor was mounted (None: as models know it)."""
     drive_contents: Callable[[TimedPoses], dict[str, bytes]]
     """The files of the drive as a whole, by their names, written when all its scans are there."""
     last_file: str
@@ -47,16 +47,21 @@ class Layout(NamedTuple):
         return self.file_of_drive(root, name, self.last_file).exists()
 
 
-def _points_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray, _mounting: Mounting) -> tuple[bytes, ...]:
+def _points_and_labels(
+    points: Float[np.ndarray, "n 4"], labels: np.ndarray, _mounting: Mounting | None
+) -> tuple[bytes, ...]:
     return points.astype("<f4").tobytes(), labels.astype("<u4").tobytes()
 
 
-def _image_and_labels(points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting) -> tuple[bytes, ...]:
+def _image_and_labels(
+    points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None
+) -> tuple[bytes, ...]:
     """A density image and the raw ids of what its pixels show; an empty pixel shows nothing.
 
     Images are those of a sensor at the height that models know, as those made of the drive's scans are.
     """
-    xyz = mounting.level(points[:, :3].astype(np.float32))
+    xyz = points[:, :3].astype(np.float32)
+    xyz = xyz if mounting is None else mounting.level(xyz)
     image = density_image(xyz)
     shown = np.where(image > 0, density_label_image(xyz, labels), 0)
     return _png(image), _png(shown.astype(np.uint16))
@@ -90,7 +95,7 @@ def _bevplace_files(poses: TimedPoses) -> dict[str, bytes]:
     return {"pose.txt": "".join(_row(pose) for pose in poses.world_from_lidar).encode()}
 
 
-def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting) -> tuple[bytes, ...]:
+def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
     """Return the bytes of a scan in NCLT's body frame: x forward, y right, z down, from the ground below the sensor.
 
     `points` are metres from the sensor, z up, and reflectivities 0 to 1. Lasers are not told apart. NCLT's numbers

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.sim.choices import RATE_HZ
@@ -122,7 +122,7 @@ def drive_through(
         paths=names,
         label_paths=names,
         read=read,
-        mounting=Mounting(sensor.height_m),
+        mounting=None if sensor.height_m == MODEL_HEIGHT_M else Mounting(sensor.height_m),
         on_disk=False,
         poses=poses,
         render=render,
