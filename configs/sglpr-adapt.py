@@ -9,28 +9,15 @@ Expect: on the KITTI BEV images, trained on 00 and 02, whitened on them and test
 Command: bin/train --seq 06 --data KITTI_BEV --also SIMULATED --weights sglpr --preset sglpr-adapt
 """
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.models.presets import model_preset
-from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
+import dataclasses
 
-CONFIG = TrainConfig(
+from sglpr_jax.models.presets import model_preset
+from sglpr_jax.training.presets import load_preset
+
+_RINGS = load_preset("rings-adapt")
+CONFIG = dataclasses.replace(
+    _RINGS,
     model=model_preset("sglpr"),
-    sampling=TupleConfig(negatives=0, cluster=4, positive_m=4.0),  # the batch's other places are the negatives
-    loss=LossConfig(
-        margin=0.3,
-        squared=True,
-        temperature=0.1,
-        one_threshold=0.5,
-        segment_every=10,  # places of the second source, which have labels
-        ignore_unlabelled=True,
-        class_balance=0.5,
-    ),
-    optimizer=OptimizerConfig(learning_rate=3e-4, warmup_steps=20, decay_rate=0.5, decay_steps=55, clip_norm=1.0),
-    steps=240,
-    tuples=20,
+    optimizer=dataclasses.replace(_RINGS.optimizer, learning_rate=3e-4),
     also_tuples=10,
-    also_triplets=True,
-    share_negatives=True,
-    max_points=131072,
-    score_every=120,
 )
