@@ -137,7 +137,6 @@ def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order
     return rotated.reshape(*batch, height, width)
 
 
-@jax.jit
 def even_cells(image: Num[Array | np.ndarray, "*b h w"]) -> Num[Array | np.ndarray, "*b h+h%2 w+w%2"]:
     """A ready-made density image on the cells of eq. 1: its middle row and column become two of half the count.
 

@@ -12,6 +12,9 @@ def check_cloud(points: Float32[np.ndarray, "n 3"], *, name: str = "") -> None:
     where = f"{name}: " if name else ""
     x, y, z = np.abs(points.T)  # a column at a time: reductions along the three axes of a point take ten times as long
     largest = np.maximum(np.maximum(x, y), z)  # not finite where one of them is not
+    near = largest <= FARTHEST_M
+    if 2 * np.count_nonzero(near) > len(points) and (near & (largest > 0)).any():
+        return  # of nearly all scans no more needs to be known
     largest = largest[np.isfinite(largest)]
     if not len(largest):
         raise ValueError(f"{where}expected finite points, found none among {len(points)}")

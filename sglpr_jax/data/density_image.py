@@ -20,6 +20,8 @@ FLOOR_M = -1.2
 CEILING_M = 200.0
 """Points count below this height, which no scan reaches, so that the number of a voxel fits 32 bits."""
 MAX_VOXELS = 6000
+SOME_POINTS, SOME_VOXELS = 18_000, 2**16
+"""At least so many points tell that there are too many voxels, numbered from 0 again after so many."""
 EDGE_STEP_M = 0.05
 FIRST_EDGE_M = 0.10
 
@@ -54,7 +56,7 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
     The voxels' edge is the smallest of 0.10, 0.15, 0.20, ... m that leaves at most 6000 voxels. Points that are not
     finite are dropped. Pixel for pixel what the ready-made images of KITTI show.
     """
-    centroids = _voxel_centroids(points.take(np.flatnonzero(_in_crop(points)), axis=0))
+    centroids = _voxel_centroids(points.T.take(np.flatnonzero(_in_crop(points)), axis=1))
     counts = np.bincount(_cell_of_point(centroids), minlength=SIZE**2).clip(max=MAX_COUNT)
     return np.round(counts * (255 / max(counts.max(), 1))).astype(np.uint8).reshape(SIZE, SIZE)
 
@@ -69,7 +71,7 @@ def density_label_image(
     """
     counted = _in_crop(points)
     labels = np.zeros(SIZE**2, np.int32)
-    labels[_cell_of_point(points[counted])] = classes[counted]  # numpy keeps the last of repeated assignments
+    labels[_cell_of_point(points[counted].T)] = classes[counted]  # numpy keeps the last of repeated assignments
     return labels.reshape(SIZE, SIZE)
 
 
@@ -78,30 +80,42 @@ def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
     return (np.abs(x) < REACH_M) & (np.abs(y) < REACH_M) & (z > FLOOR_M) & (z < CEILING_M)
 
 
-def _cell_of_point(points: Float[np.ndarray, "n _"]) -> Int[np.ndarray, " n"]:
+def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
     """The flat cell of every point. Truncation makes the row and the column through the sensor two cells wide."""
-    row, column = SIZE // 2 - np.trunc(points[:, :2].T / RESOLUTION_M).astype(np.int64)
+    row, column = SIZE // 2 - np.trunc(points[:2] / RESOLUTION_M).astype(np.int64)
     return row * SIZE + column
 
 
-def _voxel_centroids(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 2"]:
+def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
     """The mean x and y of the points in each voxel, with the smallest edge that leaves few enough voxels."""
-    voxels = _voxel_of_point(points, edge_m := FIRST_EDGE_M)
-    while np.count_nonzero(_found(voxels)) > MAX_VOXELS:
-        voxels = _voxel_of_point(points, edge_m := edge_m + EDGE_STEP_M)
-    voxel = _numbered(voxels)
-    count = np.bincount(voxel)
-    sums = [np.bincount(voxel, weights=axis) for axis in points.T[:2]]
-    return np.stack(sums, axis=1) / count[:, None]
+    voxels = _fewest_voxels(points)
+    if not len(voxels):
+        return np.zeros((2, 0))
+    found = _found(voxels)
+    voxel = (np.cumsum(found) - 1)[voxels - voxels.min()]  # the inverse of np.unique, which sorts and is slower
+    return np.stack([np.bincount(voxel, weights=axis) for axis in points[:2]]) / np.bincount(voxel)
 
 
-def _numbered(numbers: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """The place of each number among the different ones, in order: the inverse of np.unique."""
-    return (np.cumsum(_found(numbers)) - 1)[numbers - numbers.min()] if len(numbers) else numbers
+def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
+    """The voxel of every point, for the smallest edge with which there are at most `MAX_VOXELS` of them.
+
+    Most edges are ruled out by some of the points: these have no more voxels than all.
+    """
+    some = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SOME_POINTS)])
+    edge_m = FIRST_EDGE_M
+    while _too_many(_voxel_of_point(some, edge_m) & (SOME_VOXELS - 1)) or _too_many(
+        voxels := _voxel_of_point(points, edge_m)
+    ):
+        edge_m += EDGE_STEP_M
+    return voxels
+
+
+def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
+    return bool(np.count_nonzero(_found(voxels)) > MAX_VOXELS)
 
 
 def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
-    """Of the numbers from the smallest to the largest, which are there. np.unique sorts, which is slower."""
+    """Of the numbers from the smallest to the largest, which are there."""
     if not len(numbers):
         return np.zeros(0, bool)
     least = numbers.min()
@@ -110,8 +124,8 @@ def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
     return found
 
 
-def _voxel_of_point(points: Float32[np.ndarray, "n 3"], edge_m: float) -> Int32[np.ndarray, " n"]:
+def _voxel_of_point(points: Float32[np.ndarray, "3 n"], edge_m: float) -> Int32[np.ndarray, " n"]:
     """The voxel of every point as one number; the voxels' corners are multiples of `edge_m`."""
-    x, y, z = np.floor(points * np.float32(1 / edge_m)).astype(np.int32).T
+    x, y, z = np.floor(points * np.float32(1 / edge_m)).astype(np.int32)
     side = 2 * int(REACH_M / edge_m) + 4  # with room for rounding
     return (z * side + y) * side + x

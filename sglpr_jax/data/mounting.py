@@ -66,7 +66,9 @@ class Mounting:
     def level(self, points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
         """Points (n, 3) as an upright sensor at `MODEL_HEIGHT_M` has them. Those that are not finite stay so."""
         if self.up == (0.0, 0.0, 1.0):
-            return points + np.array([0, 0, self.height_m - MODEL_HEIGHT_M], np.float32)
+            lifted = points.copy(order="K")
+            lifted[:, 2] += np.float32(self.height_m - MODEL_HEIGHT_M)
+            return lifted
         with np.errstate(invalid="ignore"):
             turned = points.astype(np.float64) @ self.upright_from_lidar.T
         return (turned + np.array([0, 0, self.height_m - MODEL_HEIGHT_M])).astype(np.float32)
@@ -123,12 +125,13 @@ def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """One point of every voxel near the sensor, the first in the file."""
-    finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    distance = np.linalg.norm(finite, axis=1)
-    near = finite[(distance > NEAR_M[0]) & (distance < NEAR_M[1])]
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y, z = points.T.astype(np.float64)
+        distance = np.sqrt(x * x + y * y + z * z)  # neither near nor far where a coordinate is not finite
+        near = points[(distance > NEAR_M[0]) & (distance < NEAR_M[1])].astype(np.float64)
     if not len(near):
         return near
-    x, y, z = np.floor(near / VOXEL_M).astype(np.int64).T + 128
+    x, y, z = np.floor(near.T / VOXEL_M).astype(np.int64) + 128
     _, first = np.unique((z * 256 + y) * 256 + x, return_index=True)
     return near[np.sort(first)]
 

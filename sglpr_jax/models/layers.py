@@ -6,11 +6,25 @@ Weights are float32. Layers multiply in the type of their input, so that a netwo
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+
+def weight(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> Any:
+    """A weight of the module that calls it. ValueError for one of another shape.
+
+    Flax's `param` traces `init` in every call to know the shape: a third of the time that tracing a network takes.
+    """
+    if not module.has_variable("params", name):
+        return module.param(name, init, shape)
+    value = module.get_variable("params", name)
+    if value.shape != shape:
+        raise ValueError(f"{'/'.join((*module.path, name))}: expected weights of shape {shape}, found {value.shape}")
+    return value
 
 
 class Linear(nn.Module):
@@ -27,9 +41,9 @@ class Linear(nn.Module):
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
         """The same linear map of every vector of `c` channels."""
         c = x.shape[-1]
-        y = x.reshape(-1, c) @ self.param("kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
+        y = x.reshape(-1, c) @ weight(self, "kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
         if self.use_bias:
-            y = y + self.param("bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)[None]
+            y = y + weight(self, "bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)[None]
         return y.reshape(*x.shape[:-1], self.features)
 
 
@@ -53,14 +67,22 @@ def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
     return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
 
 
-class LayerNorm(nn.LayerNorm):
-    """Layer norm over channels with PyTorch's epsilon (Flax's default is 1e-6); within it everything is float32."""
+class LayerNorm(nn.Module):
+    """Layer norm over channels with PyTorch's epsilon; within it everything is float32."""
 
     epsilon: float = 1e-5
 
+    @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
         """Keeps the type of its input."""
-        return super().__call__(x).astype(x.dtype)
+        scale = weight(self, "scale", nn.initializers.ones, x.shape[-1:])
+        bias = weight(self, "bias", nn.initializers.zeros, x.shape[-1:])
+        y = x.astype(jnp.float32)
+        mean = y.mean(-1, keepdims=True)
+        variance = jnp.maximum((y * y).mean(-1, keepdims=True) - mean * mean, 0.0)
+        along_channels = (1,) * (x.ndim - 1) + (-1,)
+        scaled = jax.lax.rsqrt(variance + self.epsilon) * scale.reshape(along_channels)
+        return ((y - mean) * scaled + bias.reshape(along_channels)).astype(x.dtype)
 
 
 torch_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")

@@ -13,7 +13,7 @@ def test_kitti_keeps_its_axes(tmp_path):
     np.array([[1, 2, 3, 0.5], [4, 5, np.nan, 0.5]], dtype="<f4").tofile(path)
     points = read_scan(path)
     np.testing.assert_array_equal(points, np.float32([[1, 2, 3], [4, 5, np.nan]]))
-    assert points.flags.c_contiguous
+    assert points.flags.f_contiguous
 
 
 def test_nuscenes_turns_right_and_forward_into_forward_and_left(tmp_path):

@@ -67,7 +67,8 @@ def read_records(path: Path, format: RecordFormat) -> Records:
     records = np.fromfile(path, dtype=dtype)
     lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
     with np.errstate(over="ignore", invalid="ignore"):  # numbers that are none: whoever uses the points drops them
-        return Records(np.ascontiguousarray(_our_axes(records["xyz"], format), dtype=np.float32), lasers)
+        # One axis after the other in memory: copied in half the time, and whatever comes next goes along the axes.
+        return Records(np.asfortranarray(_our_axes(records["xyz"], format), dtype=np.float32), lasers)
 
 
 def _our_axes(xyz: np.ndarray, format: RecordFormat) -> np.ndarray:

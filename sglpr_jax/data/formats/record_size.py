@@ -173,8 +173,9 @@ def _each(values: Sequence[Float[np.ndarray, "_"]], start: int, turn: int) -> Fl
 
 def _apart(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> float:
     """The largest difference of two empirical distribution functions."""
-    both = np.concatenate([a, b])
-    a_below, b_below = (np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (a, b))
+    a, b = np.sort(a), np.sort(b)
+    both = np.concatenate([a, b])  # two sorted halves: a search of numbers in order takes a fraction of the time
+    a_below, b_below = (np.searchsorted(x, both, side="right") / len(x) for x in (a, b))
     return float(np.abs(a_below - b_below).max())
 
 

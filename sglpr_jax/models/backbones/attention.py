@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.models.layers import Linear
+from sglpr_jax.models.layers import Linear, weight
 
 BLOCKED = -100.0
 """Added to the score of two tokens that are neighbours only because the image was rolled."""
@@ -93,7 +93,7 @@ class WindowAttention(nn.Module):
         """Looks the table up by a product with one-hot rows: its gradient is a product too, not a slow scatter."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
-        table = self.param("position_bias", nn.initializers.normal(0.02), (rows, self.heads))
+        table = weight(self, "position_bias", nn.initializers.normal(0.02), (rows, self.heads))
         one_hot = jax.nn.one_hot(relative_position_index(window).reshape(-1), rows)
         bias = jnp.matmul(one_hot, table, precision=jax.lax.Precision.HIGHEST)
         return bias.T.reshape(self.heads, tokens, tokens)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.fields import Size, Sizes, check_fields
 from sglpr_jax.models.backbones.interface import Seen
-from sglpr_jax.models.layers import LayerNorm, Linear
+from sglpr_jax.models.layers import LayerNorm, Linear, weight
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,8 +106,8 @@ class RingConvolution(nn.Module):
         """The last radius counts as a whole stride where `stride` does not divide the radii."""
         b, radii, sectors, c = x.shape
         init = nn.initializers.he_normal(in_axis=(0, 1, 2), out_axis=3)
-        kernel = self.param("kernel", init, (3, 3, c, self.features)).astype(x.dtype)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)
+        kernel = weight(self, "kernel", init, (3, 3, c, self.features)).astype(x.dtype)
+        bias = weight(self, "bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)
         padded = jnp.pad(x, ((0, 0), (1, 1), (0, 0), (0, 0)))
         across = jnp.concatenate([padded[:, i : i + radii : self.stride] for i in range(3)], axis=-1)
         to_three = kernel.swapaxes(1, 2).reshape(3 * c, 3 * self.features)

@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sglpr_jax.models.layers import Linear, l2_normalize
+from sglpr_jax.models.layers import Linear, l2_normalize, weight
 
 
 class NetVLAD(nn.Module):
@@ -28,7 +28,7 @@ class NetVLAD(nn.Module):
         weights_init = nn.initializers.normal(d**-0.5)
         logits = Linear(self.clusters, kernel_init=weights_init, name="assignment")(features)
         assignment = nn.softmax(logits.astype(jnp.float32))
-        centres = self.param("centres", weights_init, (d, self.clusters))
+        centres = weight(self, "centres", weights_init, (d, self.clusters))
         weights = assignment.astype(features.dtype)
         residuals = jnp.einsum("bnd,bnk->bdk", features, weights, preferred_element_type=jnp.float32)
         residuals = residuals - assignment.sum(1)[:, None, :] * centres[None]

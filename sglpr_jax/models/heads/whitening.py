@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sglpr_jax.models.layers import l2_normalize
+from sglpr_jax.models.layers import l2_normalize, weight
 
 
 class Whitening(nn.Module):
@@ -15,6 +15,6 @@ class Whitening(nn.Module):
     def __call__(self, descriptor: Float[Array, "b d"]) -> Float[Array, "b d"]:
         """Descriptors of length 1."""
         d = descriptor.shape[-1]
-        kernel = self.param("kernel", lambda key, shape: jnp.eye(*shape), (d, d))
-        bias = self.param("bias", nn.initializers.zeros, (d,))
+        kernel = weight(self, "kernel", lambda key, shape: jnp.eye(*shape), (d, d))
+        bias = weight(self, "bias", nn.initializers.zeros, (d,))
         return l2_normalize(jnp.matmul(descriptor, kernel, precision=jax.lax.Precision.HIGHEST) + bias[None])
