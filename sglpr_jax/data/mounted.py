@@ -7,17 +7,26 @@ import numpy as np
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.warning import warn
 
 SCANS = 11
 """From so many scans, all over a recording, the mounting is found."""
+SCANS_CHECKED = 3
+"""So many tell whether a sensor stands where its layout has it."""
+ELSEWHERE_M, ELSEWHERE_DEG = 0.4, 10.0
+"""A sensor so much higher, lower or more tilted than that is another one."""
 
 
 def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recording:
     """The recording with the mounting that `height` asks for, and what was found in words.
 
-    `known` says that the layout's scans are mounted as models know them. Where no ground is found nothing is changed.
+    `known` says that the layout tells how its scans are mounted; where their ground is elsewhere, a `DataWarning` says
+    so. Where no ground is found nothing is changed.
     """
-    if recording.has_images or (height == "auto" and known):
+    if recording.has_images:
+        return recording
+    if height == "auto" and known:
+        _check_layout(recording)
         return recording
     if height in ("auto", "estimate"):
         return _estimated(recording)
@@ -26,17 +35,35 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
 
 
 def _estimated(recording: Recording) -> Recording:
-    rows = np.unique(np.linspace(0, len(recording) - 1, SCANS).astype(int))
-    each = [_of_scan(recording, int(row)) for row in rows]
+    each = _of_scans(recording, SCANS)
     mounting, seen = common_mounting(each), sum(found is not None for found in each)
     if mounting is None:
         found = (
-            f"sensor: no ground found but in {seen} of {len(rows)} scans, taken to be {MODEL_HEIGHT_M} m above it;"
+            f"sensor: no ground found but in {seen} of {len(each)} scans, taken to be {MODEL_HEIGHT_M} m above it;"
             " say --sensor-height"
         )
     else:
-        found = f"sensor: {mounting}, estimated from the ground in {seen} of {len(rows)} scans"
+        found = f"sensor: {mounting}, estimated from the ground in {seen} of {len(each)} scans"
     return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+
+
+def _check_layout(recording: Recording) -> None:
+    """Warn where the ground lies elsewhere than the layout has it: other sensors' scans are often put into KITTI's."""
+    believed = recording.mounting or Mounting(MODEL_HEIGHT_M)
+    found = common_mounting(_of_scans(recording, SCANS_CHECKED))
+    if found is None:
+        return
+    if abs(found.height_m - believed.height_m) > ELSEWHERE_M or found.tilt_deg > ELSEWHERE_DEG:
+        warn(
+            f"sequence {recording.name}: expected the sensor {believed}, as its layout has it, found it {found}; if it"
+            " is another sensor say --sensor-height estimate, or its height in metres"
+        )
+
+
+def _of_scans(recording: Recording, scans: int) -> list[Mounting | None]:
+    """What so many scans tell, all over the recording."""
+    rows = np.unique(np.linspace(0, len(recording) - 1, scans).astype(int))
+    return [_of_scan(recording, int(row)) for row in rows]
 
 
 def _of_scan(recording: Recording, row: int) -> Mounting | None:

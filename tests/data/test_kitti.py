@@ -103,6 +103,9 @@ def test_simulated_drives_know_how_high_their_sensor_stood(kitti_root):
         settings.write_text(damaged)
         with pytest.raises(ValueError, match=r"simulation\.json: expected the settings of a simulated dataset"):
             open_recording(kitti_root, "08")
+    settings.write_text('{"sensor": {"height_m": NaN}}')
+    with pytest.raises(ValueError, match=r"simulation\.json: .*(height|NaN)"):
+        open_recording(kitti_root, "08")
 
 
 def test_the_real_layout(shared):

@@ -18,6 +18,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.data.views import view
+from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.models.presets import model_preset
 
@@ -165,6 +166,22 @@ def test_layouts_that_know_their_sensor_are_left_alone_unless_asked(kitti_root, 
     assert asked.mounting is None and "no ground found but in 0 of 3 scans" in asked.found[-1]
     assert open_recording(bev_root, "06", sensor_height=1.2).mounting is None
     assert mounted(of_images({}), "estimate", known=False).mounting is None
+
+
+@pytest.mark.parametrize("height", [0.6, MODEL_HEIGHT_M])
+def test_another_sensor_in_kittis_layout_is_told(height, kitti_root):
+    for path in (kitti_root / "sequences/08/velodyne").glob("*.bin"):
+        points = street(0, height=height)
+        np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(path)
+    for path in (kitti_root / "sequences/08/labels").glob("*.label"):
+        np.zeros(10500, "<u4").tofile(path)
+    if height == MODEL_HEIGHT_M:  # a warning is an error
+        assert open_recording(kitti_root, "08").mounting is None
+        return
+    words = "sequence 08: expected the sensor 1.73 m above the ground, as its layout has it, found it 0.5"
+    with pytest.warns(DataWarning, match=words):
+        assert open_recording(kitti_root, "08").mounting is None
+    assert open_recording(kitti_root, "08", sensor_height=height).mounting == Mounting(height)
 
 
 def test_real_scans(shared):

@@ -77,7 +77,10 @@ def _mounting(root: Path) -> Mounting | None:
     height = sensor.get("height_m") if isinstance(sensor, dict) else None
     if not isinstance(height, int | float):
         raise ValueError(f"{path}: expected the settings of a simulated dataset with the sensor's height_m, found none")
-    return None if height == MODEL_HEIGHT_M else Mounting(float(height))
+    try:
+        return None if height == MODEL_HEIGHT_M else Mounting(float(height))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
