@@ -5,7 +5,8 @@ import dataclasses
 import jax
 import numpy as np
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.bev import Grid, ImageKind
+from sglpr_jax.data.density_image import SIZE
 from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.models.backbones.swin import SwinConfig
 from sglpr_jax.models.config import ModelConfig
@@ -16,6 +17,9 @@ from sglpr_jax.training.config import TrainConfig
 
 CLOUD_SPREAD = 0.29
 """Standard deviation of x and y as a part of the window's width: 84 % of the points fall inside."""
+
+MEAN_COUNT = 0.3
+"""Of the cells of a random image: a quarter of them are not empty."""
 
 WEIGHT_NOISE = 0.01
 """Added to initial weights, of which many are 0 or 1 and would hide that one stands in another's place."""
@@ -52,13 +56,27 @@ def random_scans(*shape: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     return points.astype(np.float32), rng.integers(1, 20, shape, dtype=np.int32)
 
 
+def random_images(number: int, grid: Grid, *, image: ImageKind) -> tuple[np.ndarray, np.ndarray]:
+    """Images of counts (number, h, w) in the size of `grid`, or of ready-made density images, and their classes."""
+    rng = np.random.default_rng(0)
+    shape = (number, *((SIZE, SIZE) if image == "density" else (grid.height, grid.width)))
+    counts = rng.poisson(MEAN_COUNT, shape).clip(max=10)
+    return counts.astype(np.float32), (rng.integers(1, 20, shape) * (counts > 0)).astype(np.int32)
+
+
 def random_batch(config: TrainConfig, points: int, *, labels: bool = True) -> Batch:
-    """A step's tuples of random clouds with `points` points each, all with labels or none."""
-    clouds, classes = random_scans(config.images, points, grid=config.model.grid)
+    """A step's tuples, all with labels or none: random clouds of so many points, or images.
+
+    Images with 0 points, and for a model of density images, which no step rasterises.
+    """
     positives, places = config.sampling.positives, config.images // config.tuples
     tuple_of, place_of = np.divmod(np.arange(config.images), places)
     own = tuple_of == np.arange(config.tuples)[:, None]
     far = np.where(own, place_of > positives, config.share_negatives)
-    count = np.full(config.images, points, np.int32)
     labelled = np.full(config.images, labels)
+    if points == 0 or config.model.image == "density":
+        images, maps = random_images(config.images, config.model.grid, image=config.model.image)
+        return Batch(labelled, far, positives, images=images, maps=maps if labels else None)
+    clouds, classes = random_scans(config.images, points, grid=config.model.grid)
+    count = np.full(config.images, points, np.int32)
     return Batch(labelled, far, positives, points=clouds, count=count, classes=classes if labels else None)

@@ -25,19 +25,19 @@ def main(
     preset: Literal["small", "paper"] = "small",
     repeats: int = 10,
     chunk: tuple[int, ...] = (0,),
-    points: int = 120_000,
+    points: int = 0,
     threads: int = 2,
 ) -> None:
     """Time training steps on the CPU against PyTorch.
 
-    Ours also rasterises the tuple's clouds; PyTorch gets the images. Both start from the same weights, and the losses
-    and gradients of their first two steps must agree.
+    Both get the same images and start from the same weights; the losses and gradients of their first two steps must
+    agree.
 
     Args:
         preset: the model; a polar one is timed without its resampling, and stochastic depth is off.
         repeats: how often both are timed against each other.
         chunk: images that ours takes through the network at a time (0: all 12); several are compared in turn.
-        points: points of each cloud.
+        points: of clouds that ours rasterises within its step, while PyTorch still gets the images; 0: none.
         threads: threads that each program may use.
     """
     require_torch()

@@ -91,7 +91,7 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
 
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
     """The batch as the network will see it, cut into chunks along a new leading axis."""
-    angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) * config.rotate
+    angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) if config.rotate else None
     see = functools.partial(views, grid=config.model.grid)
     images, maps = (see if batch.also is not None else on_own_rows(see))(batch, angles)  # a mixed one is on one device
     maps = None if maps is None else jnp.where(field_of_view(config.model), maps, UNLABELLED)

@@ -91,14 +91,15 @@ def read_batch(
     return Batch(**common, points=points, count=count, classes=classes if has_labels else None)
 
 
-def views(batch: Batch, angles: Float[Array, "b"], grid: Grid) -> View:
-    """What the model sees of each place, rotated by its angle (radians); no map of classes where there are no labels.
+def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
+    """What the model sees of each place, rotated by its angle (radians; None: as it is), inside jit on the device.
 
-    Runs on the device, inside jit.
+    No map of classes where there are no labels.
     """
     if batch.also is None:
         return _views(batch, angles, grid)
-    parts = [_views(batch, angles[: batch.places], grid), _views(batch.also, angles[batch.places :], grid)]
+    own, others = (None, None) if angles is None else (angles[: batch.places], angles[batch.places :])
+    parts = [_views(batch, own, grid), _views(batch.also, others, grid)]
     images = jnp.concatenate([image for image, _ in parts])
     if all(maps is None for _, maps in parts):
         return View(images)
@@ -106,7 +107,7 @@ def views(batch: Batch, angles: Float[Array, "b"], grid: Grid) -> View:
     return View(images, jnp.concatenate(unlabelled))
 
 
-def _views(batch: Batch, angles: Float[Array, "b"], grid: Grid) -> View:
+def _views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
     if batch.images is not None:
         return image_view(batch.images, batch.maps, grid, angles)
     return cloud_view(batch.points, batch.classes, batch.count, grid, angles)
