@@ -46,9 +46,9 @@ def main(
     """Time training steps and matrix products in turn, on one device, in one process.
 
     The step is the whole of it but reading: rasterising, where the preset trains on clouds, or rotating its images,
-    forward, backward, optimiser, on a random batch that is on the device already. Its operations are those of matrix products and convolutions, forward and backward; what
-    a step in chunks computes twice to save memory counts once. The peak is the rate of large square products of the
-    same type, at the precision JAX has by default.
+    forward, backward, optimiser, on a random batch that is on the device already. Its operations are those of matrix
+    products and convolutions, forward and backward; what a step in chunks computes twice to save memory counts once.
+    The peak is the rate of large square products of the same type, at the precision JAX has by default.
 
     Args:
         preset: files of configs/ by name, or paths.
