@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from sglpr_jax.fields import check_value, field_types, is_config, require
 from sglpr_jax.models.config import ModelConfig
 
-ADDED_LATER = {"head.means": (), "head.whiten": False}
+ADDED_LATER = {"head.means": (), "head.whiten": False, "backbone.fine": (), "backbone.stem.fine": ()}
 """Fields that files handed out before do not have, and what such files mean."""
 
 

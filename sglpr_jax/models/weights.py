@@ -35,14 +35,30 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
 def graft(given: Params, fresh: Params) -> Params:
     """`fresh` with the values of `given` wherever that has them: to train on from weights handed out.
 
-    Raises ValueError where `given` has a weight that `fresh` has not, or one of another shape.
+    A kernel may see more channels in `fresh` than in `given`: it begins with 0 for those that come last. So a larger
+    network begins by computing what the smaller one does. Raises ValueError where `given` has a weight that `fresh` has
+    not, or one of another shape.
     """
     all_of_them, values = by_name(fresh.weights), by_name(given.weights)
     for name, value in values.items():
-        if name not in all_of_them or all_of_them[name].shape != value.shape:
-            wanted = all_of_them[name].shape if name in all_of_them else "no such weight"
-            raise ValueError(f"cannot begin with these weights: {name} has shape {value.shape}, expected {wanted}")
+        wanted = all_of_them[name].shape if name in all_of_them else None
+        if wanted is None or not _may_become(wanted, value.shape):
+            expected = "no such weight" if wanted is None else wanted
+            raise ValueError(f"cannot begin with these weights: {name} has shape {value.shape}, expected {expected}")
+    values = {name: _with_zeros(value, all_of_them[name].shape) for name, value in values.items()}
     return dataclasses.replace(fresh, weights=as_tree(all_of_them | values))
+
+
+def _may_become(wanted: tuple[int, ...], found: tuple[int, ...]) -> bool:
+    """Whether the shapes are equal, or kernels' that differ in how many channels they see: the last axis but one."""
+    if wanted == found:
+        return True
+    return len(wanted) == len(found) == 4 and wanted[2] > found[2] and wanted[:2] + wanted[3:] == found[:2] + found[3:]
+
+
+def _with_zeros(value: Any, shape: tuple[int, ...]) -> Any:
+    missing = [(0, wanted - found) for wanted, found in zip(shape, value.shape, strict=True)]
+    return np.pad(np.asarray(value), missing) if np.any(missing) else value
 
 
 def for_places(params: Params) -> Params:

@@ -40,20 +40,27 @@ def test_the_convolution_is_xlas_on_a_wrapped_image(stride, radii, random_variab
     np.testing.assert_allclose(one_by_one(x), expected, atol=1e-5)
 
 
-def test_maps_shrink_as_configured_and_turn_with_the_image(random_variables):
+@pytest.mark.parametrize("fine", [(), (3, 5)])
+def test_maps_shrink_as_configured_and_turn_with_the_image(fine, random_variables):
     image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
-    net = RingNet(RINGS)
+    net = RingNet(dataclasses.replace(RINGS, fine=fine))
     variables = random_variables(net, image)
     maps = net.apply(variables, image)
-    assert [m.shape for m in maps] == [(2, 8, 16, 2), (2, 4, 16, 4), (2, 4, 8, 6), (2, 2, 8, 6)]
-    np.testing.assert_allclose(maps[0], image.reshape(2, 8, 2, 16, 2, 2).mean((2, 4)), atol=1e-6)
+    joining = [*fine, 0, 0, 0, 0]
+    assert [m.shape for m in maps] == [
+        (2, 8, 16, 2 + joining[0]),
+        (2, 4, 16, 4 + joining[1]),
+        (2, 4, 8, 6),
+        (2, 2, 8, 6),
+    ]
+    np.testing.assert_allclose(maps[0][..., :2], image.reshape(2, 8, 2, 16, 2, 2).mean((2, 4)), atol=1e-6)
     turned = net.apply(variables, jnp.roll(image, 8, axis=2))  # two sectors of the last map
     np.testing.assert_allclose(turned[-1], jnp.roll(maps[-1], 2, axis=2), atol=1e-5)
 
 
 def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_variables):
     image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
-    net, decoder = RingNet(RINGS), RingDecoder()
+    net, decoder = RingNet(RINGS), RingDecoder(RINGS.widths)
     variables = random_variables(net, image)
     maps = net.apply(variables, image)
     weights = random_variables(decoder, maps)
@@ -61,6 +68,16 @@ def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_vari
     assert pixels.shape == (2, 8, 16, 4)
     turned = decoder.apply(weights, net.apply(variables, jnp.roll(image, 8, axis=2)))
     np.testing.assert_allclose(turned, jnp.roll(pixels, 4, axis=2), atol=1e-4)
+
+
+def test_fine_blocks_see_what_the_means_do_not(random_variables):
+    image = jax.random.normal(jax.random.key(0), (1, 16, 32, 2))
+    other = image.at[0, 4, 8].add(1.0).at[0, 5, 9].add(-1.0)  # in one square
+    plain, fine = RingNet(RINGS), RingNet(dataclasses.replace(RINGS, fine=(3,)))
+    for net, differs in ((plain, False), (fine, True)):
+        variables = random_variables(net, image)
+        change = jnp.abs(net.apply(variables, image)[-1] - net.apply(variables, other)[-1]).max()
+        assert (change > 1e-3) == differs
 
 
 def test_quarter_turns_leave_the_descriptor(params):
@@ -107,6 +124,8 @@ def test_the_spectrum_reads_every_radius(random_variables):
 def test_what_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match="as many strides and means as widths"):
         RingConfig(widths=(4, 8))
+    with pytest.raises(ValueError, match="no more than the widths"):
+        RingConfig(widths=(4,), strides=(1,), means=(1,), fine=(3, 3))
     with pytest.raises(ValueError, match="'rings' sees a polar image"):
         ModelConfig(backbone=RINGS)
     with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+import sglpr_jax
 from sglpr_jax.models import weights_file
+from sglpr_jax.models.backbones.rings import RingConfig
+from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.weights import graft, weight_shapes, weights_hash
@@ -42,6 +45,23 @@ def test_weights_without_the_training_parts_are_grafted_onto_fresh_ones(params):
     chex.assert_trees_all_equal(found.weights["segmentation_head"], fresh.weights["segmentation_head"])
     with pytest.raises(ValueError, match=r"segmentation_head/kernel has shape .*, expected no such weight"):
         graft(params, given)
+
+
+def with_fine_blocks(*channels):
+    rings = RingConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
+    head = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
+    return dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=rings, head=head)
+
+
+def test_a_network_grown_by_fine_blocks_begins_as_the_smaller_one():
+    small = sglpr_jax.init(jax.random.key(0), config=with_fine_blocks(5))
+    grown = graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks(5, 6)))
+    bev = jnp.asarray(np.random.default_rng(0).poisson(0.7, (2, 32, 32)), jnp.float32)
+    np.testing.assert_allclose(sglpr_jax.describe(grown, bev), sglpr_jax.describe(small, bev), atol=1e-6)
+    np.testing.assert_allclose(sglpr_jax.segment(grown, bev), sglpr_jax.segment(small, bev), atol=1e-5)
+    expected = r"decoder/block_1/convolution/kernel has shape \(3, 3, 10, 4\), expected \(3, 3, 5, 4\)"
+    with pytest.raises(ValueError, match=expected):
+        graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks()))
 
 
 def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_what_was_there(params, tmp_path, small_files):

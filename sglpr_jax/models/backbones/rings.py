@@ -26,6 +26,8 @@ class RingConfig:
     kind: Literal["rings"] = "rings"
     average: Size = 2
     """Edge of the squares of polar pixels whose means the first block sees: without, the resampling skips cells."""
+    fine: Sizes = ()
+    """Channels of more blocks, which see the polar pixels themselves: the i-th joins what the i-th of `widths` sees."""
     widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
     """Channels of each block."""
     strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
@@ -41,6 +43,10 @@ class RingConfig:
             raise ValueError(
                 "expected as many strides and means as widths of the ring net, found "
                 f"widths {self.widths}, strides {self.strides}, means {self.means}"
+            )
+        if len(self.fine) > len(self.widths):
+            raise ValueError(
+                f"fine: expected no more than the widths of the ring net, {self.widths}, found {self.fine}"
             )
 
     @property
@@ -87,7 +93,7 @@ class RingBackbone:
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
         """A pixel for each pixel of the averaged image."""
-        return RingDecoder(name="decoder")([*seen.finer, seen.features])
+        return RingDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
 
 
 class RingConvolution(nn.Module):
@@ -130,16 +136,24 @@ class RingBlock(nn.Module):
 
 
 class RingNet(nn.Module):
-    """From the polar image to the features of the place head, and to every map on the way."""
+    """From the polar image to the features of the place head, and to every map on the way.
+
+    Means lose what is smaller than their squares. So fine blocks go beside the others at the full number of sectors,
+    and their maps are averaged to the size of those that they join.
+    """
 
     config: RingConfig
 
     @nn.compact
     def __call__(self, polar: Float[Array, "b p q c"]) -> list[Float[Array, "b _ _ _"]]:
-        """The averaged image and the map of each block; the last one is the features."""
-        config = self.config
+        """The averaged image and the map of each block, with what joins it; the last one is the features."""
+        config, fine = self.config, polar
         maps = [block_means(polar, config.average, config.average)]
         for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
+            if i < len(config.fine):
+                fine = RingBlock(config.fine[i], config.strides[i - 1] if i else config.average, name=f"fine_{i}")(fine)
+                joining = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
+                maps[-1] = jnp.concatenate([maps[-1], joining], axis=-1)
             maps.append(block_means(RingBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
         return maps
 
@@ -147,13 +161,16 @@ class RingNet(nn.Module):
 class RingDecoder(nn.Module):
     """From the features back to the resolution of the averaged image, looking at every finer map on the way."""
 
+    widths: tuple[int, ...]
+    """Of the blocks that made the maps."""
+
     @nn.compact
     def __call__(self, maps: list[Array]) -> Float[Array, "b p q _"]:
         """As many channels as the first block has."""
-        finer_maps = [fine for fine, coarse in itertools.pairwise(maps) if fine.shape[:3] != coarse.shape[:3]]
+        finer = [i for i, (fine, coarse) in enumerate(itertools.pairwise(maps)) if fine.shape[:3] != coarse.shape[:3]]
         x = maps[-1]
-        for i, seen in enumerate(reversed(finer_maps)):
-            width = max(seen.shape[-1], maps[1].shape[-1])
+        for i, of_map in enumerate(reversed(finer)):
+            seen, width = maps[of_map], self.widths[max(of_map - 1, 0)]
             x = Linear(width, name=f"narrow_{i}")(x)
             x = jnp.concatenate([_repeated(x, seen.shape[1] // x.shape[1], seen.shape[2] // x.shape[2]), seen], axis=-1)
             x = RingBlock(width, name=f"block_{i}")(x)

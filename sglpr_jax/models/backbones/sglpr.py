@@ -91,7 +91,7 @@ class SglprBackbone:
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
         """A pixel for each pixel of the averaged image."""
-        return RingDecoder(name="decoder")([*seen.finer, seen.features])
+        return RingDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
 
 
 class RingSwin(nn.Module):
