@@ -37,7 +37,7 @@ class EmbedCommand:
     """Draws the angles of --rotate."""
     skip_bad: bool = False
     """Report scans that cannot be read and go on without them."""
-    batch: int = 16
+    batch: int = 8
     """Images described at a time."""
 
 

@@ -38,7 +38,7 @@ class StressCommand:
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     seed: int = 0
     """A scan's corruption is a function of it and the scan's number."""
-    batch: int = 16
+    batch: int = 8
     """Images described at a time."""
 
 

@@ -31,7 +31,7 @@ def stress_test(
     corruptions: Sequence[str] = (),
     protocols: Sequence[str] = (),
     seed: int = 0,
-    batch: int = 16,
+    batch: int = 8,
     progress: Progress = no_progress,
 ) -> StressTest:
     """Score every method on the recording as it is and under each corruption.

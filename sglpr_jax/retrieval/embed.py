@@ -37,7 +37,7 @@ def embed(
     recording: Recording,
     *,
     rotation_seed: int | None = None,
-    batch: int = 16,
+    batch: int = 8,
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
@@ -77,7 +77,7 @@ def embed_images(
     image: ImageKind = "points",
     field: Bool[np.ndarray, "h w"] | None = None,
     rotation_seed: int | None = None,
-    batch: int = 16,
+    batch: int = 8,
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:

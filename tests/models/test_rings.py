@@ -6,8 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
-from sglpr_jax.models.backbones.rings import RingConfig, RingConvolution, RingDecoder, RingNet
+from sglpr_jax.models.backbones.rings import (
+    RingConfig,
+    RingConvolution,
+    RingDecoder,
+    RingNet,
+    as_products,
+    convolve_around,
+)
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
 from sglpr_jax.models.presets import model_preset
@@ -38,6 +46,20 @@ def test_the_convolution_is_xlas_on_a_wrapped_image(stride, radii, random_variab
     np.testing.assert_allclose(module.apply(variables, x), expected, atol=1e-5)
     one_by_one = jax.jit(jax.vmap(lambda image: module.apply(variables, image[None])[0]))
     np.testing.assert_allclose(one_by_one(x), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        as_products(x, jnp.asarray(kernel), stride) + bias[None, None, None], expected, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("stride, radii", [(1, 5), (2, 6), (2, 5)])
+def test_the_convolutions_derivatives_are_those_of_finite_differences(stride, radii):
+    x = jax.random.normal(jax.random.key(0), (2, radii, 7, 3))
+    kernel = jax.random.normal(jax.random.key(1), (3, 3, 3, 4))
+
+    def convolved(x, kernel):  # finite differences are of numpy arrays
+        return convolve_around(jnp.asarray(x), jnp.asarray(kernel), stride)
+
+    check_grads(convolved, (x, kernel), order=2, atol=1e-2, rtol=1e-2)
 
 
 @pytest.mark.parametrize("fine", [(), (3, 5)])

@@ -6,11 +6,13 @@ that map, exact up to the resampling of the image.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from typing import Literal
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -97,11 +99,7 @@ class RingBackbone:
 
 
 class RingConvolution(nn.Module):
-    """A 3 x 3 convolution, He-initialised: zeros beyond the first and last radius, sectors go around.
-
-    One matrix product gives what each pixel adds to itself and to its two neighbours at its radius, and the three are
-    added after a roll. On a CPU forward and backward take 0.5 to 0.9 times as long as XLA's convolution.
-    """
+    """A 3 x 3 convolution, He-initialised: zeros beyond the first and last radius, sectors go around."""
 
     features: int
     stride: int = 1
@@ -110,16 +108,44 @@ class RingConvolution(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "b r s c"]) -> Float[Array, "b _ s {self.features}"]:
         """The last radius counts as a whole stride where `stride` does not divide the radii."""
-        b, radii, sectors, c = x.shape
         init = nn.initializers.he_normal(in_axis=(0, 1, 2), out_axis=3)
-        kernel = weight(self, "kernel", init, (3, 3, c, self.features)).astype(x.dtype)
+        kernel = jnp.asarray(weight(self, "kernel", init, (3, 3, x.shape[-1], self.features)), x.dtype)
         bias = weight(self, "bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)
-        padded = jnp.pad(x, ((0, 0), (1, 1), (0, 0), (0, 0)))
-        across = jnp.concatenate([padded[:, i : i + radii : self.stride] for i in range(3)], axis=-1)
-        to_three = kernel.swapaxes(1, 2).reshape(3 * c, 3 * self.features)
-        three = (across.reshape(-1, 3 * c) @ to_three).reshape(b, -1, sectors, 3 * self.features)
-        left, middle, right = jnp.split(three, 3, axis=-1)
-        return jnp.roll(left, 1, axis=2) + middle + jnp.roll(right, -1, axis=2) + bias[None, None, None]
+        return convolve_around(x, kernel, self.stride) + bias[None, None, None]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def convolve_around(
+    x: Float[Array, "b r s c"], kernel: Float[Array, "3 3 c f"], stride: int
+) -> Float[Array, "b _ s f"]:
+    """XLA's convolution of the image with a sector more at either end. Its derivative is that of `as_products`.
+
+    On a CPU XLA's convolution takes 0.5 to 1.2 times as long as the products, its gradient up to 1.8 times.
+    """
+    wrapped = jnp.pad(x, ((0, 0), (0, 0), (1, 1), (0, 0)), mode="wrap")
+    axes = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(wrapped, kernel, (stride, 1), ((1, 1), (0, 0)), dimension_numbers=axes)
+
+
+@convolve_around.defjvp
+def _(stride: int, primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (x, kernel), (x_tangent, kernel_tangent) = primals, tangents
+    tangent = as_products(x_tangent, kernel, stride) + as_products(x, kernel_tangent, stride)
+    return convolve_around(x, kernel, stride), tangent
+
+
+def as_products(x: Float[Array, "b r s c"], kernel: Float[Array, "3 3 c f"], stride: int) -> Float[Array, "b _ s f"]:
+    """The same convolution as one matrix product and two rolls.
+
+    The product gives what each pixel adds to itself and to its two neighbours at its radius.
+    """
+    b, radii, sectors, c = x.shape
+    padded = jnp.pad(x, ((0, 0), (1, 1), (0, 0), (0, 0)))
+    across = jnp.concatenate([padded[:, i : i + radii : stride] for i in range(3)], axis=-1)
+    to_three = kernel.swapaxes(1, 2).reshape(3 * c, -1)
+    three = (across.reshape(-1, 3 * c) @ to_three).reshape(b, -1, sectors, to_three.shape[-1])
+    left, middle, right = jnp.split(three, 3, axis=-1)
+    return jnp.roll(left, 1, axis=2) + middle + jnp.roll(right, -1, axis=2)
 
 
 class RingBlock(nn.Module):
