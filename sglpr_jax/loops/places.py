@@ -1,6 +1,7 @@
 """A map of places on disk, in which tomorrow's scan finds itself: an index, and an image and a pose for each place."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -89,15 +90,17 @@ class PlaceMap:
     def merged(self, other: "PlaceMap") -> "PlaceMap":
         """The places of both, in one world frame; those of `other` that are here already are taken once.
 
-        Raises ValueError where other weights or images made them.
+        Where its ids are taken by other places, its recordings are called ~2, ~3 and so on. Raises ValueError where
+        other weights or images made them.
         """
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
         known = set(self._contents())
         new = [row for row, content in enumerate(other._contents()) if content not in known]
         index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
-        for one, rows in ((self, list(range(len(self)))), (other, new)):
-            places = {"ids": [one.index.ids[row] for row in rows], "positions": one.world_from_place[rows, :3, 3]}
+        new_ids = _not_taken([other.index.ids[row] for row in new], set(self.index.ids))
+        for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
+            places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
             index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
         both = (np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in ARRAYS)
         return PlaceMap(index, *both)
@@ -147,15 +150,26 @@ class PlaceMap:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
         return cls(index, *(more[name] for name in ARRAYS))
 
-    def _contents(self) -> Iterator[tuple[str, bytes, bytes]]:
+    def _contents(self) -> Iterator[tuple[bytes, bytes]]:
         """What tells each place from every other one."""
-        for name, descriptor, pose in zip(self.index.ids, self.index.descriptors, self.world_from_place, strict=True):
-            yield name, descriptor.tobytes(), pose.tobytes()
+        for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
+            yield descriptor.tobytes(), pose.tobytes()
 
     def _other_place(self, descriptor: Float[np.ndarray, " d"], row: int) -> float:
         near = np.linalg.norm(self.world_from_place[:, :3, 3] - self.world_from_place[row, :3, 3], axis=1) <= NEGATIVE_M
         distance = float(self.index.query(descriptor, exclude=near).distances[0])
         return distance if np.isfinite(distance) else np.nan
+
+
+def _not_taken(ids: list[str], taken: set[str]) -> list[str]:
+    """The ids, `recording/scan`, with a number after the recording where one of them is taken."""
+    for number in itertools.count(1):
+        mark = f"~{number}" if number > 1 else ""
+        parts = (name.rpartition("/") for name in ids)
+        marked = [f"{recording}{mark}{slash}{scan}" for recording, slash, scan in parts]
+        if taken.isdisjoint(marked):
+            return marked
+    raise AssertionError("there is always a next number")
 
 
 class Mapped(NamedTuple):

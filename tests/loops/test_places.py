@@ -91,8 +91,10 @@ def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, fir
     again = both.merged(places).merged(other)
     assert again.index.to_bytes() == both.index.to_bytes()
     np.testing.assert_array_equal(again.images, both.images)
-    moved = dataclasses.replace(places, world_from_place=shifted)
-    assert len(both.merged(moved)) == 3 * MAPPED // 2
+    moved = dataclasses.replace(places, world_from_place=shifted + np.eye(4, k=3)[None])
+    three = both.merged(moved)  # of another recording that is called 08 too
+    assert three.index.ids[len(both) :] == [name.replace("08/", "08~2/") for name in places.index.ids]
+    assert three.merged(moved).index.ids == three.index.ids
 
 
 @pytest.mark.slow
