@@ -75,7 +75,7 @@ def test_the_nearest_of_all_shapes_wins_from_any_pose(seed, world_from_lidar):
     clear = expected_distance < REACH_M - 1
     for grow in (0.997, 1.003):
         clear &= reference(rays, world_from_lidar[:3, 3], scene, grow)[1] == expected
-    assert clear.sum() > 100
+    assert clear.sum() > 20  # a tilted sensor may see little but ground and sky
     np.testing.assert_array_equal(found[clear], expected[clear])
     np.testing.assert_allclose(distance.ravel()[clear], expected_distance[clear], rtol=1e-4, atol=5e-3)
     missed = np.isinf(expected_distance) & np.isinf(reference(rays, world_from_lidar[:3, 3], scene, 1.003)[0])
