@@ -23,7 +23,7 @@ class SglprConfig:
     """A Swin-Unet whose tokens come from convolutions that go around the polar image."""
 
     kind: Literal["sglpr"] = "sglpr"
-    stem: RingConfig = RingConfig(widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
+    stem: RingConfig = RingConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
     """Its last map has a pixel for each token."""
     embed_dim: Size = 64
     depths: Depths = (2, 2)
