@@ -22,7 +22,7 @@ from sglpr_jax.data.views import view
 from sglpr_jax.models.params import Params
 
 SIMULATED = {"routes": ("08",), "scans": 20, "azimuth_steps": 1800}
-BATCH = 64
+BATCH = 8
 
 
 def main(
