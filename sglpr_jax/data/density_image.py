@@ -21,7 +21,7 @@ CEILING_M = 200.0
 """Points count below this height, which no scan reaches, so that the number of a voxel fits 32 bits."""
 MAX_VOXELS = 6000
 SOME_POINTS, SOME_VOXELS = 18_000, 2**16
-"""At least so many points tell that there are too many voxels, numbered from 0 again after so many."""
+"""A quick count sees every n-th point, but at least so many, and voxels whose numbers differ by so many as one."""
 EDGE_STEP_M = 0.05
 FIRST_EDGE_M = 0.10
 
@@ -99,7 +99,7 @@ def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2
 def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
     """The voxel of every point, for the smallest edge with which there are at most `MAX_VOXELS` of them.
 
-    Most edges are ruled out by some of the points: these have no more voxels than all.
+    Most edges are ruled out by the quick count, which never finds more voxels than there are.
     """
     some = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SOME_POINTS)])
     edge_m = FIRST_EDGE_M
