@@ -45,7 +45,7 @@ def main(
     config = TrainConfig(model=comparable_model(preset), loss=PAPER_LOSS, rotate=False)
     params = random_params(config.model)
     batch = random_batch(config, points)
-    images, maps = views(batch, np.zeros(config.images, np.float32), config.model.grid)
+    images, maps = views(batch, None, config.model.grid)
     images = prepare(images, config.model)
 
     other = Contender("PyTorch", torch_job, params, *map(np.asarray, (images, maps)), config, threads=threads)

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import gc
 import inspect
 import logging
 import os
@@ -21,6 +22,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sglpr_jax.data.warning import DataWarning
 
 _TABLE_WIDTH = 140
+_OBJECTS_BETWEEN_COLLECTIONS = 100_000
+"""Imports and tracing make objects that stay: with Python's 700 an eighth of a start went by looking for garbage."""
 T = TypeVar("T")
 
 
@@ -50,6 +53,7 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
 
 def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     """Parse a command line and do its work: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
+    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     for chatty in ("absl", "asyncio"):  # pages about a checkpoint that failed, which orbax raises too
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)  # the same at the very end

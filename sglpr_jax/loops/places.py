@@ -163,13 +163,10 @@ class PlaceMap:
 
 def _not_taken(ids: list[str], taken: set[str]) -> list[str]:
     """The ids, `recording/scan`, with a number after the recording where one of them is taken."""
-    for number in itertools.count(1):
-        mark = f"~{number}" if number > 1 else ""
-        parts = (name.rpartition("/") for name in ids)
-        marked = [f"{recording}{mark}{slash}{scan}" for recording, slash, scan in parts]
-        if taken.isdisjoint(marked):
-            return marked
-    raise AssertionError("there is always a next number")
+    parts = [name.rpartition("/") for name in ids]
+    marks = itertools.chain([""], (f"~{number}" for number in itertools.count(2)))
+    marked = ([f"{recording}{mark}{slash}{scan}" for recording, slash, scan in parts] for mark in marks)
+    return next(names for names in marked if taken.isdisjoint(names))
 
 
 class Mapped(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 def weight(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> Any:
     """A weight of the module that calls it. ValueError for one of another shape.
 
-    Flax's `param` traces `init` in every call to know the shape: a third of the time that tracing a network takes.
+    Flax's `param` traces `init` in every call to know the shape: half of the time that tracing a network takes.
     """
     if not module.has_variable("params", name):
         return module.param(name, init, shape)
@@ -68,7 +68,10 @@ def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
 
 
 class LayerNorm(nn.Module):
-    """Layer norm over channels with PyTorch's epsilon; within it everything is float32."""
+    """Layer norm over channels with PyTorch's epsilon; within it everything is float32.
+
+    The arithmetic of Flax's, whose initial values would be traced in every call (see `weight`).
+    """
 
     epsilon: float = 1e-5
 
