@@ -47,21 +47,6 @@ class Linear(nn.Module):
         return y.reshape(*x.shape[:-1], self.features)
 
 
-def convolution(
-    x: Float[Array, "b h w c"], channels: int, kernel: int, stride: int = 1, *, circular: bool, name: str
-) -> Float[Array, "b _ _ {channels}"]:
-    """A convolution, part of the module that calls it, He-initialised; the columns of a `circular` image go around.
-
-    Patches side by side (kernel = stride) need no border, others PyTorch's of kernel // 2.
-    """
-    border = 0 if kernel == stride else kernel // 2
-    if circular:
-        x = jnp.pad(x, ((0, 0), (0, 0), (border, border), (0, 0)), mode="wrap")
-    padding = [(border, border), (0, 0) if circular else (border, border)]
-    init = nn.initializers.he_normal()
-    return nn.Conv(channels, (kernel, kernel), stride, padding, dtype=x.dtype, kernel_init=init, name=name)(x)
-
-
 def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
     """The exact GELU, x times the normal distribution function, by erf: `jax.nn.gelu` takes the costlier erfc."""
     return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))

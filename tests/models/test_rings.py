@@ -1,4 +1,4 @@
-"""The ring net: its convolution is XLA's, and a rotation of the scan shifts its features and no more."""
+"""The ring net: a rotation of the scan shifts its features and no more."""
 
 import dataclasses
 
@@ -6,16 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
-from sglpr_jax.models.backbones.rings import (
-    RingConfig,
-    RingConvolution,
-    RingDecoder,
-    RingNet,
-    as_products,
-    convolve_around,
-)
+from sglpr_jax.models.backbones.rings import RingConfig, RingDecoder, RingNet
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
 from sglpr_jax.models.presets import model_preset
@@ -31,35 +23,6 @@ BEV = jax.random.poisson(jax.random.key(1), 0.7, (3, 32, 32)).astype(jnp.float32
 @pytest.fixture(scope="module", params=[CONFIG, SPECTRUM], ids=["netvlad", "spectrum"])
 def params(request, random_params):
     return random_params(request.param)
-
-
-@pytest.mark.parametrize("stride, radii", [(1, 5), (2, 6), (2, 5)])
-def test_the_convolution_is_xlas_on_a_wrapped_image(stride, radii, random_variables):
-    x = jax.random.normal(jax.random.key(0), (2, radii, 7, 3))
-    module = RingConvolution(4, stride)
-    variables = random_variables(module, x)
-    wrapped = jnp.pad(jnp.pad(x, ((0, 0), (0, 0), (1, 1), (0, 0)), mode="wrap"), ((0, 0), (1, 1), (0, 0), (0, 0)))
-    kernel, bias = variables["params"]["kernel"], variables["params"]["bias"]
-    expected = bias[None, None, None] + jax.lax.conv_general_dilated(
-        wrapped, kernel, (stride, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest"
-    )
-    np.testing.assert_allclose(module.apply(variables, x), expected, atol=1e-5)
-    one_by_one = jax.jit(jax.vmap(lambda image: module.apply(variables, image[None])[0]))
-    np.testing.assert_allclose(one_by_one(x), expected, atol=1e-5)
-    np.testing.assert_allclose(
-        as_products(x, jnp.asarray(kernel), stride) + bias[None, None, None], expected, atol=1e-5
-    )
-
-
-@pytest.mark.parametrize("stride, radii", [(1, 5), (2, 6), (2, 5)])
-def test_the_convolutions_derivatives_are_those_of_finite_differences(stride, radii):
-    x = jax.random.normal(jax.random.key(0), (2, radii, 7, 3))
-    kernel = jax.random.normal(jax.random.key(1), (3, 3, 3, 4))
-
-    def convolved(x, kernel):  # finite differences are of numpy arrays
-        return convolve_around(jnp.asarray(x), jnp.asarray(kernel), stride)
-
-    check_grads(convolved, (x, kernel), order=2, atol=1e-2, rtol=1e-2)
 
 
 @pytest.mark.parametrize("fine", [(), (3, 5)])

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand
-from sglpr_jax.models.layers import LayerNorm, convolution
+from sglpr_jax.models.convolution import Convolution
+from sglpr_jax.models.layers import LayerNorm
 
 
 class Stem(nn.Module):
@@ -26,9 +27,10 @@ class Stem(nn.Module):
         x, maps = image, []
         for level, width in enumerate(self.widths):
             stride = 2 if level else 1
-            x = nn.relu(convolution(x, width, 3, stride, circular=self.circular, name=f"down_{level}"))
+            down = Convolution(width, strides=(stride, stride), circular=self.circular, name=f"down_{level}")
+            x = nn.relu(down(x))
             if level:
-                x = convolution(x, width, 3, circular=self.circular, name=f"convolution_{level}")
+                x = Convolution(width, circular=self.circular, name=f"convolution_{level}")(x)
                 x = nn.relu(LayerNorm(name=f"norm_{level}")(x))
             maps.append(x)
         return maps
@@ -48,6 +50,6 @@ class StemDecoder(nn.Module):
             width = maps[level].shape[-1]
             x = FinalPatchExpand(factor, width, name=f"expand_{level}")(x)
             x = jnp.concatenate([x, maps[level]], axis=-1)
-            x = nn.relu(convolution(x, width, 3, circular=self.circular, name=f"convolution_{level}"))
+            x = nn.relu(Convolution(width, circular=self.circular, name=f"convolution_{level}")(x))
             factor = 2
         return x

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.layers import Linear, torch_uniform
 
 ROUNDING = 1e-6
@@ -58,12 +59,8 @@ class SpatialGate(nn.Module):
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
         """One weight per pixel."""
         pooled = jnp.stack([largest(x, (-1,)), x.mean(-1)], axis=-1)
-        padding = [(3, 3), (3, 3)]
-        if self.circular:
-            pooled, padding = jnp.pad(pooled, ((0, 0), (0, 0), (3, 3), (0, 0)), mode="wrap"), [(3, 3), (0, 0)]
-        convolution = nn.Conv(1, (7, 7), padding=padding, dtype=x.dtype, kernel_init=torch_uniform, name="convolution")
-        logits = convolution(pooled)
-        return x * nn.sigmoid(logits)
+        convolution = Convolution(1, 7, circular=self.circular, kernel_init=torch_uniform, name="convolution")
+        return x * nn.sigmoid(convolution(pooled))
 
 
 class CBAM(nn.Module):

@@ -4,8 +4,10 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.layers import Linear, gelu
 
+_INIT = nn.initializers.lecun_normal()
 _LOCAL = ((5, 16), (3, 16))
 """Cells and channels of the convolutions: together they see what lies within three cells."""
 
@@ -23,6 +25,6 @@ class Detail(nn.Module):
         """The mixed features, `width` numbers for each cell."""
         image = image.astype(features.dtype)
         for i, (cells, channels) in enumerate(_LOCAL):
-            image = nn.relu(nn.Conv(channels, (cells, cells), dtype=image.dtype, name=f"local{i}")(image))
+            image = nn.relu(Convolution(channels, cells, kernel_init=_INIT, name=f"local{i}")(image))
         both = jnp.concatenate([features, image], axis=-1)
         return gelu(Linear(self.width, name="mix")(both))

@@ -5,12 +5,13 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.backbones.rings import RingBlock, block_means
 from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.heads.cbam import CBAM
 from sglpr_jax.models.heads.mean_pooling import MeanPooling
 from sglpr_jax.models.heads.netvlad import NetVLAD
 from sglpr_jax.models.heads.spectrum import Spectrum
 from sglpr_jax.models.heads.whitening import Whitening
-from sglpr_jax.models.layers import LayerNorm, convolution, l2_normalize
+from sglpr_jax.models.layers import LayerNorm, l2_normalize
 
 
 class PlaceHead(nn.Module):
@@ -39,7 +40,8 @@ class PlaceHead(nn.Module):
         channels, kernel, stride = config.channels[i], config.kernels[i], config.strides[i]
         if config.means:
             return block_means(RingBlock(channels, stride, name=f"block_{i}")(x), 1, config.means[i])
-        x = convolution(x, channels, kernel, stride, circular=self.circular, name=f"convolution_{i}")
+        strides, name = (stride, stride), f"convolution_{i}"
+        x = Convolution(channels, kernel, strides, circular=self.circular, name=name)(x)
         return nn.relu(LayerNorm(name=f"norm_{i}")(x))
 
     def _pool(self, x: Float[Array, "b h w c"]) -> Float[Array, "b d"]:

@@ -1,0 +1,92 @@
+"""The convolution: forward and backward it is XLA's, and its gradient is made of products alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from sglpr_jax.models.convolution import Convolution, as_product, convolve
+
+CASES = [
+    pytest.param(3, (1, 1), True, id="around"),
+    pytest.param(3, (2, 1), True, id="around, stride along rows"),
+    pytest.param(3, (2, 2), True, id="around, stride"),
+    pytest.param(3, (1, 1), False, id="flat"),
+    pytest.param(3, (2, 2), False, id="flat, stride"),
+    pytest.param(4, (4, 4), False, id="side by side"),
+    pytest.param(4, (1, 1), False, id="even"),
+    pytest.param(5, (1, 1), True, id="five"),
+    pytest.param(7, (3, 2), False, id="seven"),
+]
+SHAPES = [(2, 9, 8, 3), (1, 8, 7, 1)]
+
+
+def reference(x, kernel, strides, circular):
+    """XLA's on an image whose border is written out."""
+    size = len(kernel)
+    border = 0 if strides == (size, size) else size // 2
+    x = np.pad(x, ((0, 0), (0, 0), (border, border), (0, 0)), mode="wrap" if circular else "constant")
+    x = np.pad(x, ((0, 0), (border, border), (0, 0), (0, 0)))
+    axes = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(x, kernel, strides, "VALID", dimension_numbers=axes, precision="highest")
+
+
+def image_and_kernel(shape, size):
+    x, kernel = jax.random.split(jax.random.key(0))
+    return jax.random.normal(x, shape), jax.random.normal(kernel, (size, size, shape[-1], 4)) / size
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("size, strides, circular", CASES)
+def test_both_forms_are_xlas(size, strides, circular, shape):
+    x, kernel = image_and_kernel(shape, size)
+    expected = reference(x, kernel, strides, circular)
+    for form in (convolve, as_product):
+        np.testing.assert_allclose(form(x, kernel, strides, circular), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("size, strides, circular", CASES)
+def test_the_module_adds_its_bias_under_jit_and_vmap(size, strides, circular, random_variables):
+    x, _ = image_and_kernel(SHAPES[0], size)
+    module = Convolution(4, size, strides, circular=circular)
+    variables = random_variables(module, x)
+    kernel, bias = variables["params"]["kernel"], variables["params"]["bias"]
+    expected = reference(x, kernel, strides, circular) + bias[None, None, None]
+    np.testing.assert_allclose(module.apply(variables, x), expected, atol=2e-5)
+    one_by_one = jax.jit(jax.vmap(lambda image: module.apply(variables, image[None])[0]))
+    np.testing.assert_allclose(one_by_one(x), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("size, strides, circular", CASES)
+def test_the_gradient_is_xlas(size, strides, circular):
+    x, kernel = image_and_kernel(SHAPES[0], size)
+
+    def gradients(form):
+        return jax.jit(jax.grad(lambda x, k: (form(x, k, strides, circular) ** 2).sum(), (0, 1)))(x, kernel)
+
+    def by_xla(x, kernel, strides, circular):
+        border = 0 if strides == (size, size) else size // 2
+        x = jnp.pad(x, ((0, 0), (0, 0), (border, border), (0, 0)), mode="wrap" if circular else "constant")
+        padding, axes = ((border, border), (0, 0)), ("NHWC", "HWIO", "NHWC")
+        return jax.lax.conv_general_dilated(x, kernel, strides, padding, dimension_numbers=axes, precision="highest")
+
+    for ours, expected in zip(gradients(convolve), gradients(by_xla), strict=True):
+        np.testing.assert_allclose(ours, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("size, strides, circular", CASES[:5])
+def test_derivatives_are_those_of_finite_differences(size, strides, circular):
+    def convolved(x, kernel):  # finite differences are of numpy arrays
+        return convolve(jnp.asarray(x), jnp.asarray(kernel), strides, circular)
+
+    check_grads(convolved, image_and_kernel((2, 5, 6, 3), size), order=2, atol=1e-2, rtol=1e-2)
+
+
+@pytest.mark.parametrize("size, strides, circular", CASES)
+def test_no_convolution_runs_backward(size, strides, circular):
+    def loss(x, kernel):
+        return convolve(x, kernel, strides, circular).sum()
+
+    program = str(jax.make_jaxpr(jax.grad(loss, (0, 1)))(*image_and_kernel(SHAPES[0], size)))
+    assert program.count("conv_general_dilated") == 1  # the one forward
