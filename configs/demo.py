@@ -3,7 +3,7 @@
 Reproduces nothing of the paper; it shows that everything works, on two simulated recordings with labels.
 
 Expect: 120 steps in a minute and a half on two CPU cores; on the simulated recording 00 a top-1 F1max of .99, and the
-same with every scan rotated (the weights as they ship: 1.00 and 1.00; untrained: .84 and .80).
+same with every scan rotated (the weights as they ship: 1.00 and 1.00; untrained: .78 and .79).
 
 Command: bin/demo
 """

@@ -1,6 +1,6 @@
 """The preset `paper` with a place head of a third of the cost: a 4 x 4 convolution of stride 4, then two of 3 x 3.
 
-Reproduces table 1, of whose place head the paper gives no sizes (candidate B of docs/decisions/paper.md).
+Reproduces table 1, of whose place head the paper gives no sizes (docs/decisions/paper.md, place head).
 
 Expect: as for `paper`, not measured here; it wants a GPU.
 

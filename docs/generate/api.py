@@ -17,7 +17,9 @@ GROUPS = {
 }
 HEAD = """# API
 
-What `import sglpr_jax` gives. Functions without side effects are pure: they may stand under `jit`, `vmap` and `grad`.
+What `import sglpr_jax` gives. `describe`, `forward`, `segment`, `is_describable`, `rasterize`, `rasterize_labels`,
+`rotate_image` and `rotate_points` are JAX: pure, for `jit` and `vmap`, `describe` and `forward` for `grad` too. What
+reads scans or makes density images (`scan_image`, `density_bev`) is numpy.
 Shapes stand in the signatures, as jaxtyping writes them: `Float[Array, "*b h w"]` is an array of floating point numbers
 with any leading axes, h rows and w columns. Points are metres in the LiDAR frame: x forward, y left, z up.
 """

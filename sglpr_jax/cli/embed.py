@@ -22,7 +22,7 @@ class EmbedCommand:
     """
 
     data: Path
-    """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    """A dataset, a bag or a folder of scans or ready-made images, of any layout that is known."""
     out: Path
     """The descriptor file to write (.npz)."""
     weights: str | None = None

@@ -27,7 +27,7 @@ class RelocalizeCommand:
     """
 
     scan: Annotated[Path, tyro.conf.Positional]
-    """A scan (.bin, .pcd) or a ready-made image (.png)."""
+    """A scan (.bin, .pcd, .ply, .npy, .npz, .las) or a ready-made image (.png)."""
     map: Path
     """The map."""
     out: Path | None = None
@@ -37,7 +37,7 @@ class RelocalizeCommand:
     weights: str = DEFAULT_WEIGHTS
     """The weights that made the map."""
     format: ScanFormat = "auto"
-    """What the scan is, where its name does not tell."""
+    """What the scan is, where neither its name nor a look into it tells."""
     sensor_height: SensorHeight = "auto"
     """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scan, and `auto`
     takes that of the map's last place."""

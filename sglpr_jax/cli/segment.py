@@ -25,7 +25,7 @@ class SegmentCommand:
     """
 
     data: Path
-    """A dataset (KITTI's or NCLT's layout, ready-made BEV images) or a folder of scans (.bin, .pcd)."""
+    """A dataset, a bag or a folder of scans or ready-made images, of any layout that is known."""
     out: Path
     """The folder to write to; made if need be."""
     weights: str = DEFAULT_WEIGHTS

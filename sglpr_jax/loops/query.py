@@ -3,7 +3,9 @@
 import dataclasses
 from pathlib import Path
 
-from sglpr_jax.data.choices import ScanFormat, SensorHeight
+from sglpr_jax.data.choices import RecordFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.formats.record_size import unusual_record
+from sglpr_jax.data.formats.scan_files import says_its_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.record import Record, scan_record
@@ -15,13 +17,14 @@ def read_query(
 ) -> Record:
     """Read what `places.relocate` looks for: a scan of this format, or an image (.png).
 
+    "auto" looks into a .bin whose name says nothing, as opening a folder of such does.
     `sensor_height` is metres above the ground, "estimate" finds it and the tilt from the scan, "auto" takes the
     mounting of the map's last place. Raises what `scan_record` and `read_image` do, and ValueError where there is no
     ground to estimate from.
     """
     if path.suffix == ".png":
         return Record(image=read_image(path))
-    record = scan_record(path, format=format)
+    record = scan_record(path, format=format, records=_records(path))
     if sensor_height == "auto":
         return dataclasses.replace(record, mounting=places.mounting())
     if sensor_height != "estimate":
@@ -31,3 +34,9 @@ def read_query(
     if found is None:
         raise ValueError(f"{path}: expected ground that tells the sensor's height, found none: say how high")
     return dataclasses.replace(record, mounting=found)
+
+
+def _records(path: Path) -> RecordFormat:
+    """What a .bin holds whose name says nothing."""
+    unsaid = path.is_file() and not says_its_format(path)
+    return (unusual_record([path]) if unsaid else None) or "kitti"

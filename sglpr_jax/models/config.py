@@ -22,7 +22,8 @@ BackboneConfig = SwinConfig | RingConfig | SglprConfig
 class HeadConfig:
     """The place head: CBAM, three convolutions, NetVLAD (section 4.1.2).
 
-    The paper names no kernels, strides or channels; candidates A to D are compared in docs/decisions/paper.md.
+    The paper names no kernels, strides or channels: the presets `paper` and `paper-head-b` are two readings of it
+    (docs/decisions/paper.md).
     """
 
     input: Literal["features", "counts", "labels", "counts+labels"] = "features"

@@ -48,6 +48,15 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, town, poses, tmp_path):
     best = json.loads((tmp_path / "higher.json").read_text())[0]
     assert best["place"] == "08/000020" and best["world_from_query"][2][3] == pytest.approx(position[2] + 0.1, abs=1e-6)
 
+    points = np.fromfile(scan, "<f4").reshape(-1, 4)
+    rings, seconds = np.arange(len(points)) % 64, np.linspace(0, 0.1, len(points))
+    (tmp_path / "of_six").mkdir()
+    np.column_stack([points, rings, seconds]).astype("<f4").tofile(tmp_path / "of_six" / "000020.bin")
+    six = ("relocalize", tmp_path / "of_six" / "000020.bin", "--map", out, "--out", tmp_path / "of_six" / "pose.json")
+    assert command(*six, "--candidates", "3").status == 0
+    assert json.loads((tmp_path / "of_six" / "pose.json").read_text()) == answers  # what a point is was found out
+    shutil.rmtree(tmp_path / "of_six")
+
     again = ("map", town, "--seq", "08", "--poses", poses, "--add-to", out, "--out", out)
     for _ in range(2):  # the same scans are taken once
         assert command(*again).out == f"{out}: 40 places, 0 of them from 40 scans of 08\n"
