@@ -3,8 +3,7 @@
 Reproduces table 1: top-1 F1max .980 .918 .976 1.000 1.000 .898 on 00 02 05 06 07 08, mean .962. What the paper leaves
 open is set as docs/decisions/paper.md says: margin, distance, decay of the learning rate, place head.
 
-Expect: these numbers were not measured here. The 200,000 steps want a GPU: on two CPU cores a step takes four seconds
-or more.
+Expect: these numbers were not measured here. The 200,000 steps want a GPU: a step takes nine seconds of a CPU core.
 
 Command: bin/train --seq 08 --data KITTI --preset paper
 """

@@ -11,7 +11,7 @@ import shutil
 import time
 import uuid
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,16 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
             _put(temporary, path, keep=keep)
     finally:
         _remove(temporary)
+
+
+def check_holds_only(folder: Path, names: Collection[str]) -> None:
+    """Raise FileExistsError where a folder that is to be replaced holds anything but files of these names."""
+    others = sorted({path.name for path in folder.iterdir()} - set(names)) if folder.is_dir() else []
+    if others:
+        raise FileExistsError(
+            f"{folder}: expected a new folder, or one with {', '.join(names)} alone, which is replaced, "
+            f"found {others[0]}{' and more' if len(others) > 1 else ''}"
+        )
 
 
 @contextlib.contextmanager

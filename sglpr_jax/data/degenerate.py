@@ -7,9 +7,11 @@ FARTHEST_M = 300.0
 """No LiDAR on a vehicle sees half of its points beyond this."""
 
 
-def check_cloud(points: Float32[np.ndarray, "n 3"], *, name: str = "") -> None:
+def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
     """Raise ValueError, which begins with `name`, for a cloud (metres) that shows no place; says what was found."""
     where = f"{name}: " if name else ""
+    if points.shape[1] != 3:
+        raise ValueError(f"{where}expected points of x, y and z alone, (n, 3), found an array of shape {points.shape}")
     x, y, z = np.abs(points.T)  # a column at a time: reductions along the three axes of a point take ten times as long
     largest = np.maximum(np.maximum(x, y), z)  # not finite where one of them is not
     near = largest <= FARTHEST_M

@@ -20,6 +20,8 @@ FLOOR_M = -1.2
 CEILING_M = 200.0
 """Points count below this height, which no scan reaches, so that the number of a voxel fits 32 bits."""
 MAX_VOXELS = 6000
+MOST_SPREAD = 2**25
+"""Voxels whose numbers are farther apart are counted by sorting them; 2**24 is usual, a point 30 m up makes 10**8."""
 SOME_POINTS, SOME_VOXELS = 18_000, 2**16
 """A quick count sees every n-th point, but at least so many, and voxels whose numbers differ by so many as one."""
 EDGE_STEP_M = 0.05
@@ -91,8 +93,7 @@ def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))
-    found = _found(voxels)
-    voxel = (np.cumsum(found) - 1)[voxels - voxels.min()]  # the inverse of np.unique, which sorts and is slower
+    voxel = _numbered(voxels)
     return np.stack([np.bincount(voxel, weights=axis) for axis in points[:2]]) / np.bincount(voxel)
 
 
@@ -111,15 +112,30 @@ def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"
 
 
 def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
-    return bool(np.count_nonzero(_found(voxels)) > MAX_VOXELS)
+    found = _found(voxels)
+    return int(len(np.unique(voxels)) if found is None else np.count_nonzero(found)) > MAX_VOXELS
 
 
-def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
-    """Of the numbers from the smallest to the largest, which are there."""
+def _numbered(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The voxels numbered without gaps, in their order."""
+    found = _found(voxels)
+    if found is None:
+        return np.unique(voxels, return_inverse=True)[1]
+    return (np.cumsum(found) - 1)[voxels - voxels.min()]
+
+
+def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
+    """Of the numbers from the smallest to the largest, which are there: faster than to sort them, as np.unique does.
+
+    None where a point high in the air spreads them so far that it would not be.
+    """
     if not len(numbers):
         return np.zeros(0, bool)
-    least = numbers.min()
-    found = np.zeros(int(numbers.max()) - int(least) + 1, bool)
+    least = int(numbers.min())
+    spread = int(numbers.max()) - least + 1
+    if spread > MOST_SPREAD:
+        return None
+    found = np.zeros(spread, bool)
     found[numbers - least] = True
     return found
 

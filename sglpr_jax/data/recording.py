@@ -48,6 +48,16 @@ class Recording:
     found: tuple[str, ...] = ()
     """What the reader found, for a person: the format of the scans, what was left aside."""
 
+    def __post_init__(self):
+        """Raise ValueError where two scans have one id, or something is not there once for each scan."""
+        if len(set(self.ids)) < len(self.ids):
+            twice = next(name for name in self.ids if self.ids.count(name) > 1)
+            raise ValueError(f"sequence {self.name}: expected an id of its own for each scan, found {twice!r} twice")
+        for name in ("paths", "positions", "times", "label_paths", "world_from_lidar"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self) and not (name == "label_paths" and not values):
+                raise ValueError(f"sequence {self.name}: expected {len(self)} {name}, one a scan, found {len(values)}")
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -83,6 +93,12 @@ class Recording:
     def has_labels(self) -> bool:
         """Whether any scan or image has labels."""
         return any(self.labelled)
+
+    @property
+    def read_options(self) -> dict[str, str]:
+        """The options with which files are read that can be named: the format of the scans, say."""
+        options = getattr(self.read, "keywords", {})
+        return {name: value for name, value in options.items() if isinstance(value, str)}
 
     def record(self, i: int, *, labels: bool = True, lasers: bool = False) -> Record:
         """Read scan or image `i`, each of its files once; without `labels` the file of labels is left alone.

@@ -98,7 +98,7 @@ def format_score(result: Result) -> str:
 
 def _format_interval(result: Result) -> str:
     """Return the bootstrap interval of the score to three places; empty where there is none."""
-    return "" if result.interval is None else "{:.3g} to {:.3g}".format(*result.interval)
+    return "" if result.interval is None else "{:.3f} to {:.3f}".format(*result.interval)
 
 
 def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:

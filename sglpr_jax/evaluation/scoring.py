@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 from rich.console import Console, ConsoleOptions
 from rich.table import Table
 
+from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation import report
 from sglpr_jax.evaluation.false_positives import FalsePositive, worst_false_positives
 from sglpr_jax.evaluation.inputs import Input, read_input
@@ -20,6 +22,7 @@ from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
 from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import chosen_protocols
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import distance_function
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,35 +79,64 @@ class Evaluation(report.PrintsItself):
 
 
 def evaluate(
-    source: Input | Path | str | Num[np.ndarray, "n d"],
+    source: Input | Path | str | ArrayLike,
     protocols: Sequence[str] = (),
     *,
-    positions: Float[np.ndarray, "n 3"] | None = None,
-    times: Float[np.ndarray, " n"] | None = None,
+    positions: ArrayLike | None = None,
+    times: ArrayLike | None = None,
     distance: str | None = None,
     published: bool = False,
 ) -> Evaluation:
     """Score descriptors, a top-k list or scored pairs.
 
-    `source` is a file of any kind that `evaluation.inputs` reads, what it was read to, or an array of descriptors.
+    `source` is a file of any kind that `evaluation.inputs` reads, what it was read to, or descriptors (n, d) as an
+    array of numpy, of JAX or of any kind that numpy understands.
     `protocols` are names in `PROTOCOLS`; none stands for the headlines that fit, `all` for all that do. `positions`
-    (metres, z up) and `times` (seconds) are those of the frames, where `source` has none of its own; `distance` names
-    how the descriptors of an array are compared (by L2 unless given). With `published` the paper's numbers for the
-    sequence stand beside. Raises ValueError where positions are missing or a protocol does not fit.
+    (n, 3) (metres, z up) and `times` (n,) (seconds) are those of the frames, in place of any that `source` has;
+    `distance` names how descriptors are compared (unless given, as `source` says; those of an array by L2). With
+    `published` the paper's numbers for the sequence stand beside. Raises ValueError where positions are missing, and
+    where a protocol or an option does not fit.
 
     Example:
       print(sglpr_jax.evaluate("08.npz"))
     """
-    given = as_trajectory(positions, times)
+    clock = None if times is None else np.asarray(times, np.float64)
+    given = as_trajectory(None if positions is None else np.asarray(positions, np.float64), clock)
     if isinstance(source, str | Path):
         path = Path(source)
         read = read_input(path, given, sequence=path.stem, distance=distance)
+        read = _with_options(read, where=f"{path}: ", times=clock)
         return evaluate_methods({path.stem: read}, protocols, published=published, file=path)
-    if isinstance(source, np.ndarray):
-        if given is None:
-            raise ValueError(f"expected positions of {len(source)} frames beside their descriptors, found none")
-        source = as_descriptors(source, given, sequence="", method="", distance=distance or "l2")
+    if distance is not None:
+        distance_function(distance)
+    if isinstance(source, Input):
+        poses = {} if given is None else {"positions": given.positions, "pose_source": given.source}
+        source = _with_options(source, **poses, times=clock, distance=distance)
+    else:
+        source = _of_array(source, given, distance or "l2")
     return evaluate_methods({"descriptors": source}, protocols, published=published)
+
+
+def _with_options(source: Input, *, where: str = "", **options: Any) -> Input:
+    """Return the source with those options that are given in place of its own; ValueError where one does not fit."""
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        if not hasattr(source, name):
+            raise ValueError(f"{where}expected no {name} beside {_about(source, None)}, found {name}")
+    try:
+        return dataclasses.replace(source, **given)
+    except ValueError as error:
+        raise ValueError(f"{where}{error}") from error
+
+
+def _of_array(rows: ArrayLike, trajectory: Trajectory | None, distance: str) -> DescriptorFile:
+    """Return descriptors of no name; ValueError where they are no matrix or positions are missing."""
+    rows = np.asarray(rows)
+    if rows.ndim != 2:
+        raise ValueError(f"expected a file, what was read from one or descriptors (n, d), found {rows.shape}")
+    if trajectory is None:
+        raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
+    return as_descriptors(rows, trajectory, sequence="", method="", distance=distance)
 
 
 def evaluate_methods(

@@ -77,7 +77,7 @@ def certain_pairs(
         near, far = places.near(int(frame)), places.far(int(frame))
         rows = rng.permutation(np.flatnonzero(near))[:1] if done % 2 else places.nearest(turned.descriptor, far)
         for row in rows:
-            evidence.append(places.evidence(turned, int(row)))
+            evidence.append(places.evidence(int(frame), turned, int(row)))
             is_loop.append(bool(near[row]))
         on_progress(done + 1)
     if not evidence or all(is_loop) or not any(is_loop):
@@ -127,10 +127,12 @@ class _Places:
         whole = even_cells(jnp.asarray(picture(record, None)[0]))
         return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
 
-    def evidence(self, query: Seen, row: int) -> Evidence:
+    def evidence(self, frame: int, query: Seen, row: int) -> Evidence:
+        """What speaks for a pair; the next other place is none of the frame's own, which a search leaves out too."""
         index = self.finder.index
         found = jax.device_get(align(query.image, self.images[row], config=self.finder.verification))
         distance = float(np.linalg.norm(index.descriptors[row].astype(np.float64) - query.descriptor))
-        other = float(index.query(query.descriptor, exclude=self.apart(row) <= NEGATIVE_M).distances[0])
+        same = ~self.far(frame) | (self.apart(row) <= NEGATIVE_M)
+        other = float(index.query(query.descriptor, exclude=same).distances[0])
         margin = other - distance if np.isfinite(other) else np.nan
         return Evidence.of(distance, margin, found.correlation, found.second)

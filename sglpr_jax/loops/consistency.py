@@ -16,6 +16,9 @@ from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import moved_covariance, travelled, yaw_of
 from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry, upright_poses
 
+BLOCK = 64
+"""Loops that are compared with all others at a time: for all at once, the numbers between take most of a gigabyte."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ConsistencyConfig:
@@ -62,19 +65,11 @@ def agree(
     way = travelled(odometry)
     flat = _planar(upright_odometry(odometry, mounting))
     a, b = (_columns(each, flat, way, mounting) for each in (loops, loops if others is None else others))
-    # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: that is loop a again.
-    query_from_query = _relative(a["query_pose"][:, None], b["query_pose"][None])
-    match_from_match = _relative(a["match_pose"][:, None], b["match_pose"][None])
-    around = _compose(match_from_match, _compose(b["pose"][None], _inverse(query_from_query)))
-    apart = _relative(a["pose"][:, None], around)
-    length = np.abs(a["query_way"][:, None] - b["query_way"]) + np.abs(a["match_way"][:, None] - b["match_way"])
-    lever = np.hypot(query_from_query[..., 0], query_from_query[..., 1])
-    turn = np.radians(config.yaw_deg) ** 2 + a["turn"][:, None] + b["turn"][None]
-    turn = turn + (np.radians(config.drift_deg_per_m) * length) ** 2
-    place = config.position_m**2 + a["place"][:, None] + b["place"][None] + (config.drift * length) ** 2
-    place = place + turn * lever**2
-    close = apart[..., 0] ** 2 + apart[..., 1] ** 2 <= config.deviations**2 * place
-    return close & (np.abs(apart[..., 2]) <= config.deviations * np.sqrt(turn))
+    pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
+    for start in range(0, len(pairs), BLOCK):
+        rows = slice(start, start + BLOCK)
+        pairs[rows] = _closes({name: values[rows] for name, values in a.items()}, b, config)
+    return pairs
 
 
 def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) -> Int[np.ndarray, " k"]:
@@ -84,21 +79,30 @@ def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) 
     leaves most to choose from, finds it where right loops are many.
     """
     pairs = pairs & pairs.T
+    degrees = pairs.sum(0)
     best = np.zeros(0, np.int64)
-    for start in np.argsort(-pairs.sum(1), kind="stable")[:starts]:
-        members, left = [start], pairs[start].copy()
-        left[start] = False
-        while left.any():
-            rows = np.flatnonzero(left)
-            chosen = rows[np.argmax(pairs[np.ix_(rows, rows)].sum(1))]
-            members.append(chosen)
-            left &= pairs[chosen]
-            left[chosen] = False
+    for start in np.argsort(-degrees, kind="stable")[:starts]:
+        members = _members_from(start, pairs, degrees)
         if len(members) > len(best):
             best = np.array(members)
         if len(best) > pairs.shape[0] / 2:
             break
     return np.sort(best)
+
+
+def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[np.ndarray, " n"]) -> list[np.int64]:
+    """One consistent set, greedy from `start`; `degrees` says of each loop with how many it agrees."""
+    members, chosen, left = [], start, np.ones(len(pairs), bool)
+    while True:
+        members.append(chosen)
+        stay = left & pairs[chosen]
+        stay[chosen] = False
+        # Each loop leaves once, so that to keep the degrees costs no more than to take them once.
+        degrees = degrees - pairs[left & ~stay].sum(0)
+        left = stay
+        if not left.any():
+            return members
+        chosen = np.argmax(np.where(left, degrees, -1))
 
 
 Planar = Float[np.ndarray, "... 3"]
@@ -121,6 +125,23 @@ def _columns(
         "place": covariances[:, 0, 0] + covariances[:, 1, 1],
         "turn": covariances[:, 5, 5],
     }
+
+
+def _closes(a: dict[str, np.ndarray], b: dict[str, np.ndarray], config: ConsistencyConfig) -> Bool[np.ndarray, "a b"]:
+    """Whether the circle of each loop of a and each of b closes, of their `_columns`."""
+    # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: that is loop a again.
+    query_from_query = _relative(a["query_pose"][:, None], b["query_pose"][None])
+    match_from_match = _relative(a["match_pose"][:, None], b["match_pose"][None])
+    around = _compose(match_from_match, _compose(b["pose"][None], _inverse(query_from_query)))
+    apart = _relative(a["pose"][:, None], around)
+    length = np.abs(a["query_way"][:, None] - b["query_way"]) + np.abs(a["match_way"][:, None] - b["match_way"])
+    lever = np.hypot(query_from_query[..., 0], query_from_query[..., 1])
+    turn = np.radians(config.yaw_deg) ** 2 + a["turn"][:, None] + b["turn"][None]
+    turn = turn + (np.radians(config.drift_deg_per_m) * length) ** 2
+    place = config.position_m**2 + a["place"][:, None] + b["place"][None] + (config.drift * length) ** 2
+    place = place + turn * lever**2
+    close = apart[..., 0] ** 2 + apart[..., 1] ** 2 <= config.deviations**2 * place
+    return close & (np.abs(apart[..., 2]) <= config.deviations * np.sqrt(turn))
 
 
 def _planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:

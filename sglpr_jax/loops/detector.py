@@ -16,6 +16,9 @@ from sglpr_jax.loops.verification import VerificationConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.poses import are_rotations
 
+MOST_COLUMNS = 8
+"""No image is as narrow; points with so many are rows of a file, with intensity and more."""
+
 
 @dataclasses.dataclass(frozen=True)
 class DetectorConfig:
@@ -142,6 +145,8 @@ def _record(scan: Record | Float[np.ndarray, "..."]) -> Record:
     values = np.asarray(scan, np.float32)
     if values.ndim != 2:
         raise ValueError(f"expected points (n, 3) or an image (h, w), found an array of shape {values.shape}")
+    if 3 < values.shape[1] <= MOST_COLUMNS:
+        raise ValueError(f"expected points of x, y and z alone, (n, 3), found an array of shape {values.shape}")
     return Record(points=values) if values.shape[1] == 3 else Record(image=values)
 
 

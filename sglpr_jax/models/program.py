@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.export
@@ -26,7 +26,7 @@ from sglpr_jax.data.density_image import (
 )
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M
-from sglpr_jax.files import replacing, write_json
+from sglpr_jax.files import check_holds_only, replacing, write_json
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
@@ -49,12 +49,13 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
     and return (b, d).
 
     `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; it needs the package flatbuffers. `onnx`
-    needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; ValueError for a model
-    that reads labels too.
+    needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; FileExistsError where
+    the folder holds other files; ValueError for a model that reads labels too.
     """
     folder = Path(folder)
     if params.config.head.reads_labels:
         raise ValueError(f"expected a model that reads images alone, found one that reads {params.config.head.input}")
+    check_holds_only(folder, (*(f"describe.{one}" for one in get_args(ProgramFormat)), CONFIG_FILE, INPUT_FILE))
     params = for_places(params)
     program = stablehlo(params) if format == "stablehlo" else onnx(params)
     with replacing(folder) as new:

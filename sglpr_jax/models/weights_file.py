@@ -10,7 +10,7 @@ import numpy as np
 import safetensors
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.files import in_short, read_json, replacing
+from sglpr_jax.files import check_holds_only, in_short, read_json, replacing
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.config_dict import config_from_dict
 from sglpr_jax.models.params import Params
@@ -29,12 +29,14 @@ STORED = ("F32", "F16")
 
 
 def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
-    """Write weights and their configuration into `folder`, whole or not at all; one that is there is replaced.
+    """Write weights and their configuration into `folder`, whole or not at all; those that are there are replaced.
 
-    With `half` as float16, in half the room. Raises OSError, naming `folder`, where they cannot be written; ValueError,
-    naming the weight, where one is not of its configuration's shape, no float32, not finite or too large for float16.
+    With `half` as float16, in half the room. Raises OSError, naming `folder`, where they cannot be written or it holds
+    other files; ValueError, naming the weight, where one is not of its configuration's shape, no float32, not finite or
+    too large for float16.
     """
     folder = Path(folder)
+    check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
     # safetensors writes an array's memory as it lies, so a transposed view would come back scrambled.
     values = {name: np.asarray(leaf, order="C") for name, leaf in by_name(params.weights).items()}
     _check_shapes({name: leaf.shape for name, leaf in values.items()}, params.config, source=folder)

@@ -20,10 +20,17 @@ SMALLEST_SPREAD = 1e-3
 def fit_whitening(
     descriptors: Float[np.ndarray, "n d"], *, power: float = 0.5
 ) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "d"]]:
-    """The kernel and bias whose result has spread s**(1 - power) along principal component s; power 1 whitens fully."""
+    """The kernel and bias whose result has spread s**(1 - power) along principal component s; power 1 whitens fully.
+
+    Raises ValueError for too few descriptors to know the spread along every direction.
+    """
     d = np.asarray(descriptors, np.float64)
+    if len(d) <= d.shape[1]:
+        raise ValueError(f"expected more than {d.shape[1]} descriptors to whiten as many numbers, found {len(d)}")
     mean = d.mean(0)
     variances, components = np.linalg.eigh(np.cov(d - mean, rowvar=False))
+    if not variances.max() > 0:
+        raise ValueError(f"expected descriptors of several places to whiten with, found {len(d)} equal ones")
     spread = np.sqrt(np.maximum(variances, variances.max() * SMALLEST_SPREAD**2))
     kernel = components / (spread / spread.max()) ** power
     return kernel.astype(np.float32), (-mean @ kernel).astype(np.float32)

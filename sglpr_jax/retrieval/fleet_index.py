@@ -93,6 +93,8 @@ class FleetIndex:
         before = [named for named, stored in _STORED.items() if stored in self._names()]
         about = {"ids": ids, "times": times, "positions": positions}
         names, columns = new_places(descriptors, width=self.width, first=first, before=before, **about)
+        if not names:  # no rows begin no column
+            return
         rows = self._arrow(first, names, columns)
         if self.table is None:
             self.table = self._connection.create_table(TABLE, rows)

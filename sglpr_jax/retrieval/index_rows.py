@@ -55,6 +55,8 @@ def new_places(
         columns["positions"] = _finite("positions", np.reshape(positions, (-1, 3)), (len(rows), 3))
     if first and set(columns) != set(before):
         raise ValueError(f"expected places with {', '.join(before)}, as before, found {', '.join(columns)}")
+    if before and not len(rows):  # to begin a column would say that all places after these have it
+        columns = {name: values for name, values in columns.items() if name in before}
     return NewPlaces(names, columns)
 
 

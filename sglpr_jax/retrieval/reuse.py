@@ -47,9 +47,10 @@ def embed_or_reuse(
 
 
 def fingerprint(recording: Recording) -> str:
-    """Name what a recording holds without reading its scans: their ids, the sizes of their files, the positions."""
+    """Name what a recording holds without reading its scans: ids, sizes of files, how they are read, positions."""
     sizes = [path.stat().st_size for path in recording.paths if path.is_file()]
-    digest = hashlib.sha256(json.dumps([recording.ids, sizes]).encode())
+    mounting = None if recording.mounting is None else dataclasses.asdict(recording.mounting)
+    digest = hashlib.sha256(json.dumps([recording.ids, sizes, recording.read_options, mounting]).encode())
     if recording.positions is not None:
         digest.update(recording.positions.tobytes())
     return digest.hexdigest()[:16]

@@ -1,5 +1,6 @@
 """What can be done while a training runs, beside training: show how far it is, write measurements, draw curves."""
 
+import contextlib
 from collections.abc import Mapping
 
 
@@ -67,5 +68,7 @@ class Callbacks(Callback):
             callback.on_end(step)
 
     def close(self) -> None:
-        for callback in self._callbacks:
-            callback.close()
+        """Close all, the first one first, even where one of them raises."""
+        with contextlib.ExitStack() as closing:
+            for callback in reversed(self._callbacks):
+                closing.callback(callback.close)

@@ -117,7 +117,7 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     times = (folder / "times.txt").read_text().splitlines()
     (folder / "times.txt").write_text("\n".join([*times[:3], times[1], *times[4:]]))
     ended = command("loops", tmp_path / "late", "--out", tmp_path / "found")
-    assert_one_line_error(ended, "times.txt, line 4: expected a time >=")
+    assert_one_line_error(ended, "times.txt, row 4: expected a time >=")
     assert not (tmp_path / "found").exists()
 
 

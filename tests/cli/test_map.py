@@ -179,7 +179,7 @@ def test_wrong_input_is_one_clear_error(command, town, poses, tmp_path):
     late = tmp_path / "late.tum"
     late.write_text("0 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     run = ("map", town, "--seq", "08", "--poses", late, "--out", tmp_path / "a.safetensors")
-    assert_one_line_error(command(*run), "late.tum, line 3: expected a time >= 2.0, found 1.0")
+    assert_one_line_error(command(*run), "late.tum, row 3: expected a time >= 2.0, found 1.0")
     scan = town / "sequences/08/velodyne/000020.bin"
     (tmp_path / "broken.safetensors").write_bytes(b"no map at all")
     ended = command("relocalize", scan, "--map", tmp_path / "broken.safetensors")

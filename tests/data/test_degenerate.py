@@ -36,6 +36,11 @@ OUTSIDE = {"far": GOOD + np.float32([200, 0, 0]), "one point": GOOD[:1]}
 CONFIG = model_preset("tiny")
 
 
+def test_rows_of_a_file_are_no_points():
+    with pytest.raises(ValueError, match=r"scan 7: expected points of x, y and z alone.*shape \(400, 4\)"):
+        check_cloud(np.column_stack([GOOD, GOOD[:, 0]]), name="scan 7")
+
+
 @pytest.mark.parametrize("kind", BAD)
 def test_no_place_is_refused(kind):
     points, found = BAD[kind]

@@ -1,6 +1,7 @@
 """Density images: against the recipe spelled out point by point, and against the images rendered from real scans."""
 
 import math
+import tracemalloc
 from collections import defaultdict
 
 import numpy as np
@@ -39,6 +40,17 @@ def test_images_follow_the_recipe_at_every_edge(n, spread_m, edge_m):
     expected, edge_found = reference_image(points)
     assert edge_found == pytest.approx(edge_m)
     np.testing.assert_array_equal(density_image(points), expected)
+
+
+def test_a_point_high_in_the_air_takes_no_memory():
+    points = np.random.default_rng(1).normal(scale=[8, 8, 1], size=(1000, 3)).astype(np.float32)
+    points[7, 2] = 120.0
+    tracemalloc.start()
+    image = density_image(points)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_array_equal(image, reference_image(points)[0])
+    assert peak < 2e8  # a flag for each voxel up there would take gigabytes
 
 
 def test_points_of_one_voxel_count_once_where_their_centroid_lies():

@@ -83,6 +83,16 @@ def test_times_are_optional(kitti_root):
     assert open_recording(kitti_root, "08").times is None
 
 
+def test_empty_scans_at_both_ends_leave_the_others(kitti_root):
+    sequence = open_recording(kitti_root, "08")
+    for row in (0, -1):
+        sequence.paths[row].write_bytes(b"")
+    sequence = open_recording(kitti_root, "08")
+    assert len(sequence) == 3 and len(sequence.points(1)) == 5
+    with pytest.raises(ValueError, match=r"000003\.bin: expected 16 bytes for each point .*found 0 bytes"):
+        sequence.points(2)
+
+
 def test_a_sequence_without_scans_is_refused(kitti_root):
     (kitti_root / "sequences/09/velodyne").mkdir(parents=True)
     assert recording_names(kitti_root) == ("08", "09")

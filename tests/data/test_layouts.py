@@ -93,6 +93,14 @@ def test_helipr(helipr_root, sensor):
     assert recording.found[0] == f"format: HeLiPR's {sensor} ({PACKED[sensor][1]} bytes a point)"
 
 
+def test_helipr_through_a_link(helipr_root, tmp_path):
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "today").symlink_to(helipr_root / "Roundabout01")
+    assert "today-Ouster" in recording_names(tmp_path / "links")
+    recording = open_recording(tmp_path / "links", "today-Ouster", sensor_height=1.8)
+    np.testing.assert_array_equal(recording.points(0), POINTS)
+
+
 def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
     path = tmp_path / f"{helipr.AEVA_CHANGED}.bin"
     path.write_bytes(helipr_scan("Aeva", "fffffiB"))
@@ -161,6 +169,16 @@ def test_kitti_raw_without_gps_and_with_broken_times(raw_root):
         (drive / "velodyne_points" / "timestamps.txt").write_text(text)
         with pytest.raises(ValueError, match=r"timestamps\.txt: expected a date and time, .* for each of 2 scans"):
             open_recording(raw_root)
+
+
+def test_kitti_raw_leaves_the_line_of_a_missing_scan_blank(raw_root):
+    file = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps.txt"
+    first, _, last = file.read_text().splitlines()
+    file.write_text(f"{first}\n\n{last}\n\n")
+    np.testing.assert_allclose(np.diff(open_recording(raw_root).times), 0.2, atol=1e-6)
+    file.write_text(f"{first}\n{last}\n\n")
+    with pytest.raises(ValueError, match=r"timestamps\.txt: expected a date and time, .* \(a scan whose line is ''\)"):
+        open_recording(raw_root)
 
 
 @pytest.mark.parametrize("reader", [mulran, boreas])

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.retrieval.reuse import fingerprint
 
 POINTS = np.array([[4.0, 10.0, -1.0], [-3.0, 20.0, 2.0]])
 """x to the right, y forward."""
@@ -53,6 +55,20 @@ def test_converted_scans_are_turned_back_into_the_lidars_frame(root):
             np.testing.assert_allclose(recording.points(i), [[10, -4, -1], [20, 3, 2]], atol=1e-5)
 
 
+def test_packs_and_fingerprints_follow_the_poses(root, tmp_path):
+    """A heading alone is corrected: points change, while files of scans and positions stay."""
+    before = open_recording(root, sensor_height=1.8)
+    packed(before, tmp_path / "cache")
+    poses = root / "001" / "lidar" / "poses.json"
+    rows = json.loads(poses.read_text())
+    rows[1]["heading"] = dict(w=1.0, x=0, y=0, z=0)
+    poses.write_text(json.dumps(rows))
+    after = open_recording(root, sensor_height=1.8)
+    assert np.abs(after.points(1) - before.points(1)).max() > 1
+    np.testing.assert_array_equal(packed(after, tmp_path / "cache").points(1), after.points(1))
+    assert fingerprint(after) != fingerprint(before)
+
+
 def test_scans_that_are_not_converted_are_said(root):
     (root / "001" / "lidar" / "01.npy").unlink()
     recording = open_recording(root, sensor_height=1.8)
@@ -90,7 +106,7 @@ def test_no_pickle_is_opened(root, monkeypatch, tmp_path):
         ("poses.json", 3, "expected a list of poses"),
         ("poses.json", [], r"expected at least 3 rows \(frame 2\), found 0"),
         ("timestamps.json", [0.0], r"expected at least 3 rows \(frame 2\), found 1"),
-        ("timestamps.json", [3.0, 2.0, 1.0], r"line 2: expected a time >= 3.0, found 2.0"),
+        ("timestamps.json", [3.0, 2.0, 1.0], r"row 2: expected a time >= 3.0, found 2.0"),
         ("timestamps.json", {"a": 1}, "expected a list of seconds, found"),
         ("timestamps.json", ["noon"], "expected a list of seconds, found"),
     ],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
+from sglpr_jax.data.formats.pose_files import read_poses, read_rows, read_times, rows_of
 
 GOOD = "1 0 0 5 0 1 0 6 0 0 1 7\n"
 
@@ -41,7 +41,22 @@ def test_a_bad_line_is_named(tmp_path, line, found):
 def test_times_must_not_run_backwards(tmp_path):
     path = tmp_path / "times.txt"
     path.write_text("0.0\n0.2\n0.1\n")
-    with pytest.raises(ValueError, match=r"times\.txt, line 3: expected a time >= 0\.2, found 0\.1"):
+    with pytest.raises(ValueError, match=r"times\.txt, row 3: expected a time >= 0\.2, found 0\.1"):
+        read_times(path)
+
+
+@pytest.mark.parametrize("separator", [None, ","])
+def test_comments_say_nothing(tmp_path, separator):
+    path = tmp_path / "rows.txt"
+    rows = "# t x\n1 2\n# a stop\n3 4\n"
+    path.write_text(rows if separator is None else rows.replace(" ", separator))
+    np.testing.assert_array_equal(read_rows(path, columns=2, separator=separator), [[1, 2], [3, 4]])
+
+
+def test_times_are_named_by_their_row_among_comments(tmp_path):
+    path = tmp_path / "times.txt"
+    path.write_text("# seconds\n0\n# a stop\n1e18\n")
+    with pytest.raises(ValueError, match=r"times\.txt, row 2: expected seconds, found 1e\+18"):
         read_times(path)
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.formats import record_size
-from sglpr_jax.data.formats.record_size import find_record
+from sglpr_jax.data.formats.bin_records import read_records
+from sglpr_jax.data.formats.record_size import find_record, unusual_record
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers import kitti
 from sglpr_jax.data.readers.scan_folder import open_recording
@@ -77,6 +78,42 @@ def test_a_broken_file_among_others_does_not_hide_it(tmp_path):
         columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
     (tmp_path / "2.bin").write_bytes(b"cut")
     (tmp_path / "4.bin").write_bytes(np.random.default_rng(0).bytes(48000))
+    assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
+
+
+def spoil(folder):
+    """In place of scan 0 an empty file, of 4 a dangling link, of 8 a folder: always the first and the last."""
+    for path in (folder / "0.bin", folder / "4.bin", folder / "8.bin"):
+        path.unlink(missing_ok=True)
+    (folder / "0.bin").touch()
+    (folder / "4.bin").symlink_to("none")
+    (folder / "8.bin").mkdir()
+
+
+@pytest.mark.parametrize("scans", [1, 2, 3, 5, 9])
+@pytest.mark.parametrize("said", ["auto", "float32x6"])
+def test_files_that_are_empty_or_cannot_be_read_tell_nothing(tmp_path, recwarn, scans, said):
+    for i in range(scans):
+        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
+    spoil(tmp_path)
+    found = open_recording(tmp_path, format=said)
+    assert not recwarn.list
+    assert found.found[0].startswith("format: float32x6" if scans > 1 or said != "auto" else "format: kitti")
+    assert unusual_record(found.paths) == ("float32x6" if scans > 1 else None)
+    if scans > 1:
+        np.testing.assert_array_equal(found.points(1), scan(1).astype(np.float32))
+
+
+def test_a_file_that_fails_while_it_is_read_does_not_hide_it(tmp_path, monkeypatch):
+    for i in range(5):
+        columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
+
+    def read(path, format):
+        if path.name == "4.bin":
+            raise OSError(5, "Input/output error")
+        return read_records(path, format)
+
+    monkeypatch.setattr(record_size, "read_records", read)
     assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
 
 

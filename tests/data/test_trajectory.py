@@ -46,9 +46,23 @@ def test_csv_is_read_by_its_header(write):
     assert read_trajectory(write("b.csv", "x,y,z\n1,2,3\n")).times is None
 
 
-@pytest.mark.parametrize("name", ["t", "time", "Timestamp"])
-def test_a_column_of_times_has_one_of_three_names(write, name):
+@pytest.mark.parametrize("name", ["t", "time", "Timestamp", "# t", "#time", "t_s", "time_s", "timestamp_s", "Seconds"])
+def test_a_column_of_times_has_a_name_that_says_so(write, name):
     np.testing.assert_array_equal(read_trajectory(write("a.csv", f"{name},x,y,z\n0.5,1,2,3\n")).times, [0.5])
+
+
+def test_a_csv_of_numpy_is_read_by_its_header(tmp_path):
+    np.savetxt(tmp_path / "a.csv", [[0.5, 1, 2, 3], [0.75, 4, 5, 6]], delimiter=",", header="t,x,y,z")
+    found = read_trajectory(tmp_path / "a.csv")
+    np.testing.assert_array_equal(found.times, [0.5, 0.75])
+    np.testing.assert_array_equal(found.positions, [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize(("names", "times"), [("x,y,z,timestamp_ns", None), ("x,y,Timestamps,z,t", [3.0])])
+def test_a_column_that_may_be_times_and_is_not_used_is_told(write, names, times):
+    with pytest.warns(DataWarning, match=r"a\.csv: expected seconds in one of t, .*, found timestamp.*, not used"):
+        found = read_trajectory(write("a.csv", f"{names}\n{','.join('1233'[: names.count(',')])},3\n"))
+    assert (None if found.times is None else found.times.tolist()) == times
 
 
 @pytest.mark.parametrize("row", ["0 0 0 5 0 0 0 6 0 0 0 7", "1 0 0 5 0 1 0 6 0 0 -1 7", "2 0 0 5 0 2 0 6 0 0 2 7"])
@@ -78,7 +92,13 @@ def test_a_file_of_times_replaces_those_of_the_poses(write):
         ("back.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", r"expected a time >= 1\.0, found 0\.0"),
         ("zeros.txt", "0 0 0 0 0 0 0 0\n", r"rotation qx qy qz qw of length 1 in row 1, found 0 0 0 0"),
         ("far.csv", "x,y,z\n1,2,1e30\n", r"expected positions in metres, up to 1e\+08, found .* in row 1"),
-        ("nanoseconds.csv", "timestamp,x,y,z\n1700000000000000000,1,2,3\n", r"expected seconds, found 1\.7e\+18"),
+        (
+            "nanoseconds.csv",
+            "timestamp,x,y,z\n1700000000000000000,1,2,3\n",
+            r"row 1: expected seconds, found 1\.7e\+18",
+        ),
+        ("back.csv", "# t,x,y,z\n1,1,2,3\n# a stop\n0,1,2,3\n", r"row 2: expected a time >= 1\.0, found 0"),
+        ("units.csv", "t_s,seconds,x,y,z\n1,1,1,2,3\n", "expected every column once, and one of t, .*, t_s"),
         ("clocks.csv", "t,time,x,y,z\n1,1,1,2,3\n", "expected every column once, and one of t, time, timestamp"),
         ("twice.csv", "x,y,z,x\n1,1,2,3\n", "expected every column once"),
         ("half.txt", "1 0 0 0 0 0 0 1\n0 0 0\n", "line 2: expected 8 numbers, found 3"),

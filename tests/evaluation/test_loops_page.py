@@ -42,6 +42,12 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert "No scan was looked at." in loops_page(dataclasses.replace(none, frames=0))
 
 
+def test_stopped_before_the_first_scan_there_is_nothing_corrected(found):
+    none = dataclasses.replace(found, loops=(), frames=0)
+    page = Parsed(loops_page(none, optimized=OptimizedTrajectory(np.zeros((0, 4, 4)), np.zeros(0, bool))))
+    assert "Corrected" not in page.texts and "No scan was looked at." in page.texts["Where"]
+
+
 @pytest.fixture
 def known(found) -> FoundLoops:
     """The same with true positions, off the odometry, and with candidates: two loops, and one that is none."""

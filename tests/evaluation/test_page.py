@@ -72,7 +72,7 @@ def test_the_page_says_what_the_results_say_and_stands_alone(found):
         assert word in seen.texts["Results"]
     result = found.results[0]
     assert f"{result.score:.3f}" in seen.texts["Results"]
-    assert "{:.3g} to {:.3g}".format(*result.interval) in seen.texts["Results"]
+    assert "{:.3f} to {:.3f}".format(*result.interval) in seen.texts["Results"]
     assert [headline for headline, _ in seen.images] == ["Precision and recall", "Trajectory"]
     assert "Methods side by side" not in seen.texts
 

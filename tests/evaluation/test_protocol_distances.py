@@ -60,3 +60,11 @@ def test_a_distance_between_sets_serves_for_pairs_and_for_neighbours(make_file):
     for i in range(3, 90):
         np.testing.assert_array_equal(nearest[i], np.argsort(table[i, : i + 1])[:3])
     np.testing.assert_allclose(best, table[np.arange(90), nearest[:, 0]], atol=1e-6)
+
+
+def test_far_from_zero_the_nearest_are_still_found():
+    rng = np.random.default_rng(0)
+    rows = (1000 + rng.normal(size=(300, 64))).astype(np.float32)
+    nearest, _ = nearest_descriptors(rows[150:], rows, np.full(150, 150), k=3)
+    apart = np.linalg.norm(rows[150:, None].astype(np.float64) - rows[None, :150], axis=2)
+    np.testing.assert_array_equal(nearest, np.argsort(apart, axis=1)[:, :3])

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -39,7 +40,7 @@ def test_every_protocol_is_reported_with_what_it_rests_on(found):
     for result in found:
         assert 0 < result.score <= 1
         assert f"{result.score:.3f}" in text
-        assert f"{result.interval[0]:.3g} to {result.interval[1]:.3g}" in text
+        assert f"{result.interval[0]:.3f} to {result.interval[1]:.3f}" in text
 
 
 def test_other_protocols_are_reported_where_they_are_named(make_file, two_laps):
@@ -57,6 +58,11 @@ def test_a_sequence_without_revisits_says_so(nothing_to_find):
     text = render(report.table(nothing_to_find))
     assert text.count("no revisit") == 3
     assert "nan" not in text
+
+
+def test_an_interval_has_as_many_places_as_the_score(found):
+    one = dataclasses.replace(found[0], score=0.0712, interval=(0.05, 0.1234567))
+    assert report.cells(one)[2:4] == ("0.071", "0.050 to 0.123")
 
 
 def test_methods_stand_side_by_side(found, nothing_to_find):

@@ -1,11 +1,13 @@
 """One call scores a descriptor file, a path or arrays, and its result prints itself."""
 
+import dataclasses
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS, kind_of, protocols_taking
+from sglpr_jax.evaluation.protocols import PROTOCOLS, ScoredPairs, TopK, kind_of, protocols_taking
 from sglpr_jax.evaluation.scoring import evaluate, score
 from sglpr_jax.evaluation.sessions import evaluate_session_files
 
@@ -29,6 +31,46 @@ def test_a_file_a_path_and_arrays_score_alike(file, tmp_path):
     ):
         assert [result.score for result in same.results] == [result.score for result in whole.results]
         assert [result.name for result in same.results] == ["top-1 F1max", "pairs F1max", "Recall@1"]
+
+
+def scores(*args, **options):
+    return [result.score for result in evaluate(*args, **options).results]
+
+
+def test_arrays_of_jax_and_lists_are_taken(file):
+    where = {"positions": file.positions, "times": file.times}
+    assert scores(jnp.asarray(file.descriptors), **where) == scores(file)
+    as_lists = {name: values.tolist() for name, values in where.items()}
+    assert scores(file.descriptors.tolist(), **as_lists) == scores(file)
+    with pytest.raises(ValueError, match=r"descriptors \(n, d\), found \(3,\)"):
+        evaluate(np.zeros(3), **where)
+
+
+def test_options_stand_in_for_what_a_file_says_itself(file, tmp_path):
+    bare = dataclasses.replace(file, positions=None, times=None, pose_source=None)
+    assert scores(bare, positions=file.positions, times=file.times) == scores(file)
+    other = dataclasses.replace(file, times=file.times * 1000, distance="cosine")
+    assert scores(file, times=other.times, distance="cosine") == scores(other) != scores(file)
+    moved = evaluate(file, positions=file.positions[::-1] * 9)
+    np.testing.assert_array_equal(moved.positions, file.positions[::-1] * 9)
+    assert {result.pose_source for result in moved.results} == {"positions given as an array"}
+    file.save(tmp_path / "town.npz")
+    assert scores(tmp_path / "town.npz", times=other.times) == scores(dataclasses.replace(file, times=other.times))
+
+
+def test_options_that_cannot_apply_are_refused(file, tmp_path):
+    (tmp_path / "pairs.txt").write_text("0 1 0.5 1\n0 2 0.1 0\n")
+    pairs = ScoredPairs(np.array([[0, 1], [0, 2]]), np.array([0.5, 0.1]), np.array([True, False]))
+    answers = TopK("town", file.positions, None, None, np.array([700]), np.array([[300]]))
+    for source, options, message in (
+        (pairs, {"times": file.times}, "^expected no times beside scored pairs"),
+        (tmp_path / "pairs.txt", {"times": file.times}, "pairs.txt: expected no times beside scored pairs"),
+        (answers, {"distance": "l2"}, "expected no distance beside up to 1 retrieved frames"),
+        (file, {"distance": "cosin"}, "did you mean cosine"),
+        (file, {"positions": file.positions[:9]}, r"found float64 \(9, 3\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            evaluate(source, **options)
 
 
 def test_the_result_prints_itself_and_becomes_json(file, tmp_path):

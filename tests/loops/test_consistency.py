@@ -1,13 +1,14 @@
 """Right loops agree with each other whatever the odometry has drifted, wrong ones do not; the largest set is found."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.loops.consistency import agree, agree_in_order, largest_consistent_set
+from sglpr_jax.loops.consistency import BLOCK, agree, agree_in_order, largest_consistent_set
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import Alignment
@@ -97,6 +98,42 @@ def test_the_set_is_consistent_and_nearly_the_largest(n, seed):
     sizes = range(n, 0, -1)
     best = next(k for k in sizes if any(pairs[np.ix_(s, s)].all() for s in itertools.combinations(range(n), k)))
     assert len(found) >= best - 1
+
+
+def chosen_by_the_letter(pairs: np.ndarray, starts: int = 20) -> list[int]:
+    """The largest set as its docstring says, with all degrees taken anew for each member."""
+    pairs, best = pairs & pairs.T, []
+    for start in np.argsort(-pairs.sum(1), kind="stable")[:starts]:
+        members, left = [start], np.flatnonzero(pairs[start] & (np.arange(len(pairs)) != start))
+        while len(left):
+            members.append(left[np.argmax(pairs[np.ix_(left, left)].sum(1))])
+            left = left[pairs[members[-1], left] & (left != members[-1])]
+        best = max(best, members, key=len)
+        if len(best) > len(pairs) / 2:
+            break
+    return sorted(best)
+
+
+@settings(deadline=None, max_examples=60)
+@given(n=st.integers(0, 60), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]), seed=st.integers(0, 10**6))
+def test_the_set_is_the_one_that_all_degrees_taken_anew_choose(n, share, seed):
+    rng = np.random.default_rng(seed)
+    pairs = rng.random((n, n)) < np.sqrt(share)  # some agree one way alone, some not with themselves
+    assert largest_consistent_set(pairs).tolist() == chosen_by_the_letter(pairs)
+
+
+def test_loops_are_compared_block_by_block():
+    poses, rng = square_drive(), np.random.default_rng(0)
+    queries = rng.integers(205, 395, 5 * BLOCK + 3).tolist()
+    loops = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[1, 1, 0.05]))) for i in queries]
+    odometry = drifted(poses, rng)
+    tracemalloc.start()
+    pairs = agree(loops, odometry)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 80 * len(loops) ** 2  # bytes; all at once took 150 a pair
+    for row in range(0, len(loops), 41):
+        np.testing.assert_array_equal(pairs[row], agree([loops[row]], odometry, loops)[0])
 
 
 def test_nothing_to_choose_from():

@@ -144,6 +144,7 @@ def test_what_does_not_fit_is_one_clear_error(drive, params, random_params):
         (cloud, {"time": 6.0, "odometry": 2 * np.eye(4)}, "4 x 4 pose with a rotation"),
         (cloud, {"time": 6.0, "odometry": np.diag([1.0, 1, 1, np.nan])}, "4 x 4 pose with a rotation"),
         (np.zeros(7), {"time": 6.0}, r"points \(n, 3\) or an image"),
+        (np.zeros((900, 4)), {"time": 6.0}, r"x, y and z alone, \(n, 3\), found an array of shape \(900, 4\)"),
     ):
         with pytest.raises(ValueError, match=message):
             detector.add(scan, **given)

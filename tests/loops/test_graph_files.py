@@ -111,7 +111,7 @@ def test_no_loops_are_files_too(tmp_path, poses):
         (read_loops_jsonl, '{"query": 1}\n', "line 1: expected a loop as JSON"),
         (read_loops_csv, "a,b\n", "line 1: expected query,match"),
         (read_tum, "0 1 2 3 0 0 0 2\n", "expected a quaternion of length 1"),
-        (read_tum, "1 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "line 2: expected a time >= 1"),
+        (read_tum, "1 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "row 2: expected a time >= 1"),
         (read_kitti, "1 2 3\n", "line 1: expected 12 numbers, found 3"),
     ],
 )

@@ -94,6 +94,13 @@ def test_saving_again_replaces_the_folder(params, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["weights"]
 
 
+def test_a_folder_with_other_files_is_not_replaced(params, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(FileExistsError, match=r"config.json, model.safetensors alone, .* found checkpoints"):
+        save(params, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]
+
+
 def test_a_training_run_s_folder_is_its_weights(params, tmp_path):
     save(params, tmp_path / "run" / "weights")
     chex.assert_trees_all_equal(load(tmp_path / "run"), params)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax import FleetIndex, Index
+from sglpr_jax.revisits import EXCLUDED_FRAMES
 
 from .places import WIDTH, add_places, draw, file_of
 
@@ -34,6 +35,13 @@ def test_recent_places_are_left_out_by_time_or_by_number(new: New):
     assert np.flatnonzero(index.recent(50.0)).tolist() == list(range(41, 100))
     assert np.flatnonzero(index.recent(frames=3)).tolist() == [97, 98, 99]
     assert index.query(draw(100)[99], 1, exclude=index.recent(50.0)).rows[0] <= 40
+
+
+def test_no_places_begin_no_times(new: New):
+    index = new()
+    index.add(np.zeros((0, WIDTH)), times=np.zeros(0))
+    index.add(draw(400))
+    assert np.flatnonzero(index.recent()).tolist() == list(range(400 - EXCLUDED_FRAMES, 400))
 
 
 def test_without_times_recent_places_are_left_out_by_number(new: New):

@@ -108,3 +108,12 @@ def test_a_descriptor_file_becomes_an_index():
     index = Index.of(file_of(7))
     assert index.ids == list(file_of(7).ids) and index.weights_hash == "abc" and index.positions is None
     np.testing.assert_array_equal(index.times, file_of(7).times)
+
+
+def test_no_places_begin_no_column():
+    index = Index.empty(WIDTH)
+    index.add(np.zeros((0, WIDTH)), times=np.zeros(0), positions=np.zeros((0, 3)))
+    index.add(draw(2))
+    assert len(index) == 2 and index.times is None and index.positions is None
+    with pytest.raises(ValueError, match="times of shape"):
+        index.add(np.zeros((0, WIDTH)), times=np.zeros(1))

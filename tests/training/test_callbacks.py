@@ -2,6 +2,8 @@
 
 import inspect
 
+import pytest
+
 from sglpr_jax.training.callbacks import Callback, Callbacks
 
 TOLD = {name: method for name, method in vars(Callback).items() if not name.startswith("_")}
@@ -26,3 +28,20 @@ def test_all_callbacks_are_called_in_their_order():
         getattr(both, name)(*values)
         assert told[-2:] == [("first", name, values), ("second", name, values)]
     assert len(told) == 2 * len(TOLD) > 10
+
+
+def test_all_are_closed_in_their_order_where_one_cannot_be():
+    closed = []
+
+    class Closing(Callback):
+        def __init__(self, own: str):
+            self._own = own
+
+        def close(self):
+            closed.append(self._own)
+            if self._own == "second":
+                raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        Callbacks(*map(Closing, ("first", "second", "third"))).close()
+    assert closed == ["first", "second", "third"]

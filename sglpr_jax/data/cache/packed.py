@@ -5,8 +5,9 @@
     DIR/08-5f0c.../labels.bin   uint16 raw ids of all points, where any scan has labels: a SemanticKITTI id has 16 bits
     DIR/08-5f0c.../images.bin   in place of these two, float32 rows of ready-made images
 
-The folder's name ends in a hash of the list of files. So a pack never changes, a recording of which a file has changed
-is packed anew, and whoever finds a pack can use it, whichever process or host made it.
+The folder's name ends in a hash of the list of files and of the options with which they are read. So a pack never
+changes, a recording of which a file has changed is packed anew, and whoever finds a pack can use it, whichever process
+or host made it.
 """
 
 import contextlib
@@ -71,13 +72,15 @@ def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """What tells whether a pack is the recording's: its files, and the options with which they are read."""
+    """What tells whether a pack is the recording's: its files, and the options with which they are read.
+
+    Of the options only text counts: a reader whose points depend on other files gives a hash of these as an option.
+    """
     paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
     files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
-    options = getattr(recording.read, "keywords", {})
     return {
         "format": FORMAT,
-        "options": {name: value for name, value in options.items() if isinstance(value, str)},
+        "options": recording.read_options,
         "files": [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files],
     }
 

@@ -57,7 +57,8 @@ def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
     """Return the times (n,) in seconds of a file with one number a line.
 
-    Raises FileNotFoundError, and ValueError naming the first line that is no finite number or runs backwards.
+    Raises FileNotFoundError, and ValueError naming the first line that is no finite number or the first row whose time
+    is smaller than the one before.
     """
     times = read_rows(path, columns=1)[:, 0]
     check_times(path, times)
@@ -71,11 +72,11 @@ def check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
     """
     late = np.flatnonzero(np.abs(times) > LATEST_S)
     if late.size:
-        raise ValueError(f"{path}, line {late[0] + 1}: expected seconds, found {times[late[0]]:g}: a smaller unit?")
+        raise ValueError(f"{path}, row {late[0] + 1}: expected seconds, found {times[late[0]]:g}: a smaller unit?")
     backwards = np.flatnonzero(np.diff(times) < 0)
     if backwards.size:
         row = int(backwards[0]) + 2
-        raise ValueError(f"{path}, line {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
+        raise ValueError(f"{path}, row {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
 
 
 def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
@@ -97,7 +98,7 @@ def read_rows(
 ) -> Float[np.ndarray, "n {columns}"]:
     """Return the numbers (n, columns) of a text file, one row a line after so many lines of header.
 
-    Columns stand apart by `separator`; None: by white space, and then lines that start with # say nothing. Raises
+    Columns stand apart by `separator`; None: by white space. Lines that start with # say nothing. Raises
     FileNotFoundError, and ValueError naming the first line without as many finite numbers.
     """
     if not path.is_file():

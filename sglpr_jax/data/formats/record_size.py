@@ -19,6 +19,7 @@ from jaxtyping import Float
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.bin_records import described, read_records, record_type
 from sglpr_jax.data.warning import warn
+from sglpr_jax.files import in_short
 
 MOST_M = 300.0
 """Coordinates lie within so many metres, all but a share of `STRANGE`."""
@@ -49,8 +50,8 @@ CANDIDATES: tuple[RecordFormat, ...] = tuple(
 def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     """Return the format of headerless scans, and in words how it was found; None where they are too few to tell.
 
-    A few of the files are looked at, all over the recording. Some may be broken, most not. Raises ValueError, with all
-    that was tried, where no reading fits or more than one does.
+    A few of the files are looked at, all over the recording. Some may be broken, most not; what is empty or cannot be
+    read tells nothing. Raises ValueError, with all that was tried, where no reading fits or more than one does.
     """
     chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
@@ -79,7 +80,8 @@ def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> R
 
     For own recordings that were put into the layout of a dataset: a record of another size would read as garbage.
     """
-    if not strangeness(_some(paths), usual):
+    chosen = _some(paths)
+    if not chosen or not strangeness(chosen, usual):
         return None
     try:
         return find_record(paths)[0]
@@ -97,8 +99,18 @@ def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
 
 
 def _some(paths: Sequence[Path]) -> list[Path]:
-    """A few files, all over the recording."""
-    return [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int))]
+    """A few files, all over the recording, without those that tell nothing: a crash leaves the last one empty."""
+    chosen = (paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int)))
+    return [path for path in chosen if _has_bytes(path)]
+
+
+def _has_bytes(path: Path) -> bool:
+    """Whether there is anything to read: not in an empty file, behind a dangling link, or without permission."""
+    try:
+        with path.open("rb") as stream:
+            return bool(stream.read(1))
+    except OSError:
+        return False
 
 
 def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
@@ -115,11 +127,14 @@ def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
 
 def _coordinates(path: Path, format: RecordFormat) -> tuple[Float[np.ndarray, "n 3"], str]:
     """The first points of a file, NaN where there was no return; and what is strange about them."""
-    size, width = path.stat().st_size, record_type(format).itemsize
-    if size % width:
-        return np.zeros((0, 3)), f"no whole number of {width} bytes"
-    with np.errstate(invalid="ignore"):
-        points = read_records(path, format).points[:MOST].astype(np.float64)
+    nothing, width = np.zeros((0, 3)), record_type(format).itemsize
+    try:
+        if path.stat().st_size % width:
+            return nothing, f"no whole number of {width} bytes"
+        with np.errstate(invalid="ignore"):
+            points = read_records(path, format).points[:MOST].astype(np.float64)
+    except (OSError, ValueError) as error:  # a bad disk, or a file that is being written: the others may tell
+        return nothing, f"not readable ({in_short(error)})"
     missing = np.isnan(points).all(axis=1) | (points == 0).all(axis=1)
     points[missing] = np.nan
     return points, _strange_range(points[~missing])

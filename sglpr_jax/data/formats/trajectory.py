@@ -3,7 +3,7 @@
 kitti   12 numbers a line, camera frame (x right, y down, z forward): KITTI's own poses and SemanticKITTI's
 lidar   12 numbers a line, z up: poses of the sensor or the car
 tum     t x y z qx qy qz qw, z up
-csv     a header that names columns, x, y and z among them and perhaps t, time or timestamp (seconds)
+csv     a header that names columns, x, y and z among them and perhaps t, time or timestamp (seconds); # may begin it
 """
 
 from collections.abc import Sequence
@@ -47,6 +47,9 @@ class Trajectory:
 
 
 TIME_COLUMNS = ("t", "time", "timestamp")
+TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
+"""Names that say their unit, for files without one of `TIME_COLUMNS`."""
+KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
 
 
 def read_trajectory(
@@ -147,22 +150,31 @@ def _read_tum(path: Path) -> Trajectory:
 def _read_csv(path: Path) -> Trajectory:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
-    header = path.read_text(errors="replace").partition("\n")[0]
-    names = [name.strip().lower() for name in header.split(",")]
-    clocks = [name for name in names if name in TIME_COLUMNS]
-    if not {"x", "y", "z"} <= set(names):
-        raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
-    if len(set(names)) < len(names) or len(clocks) > 1:
-        raise ValueError(
-            f"{path}: expected every column once, and one of {', '.join(TIME_COLUMNS)}, found {header[:80]!r}"
-        )
+    names, clock = _header(path)
     columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
-    times = columns[clocks[0]] if clocks else None
+    times = None if clock is None else columns[clock]
     if times is not None:
         check_times(path, times)
     positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
     check_positions(path, positions)
     return Trajectory(positions, times, _said(path, "csv"))
+
+
+def _header(path: Path) -> tuple[list[str], str | None]:
+    """Return the names of a csv's columns, and which one has the times; ValueError where they do not tell."""
+    header = path.read_text(errors="replace").partition("\n")[0]
+    names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt writes # before it
+    clocks = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
+    if len(set(names)) < len(names) or len(clocks) > 1:
+        raise ValueError(
+            f"{path}: expected every column once, and one of {', '.join(KNOWN_CLOCKS)}, found {header[:80]!r}"
+        )
+    unused = [name for name in names if ("time" in name or "stamp" in name) and name not in clocks]
+    if unused:
+        warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
+    return names, clocks[0] if clocks else None
 
 
 def _said(path: Path, format: str) -> str:

@@ -32,10 +32,11 @@ AEVA_CHANGED = 1691936557946849179
 
 def recording_names(root: Path) -> tuple[str, ...]:
     """Return SEQUENCE-SENSOR for each sensor with scans in `root`, which holds sequences or is one."""
-    folders = (root,) if (root / "LiDAR").is_dir() else sorted(path.parent for path in root.glob("*/LiDAR"))
+    itself = {root.resolve().name: root} if (root / "LiDAR").is_dir() else {}
+    folders = itself or {path.parent.name: path.parent for path in sorted(root.glob("*/LiDAR"))}
     return tuple(
-        f"{folder.resolve().name}-{sensor}"
-        for folder in folders
+        f"{sequence}-{sensor}"
+        for sequence, folder in folders.items()
         for sensor in RECORDS
         if (folder / "LiDAR" / sensor).is_dir() and (folder / "LiDAR_GT" / f"{sensor}_gt.txt").is_file()
     )

@@ -4,7 +4,8 @@
     2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/timestamps.txt        2011-09-26 13:02:25.951199337
     2011_09_26/2011_09_26_drive_0001_sync/oxts/data/0000000000.txt              latitude, longitude, altitude, ...
 
-Positions are those of the GPS (0.8 m behind the LiDAR), east, north, up, by the dataset's Mercator projection.
+A scan may be missing: then its line of times is blank. Positions are those of the GPS (0.8 m behind the LiDAR), east,
+north, up, by the dataset's Mercator projection.
 """
 
 import math
@@ -19,6 +20,7 @@ from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0
 OXTS_COLUMNS = 30
@@ -75,15 +77,22 @@ def _times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | Non
     """Seconds since 1970 of these scans; None without the file."""
     if not file.is_file():
         return None
-    lines = [line.strip() for line in file.read_text(errors="replace").splitlines() if line.strip()]
+    lines = file.read_text(errors="replace").splitlines()  # also the blank ones: the line of a scan is its number
     try:
-        stamps = np.array([line.replace(" ", "T") for line in lines], "datetime64[ns]").astype(np.int64) / 1e9
-        return stamps[[int(path.stem) for path in paths]]
+        return np.array([_seconds(lines[int(path.stem)]) for path in paths])
     except (ValueError, IndexError) as error:
         raise ValueError(
             f"{file}: expected a date and time, 2011-09-26 13:02:25.951199337, for each of {len(paths)} scans, found"
-            f" {len(lines)} lines or others"
+            f" {len(lines)} lines or others ({in_short(error)})"
         ) from error
+
+
+def _seconds(line: str) -> float:
+    """Seconds since 1970 of a date and time; ValueError for anything else."""
+    stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
+    if np.isnat(stamp):  # numpy's reading of a blank line
+        raise ValueError(f"a scan whose line is {line.strip()!r}")
+    return float(stamp.astype(np.int64) / 1e9)
 
 
 READER = Reader(

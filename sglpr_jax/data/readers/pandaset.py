@@ -8,6 +8,7 @@
 The LiDAR's own x points right and its y forward: points are turned to x forward. The world has z up.
 """
 
+import hashlib
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def open_recording(root: Path, name: str) -> Recording:
         times=seconds,
         pose_source="lidar/poses.json",
         paths=paths,
-        read=partial(_read, poses=poses),
+        read=partial(_read, poses=poses, poses_hash=_hash(folder / "poses.json")),
         found=(f"format: PandaSet as npy, from the world's frame into the LiDAR's, x forward{left}",),
     )
 
@@ -96,13 +97,19 @@ def _times(path: Path) -> Float[np.ndarray, " n"]:
     return times
 
 
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def _read(
     path: Path,
     labels: Path | None,
     lasers: bool,
     *,
     poses: dict[Path, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]],
+    poses_hash: str,
 ) -> Record:
+    """Read a scan; `poses_hash` is for those who keep its points, and must know when the poses are others."""
     world_from_lidar, position = poses[path]
     x, y, z = ((read_npy(path) - position) @ world_from_lidar).T
     return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))

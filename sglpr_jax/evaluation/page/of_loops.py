@@ -31,7 +31,7 @@ def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = Non
     """The page as HTML that stands alone; with an `optimized` trajectory it shows that beside the odometry."""
     about = "with odometry" if found.odometry is not None else "without odometry"
     sections = [Section("Where", _where(found))]
-    if optimized is not None:
+    if optimized is not None and found.frames:
         sections.append(Section("Corrected", _corrected(found, optimized)))
     sections += [Section("Pairs", _pairs(found)), Section("Loops", _table(found)), Section("Sure of it?", _sure(found))]
     return document(f"Loops of {found.recording.name}", f"{found}; {about}.", sections)

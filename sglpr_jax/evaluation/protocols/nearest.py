@@ -53,9 +53,10 @@ def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.
     if distance != "l2":
         compare = distance_function(distance)
         return lambda queries: compare(queries, database)
-    # |q - d|^2 without |q|^2, which is the same for a whole row.
-    norms = np.sum(database**2, axis=1)
-    return lambda queries: norms[None, :] - 2 * queries @ database.T
+    # |q - d|^2 without |q|^2, which is the same for a whole row; in float64, for far from zero the two terms cancel.
+    exact = database.astype(np.float64)
+    norms = np.sum(exact**2, axis=1)
+    return lambda queries: norms[None, :] - 2 * queries.astype(np.float64) @ exact.T
 
 
 def first_hits(
