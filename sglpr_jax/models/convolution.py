@@ -70,7 +70,7 @@ def as_product(
     columns = _side_by_side(x, 1, size, strides[0])
     if strides[1] == 1 and size % 2:
         added = jnp.split(_product(columns, kernel.swapaxes(1, 2).reshape(-1, size * f)), size, axis=-1)
-        return sum(_moved(of_one, border - j, circular) for j, of_one in enumerate(added))
+        return functools.reduce(jnp.add, [_moved(of_one, border - j, circular) for j, of_one in enumerate(added)])
     patches = _side_by_side(_columns_around(columns, border, circular), 2, size, strides[1])
     return _product(patches, kernel.swapaxes(0, 1).reshape(-1, f))
 

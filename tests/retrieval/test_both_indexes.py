@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sglpr_jax import FleetIndex, Index
-from sglpr_jax.revisits import EXCLUDED_FRAMES
 
 from .places import WIDTH, add_places, draw, file_of
 
@@ -40,8 +39,8 @@ def test_recent_places_are_left_out_by_time_or_by_number(new: New):
 def test_no_places_begin_no_times(new: New):
     index = new()
     index.add(np.zeros((0, WIDTH)), times=np.zeros(0))
-    index.add(draw(400))
-    assert np.flatnonzero(index.recent()).tolist() == list(range(400 - EXCLUDED_FRAMES, 400))
+    index.add(draw(10))
+    assert index.recent(50.0, frames=4).sum() == 4
 
 
 def test_without_times_recent_places_are_left_out_by_number(new: New):
