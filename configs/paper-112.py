@@ -3,7 +3,8 @@
 Reproduces every stage of the preset `paper` (same tokens, same window of 22.4 m to each side) for images that BEVPlace
 publishes and `bin/simulate --images` writes, so that both can be compared on one dataset.
 
-Expect: not measured here; as `paper` it wants a GPU, a step takes seconds on two CPU cores.
+Expect: as `paper` it wants a GPU. After 613 steps of 20 images, 80 minutes of a CPU core, it was still behind what it
+is before training (docs/results.md).
 
 Command: bin/train --seq 08 --data IMAGES --preset paper-112
 """

@@ -95,11 +95,10 @@ def _side_by_side(x: Float[Array, "b h w c"], axis: int, size: int, stride: int)
 
 def _moved(x: Float[Array, "b h w c"], by: int, circular: bool) -> Float[Array, "b h w c"]:
     """Columns moved to the right; those that leave come in again, or zeros do."""
-    return (
-        jnp.roll(x, by, axis=2)
-        if circular
-        else jax.lax.pad(x, x.dtype.type(0), [(0, 0, 0)] * 2 + [(by, -by, 0), (0, 0, 0)])
-    )
+    if circular:
+        return jnp.roll(x, by, axis=2)
+    as_it_is = (0, 0, 0)
+    return jax.lax.pad(x, x.dtype.type(0), (as_it_is, as_it_is, (by, -by, 0), as_it_is))
 
 
 def _product(x: Float[Array, "b h w c"], matrix: Float[Array, "c f"]) -> Float[Array, "b h w f"]:

@@ -22,15 +22,13 @@ def fit_whitening(
 ) -> tuple[Float[np.ndarray, "d d"], Float[np.ndarray, "d"]]:
     """The kernel and bias whose result has spread s**(1 - power) along principal component s; power 1 whitens fully.
 
-    Raises ValueError for too few descriptors to know the spread along every direction.
+    Raises ValueError for descriptors that do not differ. From fewer than d of them nothing is known of some directions.
     """
     d = np.asarray(descriptors, np.float64)
-    if len(d) <= d.shape[1]:
-        raise ValueError(f"expected more than {d.shape[1]} descriptors to whiten as many numbers, found {len(d)}")
+    if not np.ptp(d, axis=0).any():
+        raise ValueError(f"expected descriptors of several places to whiten with, found {len(d)}, all equal")
     mean = d.mean(0)
     variances, components = np.linalg.eigh(np.cov(d - mean, rowvar=False))
-    if not variances.max() > 0:
-        raise ValueError(f"expected descriptors of several places to whiten with, found {len(d)} equal ones")
     spread = np.sqrt(np.maximum(variances, variances.max() * SMALLEST_SPREAD**2))
     kernel = components / (spread / spread.max()) ** power
     return kernel.astype(np.float32), (-mean @ kernel).astype(np.float32)

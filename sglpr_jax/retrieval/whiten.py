@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from sglpr_jax.data import Recording
+from sglpr_jax.data.warning import warn
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.whitening import unwhitened, whitened
 from sglpr_jax.retrieval.embed import embed
@@ -20,8 +21,12 @@ def whiten(
     """`params` with a last layer fitted to the descriptors of all scans, in place of one that is there.
 
     It needs neither labels nor poses. `power` says by which power of their spread principal components are divided: 1
-    evens out all. `on_progress` is told how many scans of a recording are done.
+    evens out all. `on_progress` is told how many scans of a recording are done. So few scans that they say nothing of
+    some directions are told by a warning.
     """
     params = unwhitened(params)
-    found = [embed(params, recording, on_progress=on_progress).descriptors for recording in recordings]
-    return whitened(params, np.concatenate(found), power=power)
+    found = np.concatenate([embed(params, each, on_progress=on_progress).descriptors for each in recordings])
+    n, d = found.shape
+    if n <= d:
+        warn(f"expected more scans than a descriptor has numbers, {d}, to whiten with; better ten times, found {n}")
+    return whitened(params, found, power=power)

@@ -43,11 +43,10 @@ def test_a_direction_without_spread_stays_finite():
     assert np.isfinite(kernel).all() and np.isfinite(bias).all()
 
 
-def test_too_few_or_equal_descriptors_are_refused():
-    with pytest.raises(ValueError, match="more than 6 descriptors to whiten as many numbers, found 6"):
-        fit_whitening(CLOUD[:6])
-    with pytest.raises(ValueError, match="found 20 equal ones"):
-        fit_whitening(np.ones((20, 6)))
+@pytest.mark.parametrize("n", [1, 20])
+def test_equal_descriptors_are_refused(n):
+    with pytest.raises(ValueError, match=f"found {n}, all equal"):
+        fit_whitening(np.ones((n, 6)))
 
 
 def test_a_fresh_layer_is_the_identity():
