@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from sglpr_jax.data.choices import RecordFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.data.formats.record_size import unusual_record
 from sglpr_jax.data.formats.scan_files import says_its_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
@@ -24,7 +24,7 @@ def read_query(
     """
     if path.suffix == ".png":
         return Record(image=read_image(path))
-    record = scan_record(path, format=format, records=_records(path))
+    record = scan_record(path, format=_found(path) if format == "auto" else format)
     if sensor_height == "auto":
         return dataclasses.replace(record, mounting=places.mounting())
     if sensor_height != "estimate":
@@ -36,7 +36,7 @@ def read_query(
     return dataclasses.replace(record, mounting=found)
 
 
-def _records(path: Path) -> RecordFormat:
-    """What a .bin holds whose name says nothing."""
+def _found(path: Path) -> ScanFormat:
+    """What a .bin holds whose name says nothing, where it is not what "auto" takes it for."""
     unsaid = path.is_file() and not says_its_format(path)
-    return (unusual_record([path]) if unsaid else None) or "kitti"
+    return (unusual_record([path]) if unsaid else None) or "auto"
