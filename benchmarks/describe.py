@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import tyro
 from inputs import comparable_model, random_params, random_scans
-from ratio import Contender, Job, alternate, check_equal, report, report_memory, require_torch, warn_if_busy
+from ratio import Contender, Job, alternate, check_equal, report, report_resources, require_torch, warn_if_busy
 
 from sglpr_jax.bev import rasterize
 from sglpr_jax.models.input_image import prepare
@@ -51,7 +51,7 @@ def main(
     seconds = alternate([other, *ours], repeats=repeats)
     rows = [(contender.name, seconds[:, i], seconds[:, 0]) for i, contender in enumerate(ours, start=1)]
     report(f"describe, {preset}, {batch} image(s)", rows, other="PyTorch", packages=("jax", "torch"), threads=threads)
-    report_memory([other, *ours])
+    report_resources([other, *ours])
 
 
 def jax_job(params: Params, bev: np.ndarray, chunk: int) -> Job:

@@ -57,6 +57,11 @@ class Contender:
         self._pipe.send("forget peak")
         self._pipe.recv()
 
+    def processor_s(self) -> float:
+        """Median of the processor seconds, over all threads, of the runs since `forget_peak` or its start."""
+        self._pipe.send("processor")
+        return self._pipe.recv()
+
     def peak_mb(self) -> float:
         """The most resident memory of the process, in 10^6 bytes, since `forget_peak` or its start."""
         self._pipe.send("peak")
@@ -65,19 +70,22 @@ class Contender:
 
 def _serve(pipe, threads: int, make_job: Callable[..., Job], arguments: tuple) -> None:
     os.environ["NPROC"] = os.environ["OMP_NUM_THREADS"] = str(threads)  # XLA's and PyTorch's
-    job = make_job(*arguments)
+    job, processor_s = make_job(*arguments), []
     while True:
         try:
             asked = pipe.recv()
         except EOFError:
             return
-        if asked != "run":
-            pipe.send(_PEAK[asked]())
-            continue
-        start = time.perf_counter()
-        value = job()
-        seconds = time.perf_counter() - start
-        pipe.send((value, seconds))
+        if asked == "run":
+            start, used = time.perf_counter(), time.process_time()
+            value = job()
+            pipe.send((value, time.perf_counter() - start))
+            processor_s.append(time.process_time() - used)
+        elif asked == "forget peak":
+            processor_s.clear()
+            pipe.send(_forget_peak())
+        else:
+            pipe.send({"peak": _peak_mb, "processor": lambda: float(np.median(processor_s))}[asked]())
 
 
 def _peak_mb() -> float:
@@ -87,9 +95,6 @@ def _peak_mb() -> float:
 
 def _forget_peak() -> None:
     Path("/proc/self/clear_refs").write_text("5")  # of all that it can clear: VmHWM
-
-
-_PEAK = {"peak": _peak_mb, "forget peak": _forget_peak}
 
 
 def require_torch() -> None:
@@ -125,10 +130,10 @@ def alternate(contenders: Sequence[Contender], *, repeats: int) -> np.ndarray:
     return seconds
 
 
-def report_memory(contenders: Sequence[Contender]) -> None:
-    """Print the peak of each process since its first runs, all of it: interpreter, framework, arguments and work."""
-    peaks = "; ".join(f"{contender.name} {contender.peak_mb():.0f} MB" for contender in contenders)
-    print(f"Peak of resident memory after the first runs: {peaks}")
+def report_resources(contenders: Sequence[Contender]) -> None:
+    """Print what a run of each takes after its first ones: processor time, and the peak of its process's memory."""
+    used = "; ".join(f"{one.name} {one.processor_s():.3g} s, {one.peak_mb():.0f} MB" for one in contenders)
+    print(f"Processor time of a run, and peak of resident memory: {used}")
 
 
 def report(

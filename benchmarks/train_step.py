@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import tyro
 from inputs import comparable_model, random_batch, random_params
-from ratio import Contender, Job, alternate, check_equal, report, report_memory, require_torch, warn_if_busy
+from ratio import Contender, Job, alternate, check_equal, report, report_resources, require_torch, warn_if_busy
 
 from sglpr_jax.data.sampling.batch import Batch, views
 from sglpr_jax.models.input_image import prepare
@@ -64,7 +64,7 @@ def main(
     rows = [(contender.name, seconds[:, i], seconds[:, 0]) for i, contender in enumerate(ours, start=1)]
     title = f"training step, {preset}, {config.images} images with labels"
     report(title, rows, other="PyTorch", packages=("jax", "torch", "optax"), threads=threads)
-    report_memory([other, *ours])
+    report_resources([other, *ours])
 
 
 def first_steps(contender: Contender) -> np.ndarray:

@@ -35,6 +35,8 @@ class SimulateCommand:
     hdl32e-nclt for --sessions."""
     azimuth_steps: int | None = None
     """Firings per turn; fewer make smaller files. None: as many as the real sensor's."""
+    scenery: str = "town"
+    """The land: `town`, or `outskirts`, hilly, with long roads between walls, hedges and slopes."""
     images: bool = False
     """Write BEV density images with label images (NN/imgs, NN/labels, NN/pose.txt) in place of scans and labels."""
     seed: int = 0

@@ -14,6 +14,7 @@ from sglpr_jax.sim.drive import name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.routes import ROLES
+from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
 from sglpr_jax.sim.sessions import plan_sessions
 
@@ -35,6 +36,7 @@ def write_dataset(
     sensor: Sensor = HDL64E,
     seed: int = 0,
     rate_hz: float = RATE_HZ,
+    scenery: Scenery = TOWN,
     layout: str = "scans",
     progress: Progress | None = None,
 ) -> Path:
@@ -55,13 +57,13 @@ def write_dataset(
     if len(files) < len(names) + len(along) or layout not in ("scans", "images"):
         drives = [*names, *map(name_of_path, along)]
         raise ValueError(f"expected different names and layout scans or images, found {', '.join(drives)} and {layout}")
-    settings = {"version": VERSION, "layout": layout, "scans": scans, "seed": seed, "rate_hz": rate_hz}
+    what = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     ways = {f"drive {name}": _fingerprint(file) for name, file in files.items()}
-    _claim(root, {**settings, "sensor": dataclasses.asdict(sensor)}, ways)
+    _claim(root, {"layout": layout, **what, **_settings(sensor, scenery)}, ways)
+    options = {"sensor": sensor, "scenery": scenery, **what}
     for name, file in files.items():
-        options = {"along": file, "scans": scans, "sensor": sensor, "seed": seed, "rate_hz": rate_hz}
         count = scans if file is None else len(thinned(read_path(file), scans).times)
-        simulate = functools.partial(simulate_recording, name, **options)
+        simulate = functools.partial(simulate_recording, name, along=file, **options)
         show = functools.partial(progress, name) if progress else lambda done, scans: None
         ids = tuple(f"{i:06d}" for i in range(count))
         _write_drive(root, name, simulate, ids=ids, layout=LAYOUTS[layout], progress=show)
@@ -77,6 +79,7 @@ def write_sessions(
     sensor: Sensor = SENSORS["hdl32e-nclt"],
     seed: int = 0,
     rate_hz: float = RATE_HZ,
+    scenery: Scenery = TOWN,
     progress: Progress | None = None,
 ) -> Path:
     """Write one town on several days into the folder `root`, in NCLT's layout; return `root`.
@@ -84,13 +87,18 @@ def write_sessions(
     Of the arguments and the drives see `plan_sessions`, of files, progress and errors `write_dataset`. Sessions cannot
     be added: with more days the streets are others.
     """
-    settings = {"version": VERSION, "layout": "nclt", "scans": scans, "seed": seed, "rate_hz": rate_hz}
-    sessions = plan_sessions(dates, route=route, scans=scans, sensor=sensor, seed=seed, rate_hz=rate_hz)
-    _claim(root, {**settings, "sensor": dataclasses.asdict(sensor), "sessions": dates, "route": route}, {})
+    what = {"route": route, "scans": scans, "seed": seed, "rate_hz": rate_hz}
+    sessions = plan_sessions(dates, sensor=sensor, scenery=scenery, **what)
+    _claim(root, {"layout": "nclt", "sessions": dates, **what, **_settings(sensor, scenery)}, {})
     for date, ids, simulate in sessions:
         show = functools.partial(progress, date) if progress else lambda done, scans: None
         _write_drive(root, date, simulate, ids=ids, layout=LAYOUTS["nclt"], progress=show)
     return root
+
+
+def _settings(sensor: Sensor, scenery: Scenery) -> dict:
+    """What is noted of all datasets."""
+    return {"version": VERSION, "sensor": dataclasses.asdict(sensor), "scenery": dataclasses.asdict(scenery)}
 
 
 def _fingerprint(file: Path | None) -> str:
@@ -120,10 +128,11 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
+    """The settings that were noted; datasets of before there were sceneries are towns."""
     settings = read_json(path)
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected the settings of a simulated dataset, found {settings!r:.60}")
-    return settings
+    return {**settings, "scenery": settings.get("scenery", json.loads(json.dumps(dataclasses.asdict(TOWN))))}
 
 
 def _write_drive(

@@ -40,6 +40,8 @@ def frontage(
         yield from _wood(rng, side, start, stop)
     elif side.bank:
         yield from _banks(rng, side, start, stop)
+    elif side.slope:
+        yield from _slope(rng, side, start, stop)
     else:
         yield from _border(rng, side, start, stop)
         yield from _plots(rng, side, start, stop, clock)
@@ -130,6 +132,7 @@ _BORDERS: dict[str, tuple[float, Range, float]] = {
     "hedge": (1.0, (0.9, 2.6), 0.9),
     "fence": (0.06, (0.9, 1.8), 0.85),
     "wall": (0.25, (0.7, 2.2), 0.9),
+    "screen": (0.2, (1.6, 3.5), 1.0),
     "rail": (0.15, (0.75, 0.8), 1.0),
 }
 
@@ -166,7 +169,7 @@ def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> 
     d = side.verge + 0.45 + thickness / 2
     s = start
     while s < stop - 1:
-        end = stop if side.border == "rail" else min(s + rng.uniform(6, 30), stop)
+        end = stop if side.border == "rail" else min(s + rng.uniform(*side.style.closed), stop)
         if rng.random() < closed:
             yield from _in_pieces(rng, side.border, s, end, d, "plot")
         s = end + rng.uniform(2, 4.5)
@@ -236,6 +239,15 @@ def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
             for part in plants.bush(rng, 1.3)
         ]
         yield Placed((bank, *bushes), s, side.verge + 1 + width / 2)
+
+
+def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+    """The foot of a hill: long mounds that lie deep in the ground and overlap."""
+    length, width, height, sunk = rng.uniform((20, 16, 3.0, 0.3), (35, 50, 8.0, 0.8)).tolist()
+    for s in _steps(rng, start, stop, (5.0, 7.0)):
+        across = width * rng.uniform(0.95, 1.05)
+        size, bottom = (length, across, 2 * height), -(1 + sunk) * height
+        yield Placed((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
 
 
 def bin_or_bench(rng: np.random.Generator) -> Thing:

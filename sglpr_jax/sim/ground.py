@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.sim.raw_ids import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
+from sglpr_jax.sim.scenery import TOWN, Scenery
 
 CELL_M = 0.25
 """Resolution of the ground's raster."""
@@ -15,8 +16,6 @@ ROAD_LEVEL = (ROAD, PARKING, OTHER_GROUND, LANE_MARKING)
 """The labels of the ground that lies as low as the road."""
 
 _WAVES = 4
-_WAVELENGTH_M = (150.0, 600.0)
-_MAX_SLOPE = 0.05
 
 
 class Relief(NamedTuple):
@@ -27,11 +26,11 @@ class Relief(NamedTuple):
     phase: np.ndarray  # (k,) radians
 
 
-def draw_relief(rng: np.random.Generator) -> Relief:
-    """Draw hills whose slope is nowhere above 5 %; some drives are nearly flat."""
-    number = 2 * np.pi / rng.uniform(*_WAVELENGTH_M, _WAVES)
+def draw_relief(rng: np.random.Generator, scenery: Scenery = TOWN) -> Relief:
+    """Draw hills whose slope is nowhere above the scenery's; some drives are nearly flat."""
+    number = 2 * np.pi / rng.uniform(*scenery.wavelength, _WAVES)
     bearing = rng.uniform(0, 2 * np.pi, _WAVES)
-    slopes = rng.uniform(0.2, 1.0) * _MAX_SLOPE * rng.dirichlet(np.ones(_WAVES))  # they add up at worst
+    slopes = rng.uniform(0.2, 1.0) * scenery.steepest * rng.dirichlet(np.ones(_WAVES))  # they add up at worst
     wave = number[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     return Relief(slopes / number, wave, rng.uniform(0, 2 * np.pi, _WAVES))
 

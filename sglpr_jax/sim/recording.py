@@ -25,6 +25,7 @@ from sglpr_jax.sim.drive import (
     read_path,
     speeds,
 )
+from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
 from sglpr_jax.sim.world import World, build_world
 
@@ -50,6 +51,7 @@ def simulate_recording(
     sensor: Sensor = HDL64E,
     seed: int = 0,
     rate_hz: float = RATE_HZ,
+    scenery: Scenery = TOWN,
 ) -> SimulatedRecording:
     """Build the town around a drive and return its recording: along route `name`, or along the pose file `along`.
 
@@ -65,7 +67,7 @@ def simulate_recording(
         rng = np.random.default_rng((*drive_seed(seed, name), 1))
         path = plan_path(rng, name, scans=scans, rate_hz=rate_hz)
     seeds = drive_seed(seed, name)
-    world = build_world(seeds, path.xy, path.times)
+    world = build_world(seeds, path.xy, path.times, scenery=scenery)
     rows = np.arange(len(path.times))[every_kth(path, scans)]
     return drive_through(
         world,

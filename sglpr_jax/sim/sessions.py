@@ -16,6 +16,7 @@ from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
 from sglpr_jax.sim.layouts import to_utime
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
+from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.world import World, build_world
 
@@ -41,6 +42,7 @@ def plan_sessions(
     sensor: Sensor = SENSORS["hdl32e-nclt"],
     seed: int = 0,
     rate_hz: float = RATE_HZ,
+    scenery: Scenery = TOWN,
 ) -> tuple[Session, ...]:
     """Return a session of `scans` scans for each of `dates`; the town is built when the first of them is simulated.
 
@@ -57,7 +59,7 @@ def plan_sessions(
         plan_path(np.random.default_rng((*seeds, 1)), route, scans=scans, rate_hz=rate_hz, days=len(dates)), len(dates)
     )
     days = np.split(np.arange(0, len(path.times), len(path.times) // (scans * len(dates))), len(dates))
-    town = functools.cache(lambda: build_world(seeds, path.xy, path.times))
+    town = functools.cache(lambda: build_world(seeds, path.xy, path.times, scenery=scenery))
     return tuple(
         _session(date, start, path, rows, town, sensor, (*seeds, day))
         for day, (date, start, rows) in enumerate(zip(dates, starts, days, strict=True))

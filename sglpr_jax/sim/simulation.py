@@ -8,6 +8,7 @@ from sglpr_jax.sim.choices import RATE_HZ, SCANS
 from sglpr_jax.sim.dataset import VERSION, write_dataset, write_sessions
 from sglpr_jax.sim.drive import name_of_path
 from sglpr_jax.sim.layouts import LAYOUTS
+from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 
 ROUTES = ("00", "05", "08")
@@ -61,6 +62,7 @@ def simulate(
     azimuth_steps: int | None = None,
     seed: int = 0,
     rate_hz: float = RATE_HZ,
+    scenery: str = "town",
     images: bool = False,
     on_start: Callable[[Simulated], None] = lambda dataset: None,
     on_progress: Callable[[int], None] = lambda done: None,
@@ -70,8 +72,9 @@ def simulate(
     `routes` are of 00 to 10 (None: 00, 05 and 08, or none with `along`), each through a town of its own; `along` are
     KITTI pose files to drive along. With `sessions`, dates, one town is driven through on so many days, along one
     route, in NCLT's layout. `sensor` is one of `SENSORS` (None: hdl64e, or hdl32e-nclt for sessions), `azimuth_steps`
-    its firings per turn. `rate_hz` is scans per second of a route. `images` writes density images with label images in
-    place of scans. An interrupted dataset is completed, to the same bytes, and recordings can be added.
+    its firings per turn. `rate_hz` is scans per second of a route, `scenery` one of `SCENERIES`. `images` writes
+    density images with label images in place of scans. An interrupted dataset is completed, to the same bytes, and
+    recordings can be added.
 
     `on_start` is told what there is to write, `on_progress` how many of its scans are done, counting `scans` a
     recording. Raises ValueError for an unknown route or sensor, a malformed pose file, and where `out` holds another
@@ -84,6 +87,8 @@ def simulate(
     if sessions and (along or images or len(routes or ()) > 1):
         found = f"{len(routes or ())} routes, {len(along)} pose files, images {images}"
         raise ValueError(f"expected at most one route beside sessions, no pose files and no images, found {found}")
+    if scenery not in SCENERIES:
+        raise ValueError(f"expected a scenery among {', '.join(SCENERIES)}, found {scenery!r}")
     chosen = routes if routes is not None else () if along or sessions else ROUTES
     names = tuple(sessions) or (*chosen, *map(name_of_path, along))
     layout = "nclt" if sessions else "images" if images else "scans"
@@ -94,11 +99,11 @@ def simulate(
     def progress(name: str, done: int, count: int) -> None:
         on_progress(names.index(name) * scans + done * scans // count)
 
-    options = {"scans": scans, "sensor": lidar, "seed": seed, "rate_hz": rate_hz, "progress": progress}
+    options = {"scans": scans, "sensor": lidar, "seed": seed, "rate_hz": rate_hz, "scenery": SCENERIES[scenery]}
     if sessions:
-        write_sessions(out, dates=sessions, route=next(iter(chosen), "00"), **options)
+        write_sessions(out, dates=sessions, route=next(iter(chosen), "00"), progress=progress, **options)
     else:
-        write_dataset(out, names=chosen, along=along, layout=layout, **options)
+        write_dataset(out, names=chosen, along=along, layout=layout, progress=progress, **options)
     return dataset
 
 

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from sglpr_jax.sim.styles import SHARES, STYLES, Side, draw_side
+from sglpr_jax.sim.scenery import TOWN, Scenery
+from sglpr_jax.sim.styles import STYLES, Side, draw_side
 
 MIDDLE_M = 1.2
 """How far left of the first pass the middle of the street is: one drives on the right."""
@@ -20,7 +21,6 @@ ROUNDABOUT_M = (5.5, 16.0)
 
 _LOOK_BACK_M = 30  # along the path: what is nearer is the same pass
 _SIDE_STREET_M = (30.0, 60.0)
-_CROSSING_EVERY_M = (60.0, 150.0)
 _STRETCH_M = (40.0, 150.0)
 _LOOK_ALIKE_M = (300.0, 600.0)
 
@@ -104,57 +104,62 @@ def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
         yield first, last + 1
 
 
-def draw_streets(rng: np.random.Generator, path: Path) -> tuple[Street, ...]:
-    """The streets along `path` and the side streets that branch off; same path and state of `rng`, same streets."""
+def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) -> tuple[Street, ...]:
+    """The streets along `path`, and side streets that branch off; same arguments and state of `rng`, same streets."""
     middle = gaussian_filter1d(path.xy + MIDDLE_M * path.left, 1.5, axis=0, mode="nearest")
-    style = _new_style(rng)
+    style = _new_style(rng, scenery)
     streets, lines = [], [middle]
     for first, last in runs(~revisits(path), gap=12):
         # A run begins and ends on a street that is already there: it reaches 4 m into it.
         line = slice(max(first - 4, 0), min(last + 4, len(middle)))
         fast = path.speed[line] > HIGHWAY_MPS
-        street = Street(middle[line], path.heading[line], tuple(_draw_stretches(rng, fast, style)))
+        street = Street(middle[line], path.heading[line], tuple(_draw_stretches(rng, fast, style, scenery)))
         streets.append(street)
-        for start, heading in _branch_starts(rng, street):
+        for start, heading in _branch_starts(rng, street, scenery):
             length, bend = rng.uniform(*_SIDE_STREET_M), rng.normal(0, 0.004)
             branch = _free_line(start, heading, length, bend, KDTree(np.concatenate(lines)))
             if len(branch) > 20:
                 lines.append(branch)
-                streets.append(_side_street(rng, branch))
+                streets.append(_side_street(rng, branch, scenery))
     return tuple(streets)
 
 
-def _side_street(rng: np.random.Generator, line: Float[np.ndarray, "n 2"]) -> Street:
+def _side_street(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], scenery: Scenery) -> Street:
     ahead = np.gradient(line, axis=0)
-    stretches = _draw_stretches(rng, np.zeros(len(line), bool), _new_style(rng))
+    stretches = _draw_stretches(rng, np.zeros(len(line), bool), _new_style(rng, scenery), scenery)
     return Street(line, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), tuple(stretches))
 
 
-def _new_style(rng: np.random.Generator) -> str:
-    return str(rng.choice(list(SHARES), p=np.array(list(SHARES.values())) / sum(SHARES.values())))
+def _new_style(rng: np.random.Generator, scenery: Scenery) -> str:
+    shares = np.array(list(scenery.styles.values()))
+    return str(rng.choice(list(scenery.styles), p=shares / shares.sum()))
 
 
-def _draw_stretches(rng: np.random.Generator, fast: Bool[np.ndarray, " n"], name: str) -> Iterator[Stretch]:
-    """Cut a street into stretches; a style lasts for some of them, and one in eight is long and all alike."""
+def _draw_stretches(
+    rng: np.random.Generator, fast: Bool[np.ndarray, " n"], name: str, scenery: Scenery
+) -> Iterator[Stretch]:
+    """Cut a street into stretches; a style lasts for some of them, and some are long and all alike."""
     start, changes = 0, np.flatnonzero(np.diff(fast.astype(int))) + 1
     town_width = rng.uniform(-0.2, 0.2)
     while start < len(fast):
-        look_alike = rng.random() < 0.12
+        look_alike = rng.random() < scenery.look_alike
         stop = min(start + int(rng.uniform(*(_LOOK_ALIKE_M if look_alike else _STRETCH_M))), len(fast))
         stop = min([stop, *changes[changes > start].tolist()])
-        name = name if rng.random() < 0.7 else _new_style(rng)
+        name = name if rng.random() < 0.7 else _new_style(rng, scenery)
         here = STYLES["highway" if fast[start] else name]
         half_width = sum(here.road) / 2 + town_width
         median = rng.random() < here.median
         # Every fourth street looks different across the road.
-        other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng)]
+        other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
         left = draw_side(rng, here, median=median, look_alike=look_alike)
         right = draw_side(rng, other, median=False, look_alike=look_alike)
         yield Stretch(start, stop, half_width, left, right)
         start = stop
 
 
-def _branch_starts(rng: np.random.Generator, street: Street) -> list[tuple[Float[np.ndarray, "2"], float]]:
+def _branch_starts(
+    rng: np.random.Generator, street: Street, scenery: Scenery
+) -> list[tuple[Float[np.ndarray, "2"], float]]:
     """Where side streets may begin and lead: straight on where the street turns off, and by chance elsewhere."""
     starts = []
     for turn in _sharp_turns(street.heading):
@@ -169,7 +174,7 @@ def _branch_starts(rng: np.random.Generator, street: Street) -> list[tuple[Float
             starts.append((int(at), street.heading[int(at)] + turn))
             if rng.random() < 0.5:
                 starts.append((int(at), starts[-1][1] + np.pi))
-        at += rng.uniform(*_CROSSING_EVERY_M)
+        at += rng.uniform(*scenery.crossing_every)
     return [(street.middle[index], float(heading)) for index, heading in starts]
 
 

@@ -30,6 +30,7 @@ class Style:
     set_back: Range = (3.0, 8.0)
     glass: Range = (0.1, 0.35)
     border: tuple[str, ...] = ("none",)  # what may close off the plots; one is drawn per side
+    closed: Range = (6.0, 30.0)  # metres of it between two entrances
     bays: float = 0.0  # share of the sides with parked cars along the road
     verge: float = 0.0  # share of the sides with a strip between road and sidewalk
     median: float = 0.0  # share of the streets with a planted median and a carriageway beyond it
@@ -37,6 +38,7 @@ class Style:
     trees: float = 0.0  # trees and bushes per metre of side, on the plots
     wood: float = 0.0  # share of the sides where a wood comes down to the road
     banks: float = 0.0  # share of the sides where the ground rises beside the road
+    slopes: float = 0.0  # share of the sides that are the foot of a hill
     bystanders: float = 0.0  # people, bicycles, bins and the like per metre of side
     signs: float = 0.02  # per metre of side
     lamps: bool = True
@@ -168,6 +170,36 @@ STYLES = {
         signs=0.012,
         lamps=False,
     ),
+    "walled": Style(
+        road=(3.2, 4.6),
+        walk=(1.4, 3.5),
+        garden=TERRAIN,
+        houses=0.6,
+        gap=(6.0, 30.0),
+        set_back=(6.0, 16.0),
+        border=("screen", "screen", "hedge", "wall"),
+        closed=(60.0, 400.0),
+        bays=0.1,
+        verge=0.4,
+        trees=0.7,
+        bystanders=0.01,
+    ),
+    "hillside": Style(
+        road=(2.9, 4.0),
+        walk=(0.0, 2.0),
+        garden=TERRAIN,
+        houses=0.4,
+        gap=(8.0, 40.0),
+        set_back=(3.0, 10.0),
+        border=("none", "hedge", "wall", "fence"),
+        closed=(20.0, 120.0),
+        bays=0.1,
+        verge=0.4,
+        trees=0.5,
+        wood=0.15,
+        slopes=0.6,
+        bystanders=0.01,
+    ),
     "highway": Style(
         road=(6.0, 7.5),
         walk=(0.0, 0.0),
@@ -182,10 +214,6 @@ STYLES = {
         lamps=False,
     ),
 }
-SHARES = {
-    "centre": 0.33, "suburb": 0.33, "estate": 0.09, "works": 0.04, "park": 0.08, "square": 0.02, "country": 0.11
-}  # fmt: skip
-"""How often each style begins a new neighbourhood; a highway is where the vehicle drives fast."""
 
 
 class Strip(NamedTuple):
@@ -208,6 +236,7 @@ class Side:
     border: str
     wood: bool
     bank: bool
+    slope: bool
     tree_spacing: float  # of the row of street trees; 0 where there is none
     row: House | None  # the house that stands again and again along a look-alike street
 
@@ -240,6 +269,7 @@ def draw_side(rng: np.random.Generator, style: Style, *, median: bool, look_alik
         border=str(rng.choice(style.border)),
         wood=rng.random() < style.wood,
         bank=rng.random() < style.banks,
+        slope=style.slopes > 0 and rng.random() < style.slopes,
         tree_spacing=rng.uniform(7, 16) if median or rng.random() < style.street_trees else 0.0,
         row=draw_house(rng, style) if look_alike else None,
     )

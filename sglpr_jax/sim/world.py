@@ -9,6 +9,7 @@ from sglpr_jax.sim.ground import Ground, draw_relief
 from sglpr_jax.sim.paving import paint_ground
 from sglpr_jax.sim.placing import furnish, join, plant_islands, select, to_scene
 from sglpr_jax.sim.plants import bush
+from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.shapes import Scene, Shapes
 from sglpr_jax.sim.streets import Network, Path, draw_streets, resample, roundabouts
 from sglpr_jax.sim.traffic import traffic
@@ -25,7 +26,11 @@ class World(NamedTuple):
 
 
 def build_world(
-    seed: int | tuple[int, ...], trajectory: Float[np.ndarray, "n 2"], times: Float[np.ndarray, " n"]
+    seed: int | tuple[int, ...],
+    trajectory: Float[np.ndarray, "n 2"],
+    times: Float[np.ndarray, " n"],
+    *,
+    scenery: Scenery = TOWN,
 ) -> World:
     """Return the town of `seed` around a drive, built only where the vehicle goes.
 
@@ -36,8 +41,8 @@ def build_world(
     """
     rng = np.random.default_rng(seed)
     path = resample(trajectory, times)
-    relief = draw_relief(rng)
-    network, islands = Network(draw_streets(rng, path)), roundabouts(path)
+    relief = draw_relief(rng, scenery)
+    network, islands = Network(draw_streets(rng, path, scenery)), roundabouts(path)
     ground = paint_ground(network, islands, relief, path.xy)
     clock = (float(times[0]), float(times[-1]))
     tables = [

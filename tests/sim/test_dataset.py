@@ -17,6 +17,7 @@ from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
 from sglpr_jax.poses import positions_from_camera
 from sglpr_jax.sim import SENSORS, Sensor, recording, scan, simulate_recording, write_dataset
+from sglpr_jax.sim.scenery import OUTSKIRTS
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 SCANS = 4
@@ -213,6 +214,7 @@ def test_images_written_before_there_were_label_maps_get_them(tmp_path):
         ({"sensor": SENSORS["vlp16"]}, "sensor"),
         ({"layout": "images"}, r"layout images \(found scans\)"),
         ({"rate_hz": 10.0}, "rate_hz 10"),
+        ({"scenery": OUTSKIRTS}, "scenery .*walled"),
     ],
 )
 def test_other_settings_are_refused(dataset, changes, found):
@@ -220,6 +222,16 @@ def test_other_settings_are_refused(dataset, changes, found):
     with pytest.raises(ValueError, match=f"simulation.json belongs to another.*{found}"):
         write(dataset, **changes)
     assert content(dataset) == before
+
+
+def test_a_dataset_of_before_there_were_sceneries_is_a_town(dataset, tmp_path):
+    old = shutil.copytree(dataset, tmp_path / "old")
+    settings = json.loads((old / "simulation.json").read_text())
+    del settings["scenery"]
+    (old / "simulation.json").write_text(json.dumps(settings))
+    write(old)
+    with pytest.raises(ValueError, match=r"scenery .*walled"):
+        write(old, scenery=OUTSKIRTS)
 
 
 def test_files_that_were_not_simulated_are_never_written_among(tmp_path):

@@ -18,6 +18,7 @@ from sglpr_jax.sim.ground import (
     surface_height,
 )
 from sglpr_jax.sim.raw_ids import LANE_MARKING, OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN
+from sglpr_jax.sim.scenery import SCENERIES
 
 STEP = 1e-3
 
@@ -37,12 +38,14 @@ def test_gradient_and_curvature_are_the_heights_derivatives(seed):
         np.testing.assert_allclose(relief_curvature(relief, xy)[:, axis], bend, atol=1e-8)
 
 
-def test_slopes_are_those_of_streets_and_hills_differ():
+@pytest.mark.parametrize("scenery", SCENERIES.values(), ids=SCENERIES)
+def test_slopes_are_those_of_the_scenery_and_hills_differ(scenery):
     steepest = []
     for seed in range(20):
-        slope = np.linalg.norm(relief_gradient(draw_relief(np.random.default_rng(seed)), places(seed, 500)), axis=1)
-        steepest.append(slope.max())
-    assert max(steepest) <= 0.05 and max(steepest) > 0.03 and min(steepest) < 0.02
+        relief = draw_relief(np.random.default_rng(seed), scenery)
+        slope = np.linalg.norm(relief_gradient(relief, places(seed, 500)), axis=1)
+        steepest.append(slope.max() / scenery.steepest)
+    assert 0.6 < max(steepest) <= 1 and min(steepest) < 0.4
 
 
 def test_the_shape_of_the_places_is_kept():

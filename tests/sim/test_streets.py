@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 from town import LOOP, THERE_AND_BACK, drive
 
+from sglpr_jax.sim.scenery import SCENERIES, Scenery
 from sglpr_jax.sim.streets import (
     HIGHWAY_MPS,
     MIDDLE_M,
@@ -121,6 +122,25 @@ def test_some_streets_look_alike_for_long():
             if stretch.left.row is not None:
                 lengths.append(stretch.stop - stretch.start)
     assert len(lengths) > 5 and max(lengths) > 300
+
+
+def test_the_outskirts_have_neighbourhoods_of_their_own_and_fewer_crossings():
+    sides, stretches = {}, {}
+    for name, scenery in SCENERIES.items():
+        path = resample(*drive(((0, 0), (1500, 0))))
+        towns = [draw_streets(np.random.default_rng(seed), path, scenery) for seed in range(16)]
+        sides[name] = sum(len(town) - 1 for town in towns)
+        stretches[name] = [stretch for town in towns for stretch in town[0].stretches]
+    rare = STYLES["walled"], STYLES["hillside"]
+    assert not any(stretch.left.style in rare for stretch in stretches["town"])
+    assert np.mean([stretch.left.style in rare for stretch in stretches["outskirts"]]) > 0.3
+    alike = {name: np.mean([part.left.row is not None for part in found]) for name, found in stretches.items()}
+    assert alike["outskirts"] > alike["town"] and sides["outskirts"] < sides["town"]
+
+
+def test_what_a_scenery_asks_for_must_be_there():
+    with pytest.raises(ValueError, match=r"styles: expected shares of centre, .*, found \{'harbour': 1.0\}"):
+        Scenery({"harbour": 1.0})
 
 
 def test_going_around_a_roundabout_makes_an_island():

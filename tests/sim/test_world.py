@@ -8,17 +8,18 @@ from town import LOOP, THERE_AND_BACK, drive
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim import World, build_world
 from sglpr_jax.sim.ground import is_raised, label_at, surface_height
-from sglpr_jax.sim.raw_ids import BUILDING, CAR, LANE_MARKING, MOVING, POLE, ROAD, TRUNK
+from sglpr_jax.sim.raw_ids import BUILDING, CAR, FENCE, LANE_MARKING, MOVING, POLE, ROAD, TERRAIN, TRUNK
+from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.shapes import Shapes
 
 SEEDS = range(4)
 _worlds: dict[tuple, World] = {}
 
 
-def world_of(corners, seed: int) -> World:
-    if (corners, seed) not in _worlds:
-        _worlds[corners, seed] = build_world(seed, *drive(corners))
-    return _worlds[corners, seed]
+def world_of(corners, seed: int, scenery: str = "town") -> World:
+    if (corners, seed, scenery) not in _worlds:
+        _worlds[corners, seed, scenery] = build_world(seed, *drive(corners), scenery=SCENERIES[scenery])
+    return _worlds[corners, seed, scenery]
 
 
 def clearance(shapes: Shapes, vehicle: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -41,9 +42,10 @@ def select(shapes: Shapes, keep: np.ndarray) -> Shapes:
 
 @pytest.mark.parametrize("corners", [LOOP, THERE_AND_BACK])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nothing_is_in_the_vehicles_way_at_any_time(corners, seed):
+@pytest.mark.parametrize("scenery", SCENERIES)
+def test_nothing_is_in_the_vehicles_way_at_any_time(corners, seed, scenery):
     trajectory, times = drive(corners)
-    for shapes in world_of(corners, seed).scene:
+    for shapes in world_of(corners, seed, scenery).scene:
         standing = np.all(shapes.velocity == 0, axis=1) & ~np.isin(shapes.label, list(MOVING.values()))
         always = select(shapes, standing)
         always = always._replace(since=always.since - np.inf, until=always.until + np.inf)
@@ -92,8 +94,9 @@ def test_all_classes_occur_in_six_hundred_metres(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_shapes_stand_on_the_ground(seed):
-    world = world_of(LOOP, seed)
+@pytest.mark.parametrize("scenery", SCENERIES)
+def test_shapes_stand_on_the_ground(seed, scenery):
+    world = world_of(LOOP, seed, scenery)
     for shapes in world.scene:
         moves = np.any(shapes.velocity != 0, axis=1)
         time = np.where(moves, shapes.since.clip(-1e6, 1e6) + shapes.until.clip(-1e6, 1e6), 0) / 2
@@ -111,6 +114,32 @@ def test_shapes_stand_on_the_ground(seed):
 def test_the_vehicle_drives_on_road(corners, seed):
     label = label_at(world_of(corners, seed).ground, drive(corners)[0])
     assert np.isin(label, (ROAD, LANE_MARKING)).all() and not is_raised(label).any()
+
+
+def test_the_outskirts_have_walls_to_their_length_and_hills_beside_the_road():
+    """Some wall is longer there than any in town, and ground rises out of the plots, off the road."""
+    longest, hills = {}, {}
+    for scenery in SCENERIES:
+        worlds = [world_of(((0, 0), (600, 0)), seed, scenery) for seed in range(6)]
+        walls = [select(world.scene.boxes, world.scene.boxes.label == FENCE) for world in worlds]
+        longest[scenery] = max(
+            _longest_run(wall.centre[:, 0], sign * wall.centre[:, 1] > 0) for wall in walls for sign in (1, -1)
+        )
+        mounds = [world.scene.ellipsoids for world in worlds]
+        high = [(shapes.label == TERRAIN) & (shapes.half[:, 2] > 2.9) for shapes in mounds]
+        hills[scenery] = sum(int(np.sum(each)) for each in high)
+        for world, shapes, each in zip(worlds, mounds, high, strict=True):
+            top = shapes.centre[each, 2] + shapes.half[each, 2]
+            assert np.all(top > surface_height(world.ground, shapes.centre[each, :2]) + 0.4)
+    assert longest["outskirts"] > 1.5 * longest["town"] > 0
+    assert hills["outskirts"] > 50 > hills["town"]
+
+
+def _longest_run(along: np.ndarray, side: np.ndarray) -> float:
+    """Metres of the longest row of pieces that follow each other within 6 m."""
+    along = np.sort(along[side])
+    pieces = np.split(along, np.flatnonzero(np.diff(along) > 6) + 1)
+    return max((float(np.ptp(piece)) for piece in pieces if len(piece)), default=0.0)
 
 
 def test_parked_cars_come_and_go_between_two_visits():

@@ -1,0 +1,51 @@
+"""What kind of land a town lies in: which neighbourhoods it has, how alike its streets are, how steep its hills."""
+
+import dataclasses
+from collections.abc import Mapping
+
+from sglpr_jax.sim.styles import STYLES
+from sglpr_jax.sim.things import Range
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenery:
+    """What a town is drawn from; pairs are ranges in metres."""
+
+    styles: Mapping[str, float]
+    """How often each of `STYLES` begins a new neighbourhood; a highway is where the vehicle drives fast."""
+    look_alike: float = 0.12
+    """Share of the stretches that are long and all alike."""
+    crossing_every: Range = (60.0, 150.0)
+    """From one side street to the next."""
+    wavelength: Range = (150.0, 600.0)
+    """Of the hills."""
+    steepest: float = 0.05
+    """No hill has a greater slope."""
+
+    def __post_init__(self):
+        unknown = [name for name in self.styles if name not in STYLES]
+        if unknown or sum(self.styles.values()) <= 0:
+            raise ValueError(f"styles: expected shares of {', '.join(STYLES)}, found {dict(self.styles)}")
+
+
+TOWN = Scenery(
+    {"centre": 0.33, "suburb": 0.33, "estate": 0.09, "works": 0.04, "park": 0.08, "square": 0.02, "country": 0.11}
+)
+OUTSKIRTS = Scenery(
+    {
+        "walled": 0.25,
+        "hillside": 0.25,
+        "country": 0.15,
+        "suburb": 0.15,
+        "works": 0.08,
+        "estate": 0.07,
+        "centre": 0.05,
+    },
+    look_alike=0.3,
+    crossing_every=(100.0, 300.0),
+    wavelength=(60.0, 400.0),
+    steepest=0.09,
+)
+"""Hilly land with long roads between walls, hedges and slopes, where one place looks like the next."""
+SCENERIES = {"town": TOWN, "outskirts": OUTSKIRTS}
+"""By the names that the command line knows."""
