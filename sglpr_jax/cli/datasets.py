@@ -2,7 +2,7 @@
 
 import contextlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,20 +91,17 @@ def all_recordings(root: Path, **options: Any) -> list[Recording]:
     return recordings
 
 
-def without_bad_scans(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings without the scans that cannot be read, each of which is reported."""
+def without_bad_scans(
+    recordings: Sequence[Recording], *, on_bad_scan: Callable[[str, Exception], None]
+) -> list[Recording]:
+    """Return the recordings without the scans that cannot be read, each of which `on_bad_scan` is told of."""
     with progress_bar("read all scans", sum(map(len, recordings))) as show:
         found, done = [], 0
         for recording in recordings:
             before = done
-            found.append(readable(recording, on_bad_scan=report_bad, on_progress=lambda i, n=before: show(n + i)))
+            found.append(readable(recording, on_bad_scan=on_bad_scan, on_progress=lambda i, n=before: show(n + i)))
             done += len(recording)
     return found
-
-
-def report_bad(scan: str, error: Exception) -> None:
-    """Say on stderr which scan was skipped, and why."""
-    print(f"skipped {scan}: {error}", file=sys.stderr)
 
 
 def _describe(recordings: Sequence[Recording]) -> None:

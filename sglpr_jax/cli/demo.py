@@ -50,7 +50,8 @@ def demo(command: DemoCommand) -> Path:
     config = load_preset(PRESET)
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
     train_and_test(
-        TrainCommand(seq=TESTED, data=town, preset=PRESET, weights=WEIGHTS, method=BESIDE, out=trained, config=config)
+        TrainCommand(seq=TESTED, data=town, preset=PRESET, weights=WEIGHTS, method=BESIDE, out=trained, config=config),
+        go_on="the demo begins its training anew",
     )
     print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
     source, weights = PosedRecordingOptions(seq=TESTED), str(trained)

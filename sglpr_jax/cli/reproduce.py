@@ -95,7 +95,7 @@ def reproduce(command: ReproduceCommand) -> Path:
         with stop_on_signal() as stopped:
             result = runs.train(variant, seq, stopped=stopped)
         print(result, file=sys.stderr)
-        exit_unless_finished(result, stopped)
+        exit_unless_finished(result, stopped, go_on="the same command goes on")
     write_json(command.out / "config.json", json.loads(json.dumps(dataclasses.asdict(command), default=str)))
     found = Reproduction(runs, seqs, command.method, lambda: command.nclt or cached_sessions())
     for name in names:

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import dataclasses
+import functools
 import gc
 import inspect
 import logging
@@ -12,6 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +24,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sglpr_jax.data.warning import DataWarning
 
 _TABLE_WIDTH = 140
+_INSTALLED_AS = "sglpr-"
+"""What `pip install` puts before the names of the commands."""
 _OBJECTS_BETWEEN_COLLECTIONS = 100_000
 """Imports and tracing make objects that stay: with Python's 700 an eighth of a start went by looking for garbage."""
 T = TypeVar("T")
@@ -40,9 +44,21 @@ def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
 
 
 def own_names(text: str) -> str:
-    """`text` with the commands as whoever started this one knows them: sglpr-embed, where bin/embed is not there."""
-    installed = Path(sys.argv[0]).name.startswith("sglpr-")
-    return re.sub(r"\bbin/(\w+)", r"sglpr-\1", text) if installed else text
+    """`text` with the commands as whoever started this one knows them: sglpr-embed, where bin/embed is not there.
+
+    Paths stay as they are: /home/me/bin/embed, bin/08.npz, bin/map/08.npz.
+    """
+    if not Path(sys.argv[0]).name.startswith(_INSTALLED_AS):
+        return text
+    names = "|".join(map(re.escape, _installed_commands()))
+    return re.sub(rf"(?<![\w/.~-])bin/({names})(?![\w/-]|\.\w)", rf"{_INSTALLED_AS}\1", text)
+
+
+@functools.cache
+def _installed_commands() -> tuple[str, ...]:
+    """The commands that `pip install` gives, as bin/ has them."""
+    scripts = [script.name for script in entry_points(group="console_scripts")]
+    return tuple(name.removeprefix(_INSTALLED_AS) for name in scripts if name.startswith(_INSTALLED_AS))
 
 
 def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
+from sglpr_jax.cli.recording import report_bad_scan
 from sglpr_jax.cli.runtime import (
     StopRequest,
     console,
@@ -37,6 +38,8 @@ SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_
 """Flags that a resumed run must have the same, beside its configuration."""
 SETTINGS_SINCE = ("format", "sensor_height", "skip_bad")
 """Such flags that older runs do not know: noted where they are set."""
+GO_ON = "go on with --resume"
+"""How a run that was stopped is gone on with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,12 +113,12 @@ def parse(arguments: list[str] | None = None) -> TrainCommand:
     return dataclasses.replace(command, config=without_untrained_head(command.config))
 
 
-def train_and_test(command: TrainCommand) -> Path:
-    """Do what the command says; returns the run's folder."""
+def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
+    """Do what the command says; returns the run's folder. `go_on` says how a stopped training can go on."""
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
         recordings, also, test = _recordings(command)
-        result = _train(command, recordings, also, test)
+        result = _train(command, recordings, also, test, go_on=go_on)
     if is_first_host():
         out, seed = folder / "test", command.config.seed
         found = final_test(result.params, test, out, methods=command.method, seed=seed, progress=progress_bar)
@@ -136,7 +139,7 @@ def settings(command: TrainCommand) -> dict[str, object]:
 
 
 def _train(
-    command: TrainCommand, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording
+    command: TrainCommand, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording, *, go_on: str
 ) -> TrainResult:
     """Train; where that is asked to stop, exit with what was made saved."""
     folder = run_folder(command)
@@ -157,14 +160,14 @@ def _train(
         )
     if is_first_host():
         print(result, file=sys.stderr)
-    exit_unless_finished(result, stopped)
+    exit_unless_finished(result, stopped, go_on=go_on)
     return result
 
 
-def exit_unless_finished(result: TrainResult, stopped: StopRequest) -> None:
+def exit_unless_finished(result: TrainResult, stopped: StopRequest, *, go_on: str) -> None:
     """End this process where a training was asked to stop: with 0 after SIGTERM, with 130 after Ctrl-C."""
     if not result.finished:
-        print(f"stopped at step {result.steps} of {result.config.steps}; go on with --resume", file=sys.stderr)
+        print(f"stopped at step {result.steps} of {result.config.steps}; {go_on}", file=sys.stderr)
         sys.exit(stopped.exit_status)
 
 
@@ -179,7 +182,7 @@ def _recordings(command: TrainCommand) -> tuple[Sequence[Recording], Sequence[Re
             f"--also {root}: expected another dataset than the one whose recording {command.seq} is tested"
         )
     if command.skip_bad:
-        *read, test = without_bad_scans([*recordings, *also, test])
+        *read, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
         recordings, also = read[: len(recordings)], read[len(recordings) :]
     if command.pseudo_labels is not None:
         recordings = _pseudo_labelled(recordings, command.pseudo_labels, command.config)

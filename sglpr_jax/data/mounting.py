@@ -5,7 +5,7 @@ Clouds of other sensors are brought there: turned upright, and moved up or down.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,18 +109,27 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
 def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
     """Return the median of what the scans of a recording tell; None where fewer than half of them tell anything.
 
-    A tilt below 2 degrees counts as none.
+    Those that disagree with most on whether the sensor hangs upside down are left out; None too where as many say one
+    as the other. A tilt below 2 degrees counts as none.
     """
     scans = list(found)
     seen = [mounting for mounting in scans if mounting is not None]
-    if 2 * len(seen) < max(len(scans), 1):
+    agreed = _on_one_side(seen)
+    if 2 * len(seen) < len(scans) or not agreed:
         return None
-    height = float(np.median([mounting.height_m for mounting in seen]))
-    up = np.median([mounting.up for mounting in seen], axis=0)
+    height = float(np.median([mounting.height_m for mounting in agreed]))
+    up = np.median([mounting.up for mounting in agreed], axis=0)
     mounting = Mounting(height, _unit(up))
     if min(mounting.tilt_deg, 180 - mounting.tilt_deg) < LEVEL_DEG:
         return Mounting(height, (0.0, 0.0, float(np.sign(up[2]))))
     return mounting
+
+
+def _on_one_side(seen: Sequence[Mounting]) -> Sequence[Mounting]:
+    """The upright ones or those that hang, whichever are more: opposite directions have no median. None at a tie."""
+    hanging = [mounting for mounting in seen if mounting.up[2] < 0]
+    upright = [mounting for mounting in seen if mounting.up[2] >= 0]
+    return [] if len(hanging) == len(upright) else max(hanging, upright, key=len)
 
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

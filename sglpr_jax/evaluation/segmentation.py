@@ -42,17 +42,6 @@ class SegmentationResult:
         return float(self.shares.max() / self.present)
 
 
-def score_segmentation(
-    truth: Int[np.ndarray, "*b h w"],
-    prediction: Int[np.ndarray, "*b h w"],
-    *,
-    counted: Bool[np.ndarray, "*b h w"],
-    classes: int,
-) -> SegmentationResult:
-    """Score class maps over the `counted` cells (those with points) whose true class is known."""
-    return score_confusion(confusion_matrix(truth, prediction, counted=counted, classes=classes))
-
-
 def confusion_matrix(
     truth: Int[np.ndarray, "*b h w"],
     prediction: Int[np.ndarray, "*b h w"],

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import flax
 import jax
 import jax.export
 import jaxlib.version
@@ -23,42 +24,51 @@ from sglpr_jax.models.sglpr import describe
 PACKAGE = Path(__file__).resolve().parents[1]
 _SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion")
 """Of JAX, those that change what is traced."""
-_programs: dict[tuple[ModelConfig, tuple[Any, ...]], Callable[..., Array]] = {}
-"""Of this process, by the model and the shapes of its images."""
+_programs: dict[tuple[Any, ...], Callable[..., Array]] = {}
+"""Of this process, by what they are made for: a model, the types of its weights and images, and settings."""
 
 
 def kept_describe(params: Params) -> Callable[..., Float[Array, "*b d"]]:
     """Return `describe` by these weights: a function of images and, where the model reads them, of labels.
 
-    Where JAX has a compilation cache, the traced program is kept in it for the next process; a program of other code,
-    of another JAX or of another model is never used, nor is a damaged one. Without a cache it is `describe` itself.
+    Where JAX keeps what it compiles in a folder, the traced program is kept there for the next process; a program of
+    other code, of another JAX or of another model is never used, nor is a damaged one. It is to be called as it is, not
+    under vmap or grad. Elsewhere it is `describe` itself.
     """
-    if jax.config.jax_compilation_cache_dir is None:
+    folder = _folder()
+    if folder is None:
         return functools.partial(describe, params)
-    folder = Path(jax.config.jax_compilation_cache_dir) / "traced"
 
     def describe_images(*images: Any) -> Float[Array, "*b d"]:
-        shapes = jax.tree.map(jax.typeof, images)
-        if (params.config, shapes) not in _programs:
-            _programs[params.config, shapes] = jax.jit(_program(params, shapes, folder).call)
-        return _programs[params.config, shapes](params.weights, *images)
+        arguments = jax.tree.map(jax.typeof, (params.weights, *images))
+        made_for = (params.config, tuple(jax.tree.leaves(arguments)), _settings())
+        if made_for not in _programs:
+            file = folder / f"{_name(made_for)}.stablehlo"
+            _programs[made_for] = jax.jit(_program(params.config, arguments, file).call)
+        return _programs[made_for](params.weights, *images)
 
     return describe_images
 
 
-def _program(params: Params, shapes: tuple[Any, ...], folder: Path) -> jax.export.Exported:
-    """The program for images of these shapes: read, or traced and written where that is possible."""
-    file = folder / f"{_name(params.config, shapes)}.stablehlo"
+def _folder() -> Path | None:
+    """Where programs are kept; None where JAX keeps none, or not in a folder of this machine."""
+    folder = jax.config.jax_compilation_cache_dir
+    kept = jax.config.jax_enable_compilation_cache and folder and "://" not in folder
+    return Path(folder) / "traced" if kept else None
+
+
+def _program(config: ModelConfig, arguments: tuple[Any, ...], file: Path) -> jax.export.Exported:
+    """The program for weights and images of these shapes: read, or traced and written where that is possible."""
     kept = _read(file)
     if kept is not None:
         return kept
 
     @jax.jit
     def of_weights(weights: Any, *images: Any) -> Array:
-        return describe(Params(weights, params.config), *images)
+        return describe(Params(weights, config), *images)
 
     with without_source_locations():
-        traced = jax.export.export(of_weights)(jax.tree.map(jax.typeof, params.weights), *shapes)
+        traced = jax.export.export(of_weights)(*arguments)
     _write(file, bytes(traced.serialize()))
     return traced
 
@@ -75,12 +85,16 @@ def without_source_locations() -> Iterator[None]:
         jax.config.update(limit, before)
 
 
-def _name(config: ModelConfig, shapes: tuple[Any, ...]) -> str:
-    """What a program depends on; of the code what Python looks at, too, before it uses what it compiled."""
+def _settings() -> tuple[Any, ...]:
+    """What JAX is told to do, as far as it changes what is traced."""
+    return tuple(getattr(jax.config, name) for name in _SETTINGS)
+
+
+def _name(made_for: tuple[Any, ...]) -> str:
+    """A name for all that a program depends on; of the code what Python looks at, too, before it uses a .pyc file."""
     code = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in sorted(PACKAGE.rglob("*.py"))]
-    settings = [getattr(jax.config, name) for name in _SETTINGS]
-    about = (jax.__version__, jaxlib.version.__version__, jax.default_backend(), settings, config, shapes, code)
-    return hashlib.sha256(repr(about).encode()).hexdigest()
+    versions = (jax.__version__, jaxlib.version.__version__, flax.__version__)
+    return hashlib.sha256(repr((versions, jax.default_backend(), made_for, code)).encode()).hexdigest()
 
 
 def _read(file: Path) -> jax.export.Exported | None:

@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from sglpr_jax.cli import datasets, demo
+from sglpr_jax.cli import train as train_command
 from sglpr_jax.training.presets import load_preset
+from sglpr_jax.training.recipe import TrainResult
 
 
 @pytest.fixture
@@ -44,6 +46,16 @@ def test_the_demo_ends_with_a_table_and_its_pictures_and_can_be_run_again(comman
     again = command("demo", "--out", out, "--scans", 40, "--steps", 1)
     assert again.status == 0, again.error
     assert (out / "run" / "checkpoints" / "1").is_dir() and not (out / "run" / "checkpoints" / "2").exists()
+
+
+def test_a_demo_that_is_stopped_says_what_it_does_next(command, tiny_demo, random_params, tmp_path, monkeypatch):
+    def train(config, recordings, *, out, **_):
+        return TrainResult(random_params(config.model), out, 1, config, None)
+
+    monkeypatch.setattr(train_command, "train", train)
+    ended = command("demo", "--out", tmp_path / "demo", "--steps", 2)
+    assert "stopped at step 1 of 2; the demo begins its training anew" in ended.error
+    assert "--resume" not in ended.error
 
 
 def test_the_demos_preset_is_what_it_trains():

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from sglpr_jax.cli import reproduce as reproduce_command
 from sglpr_jax.evaluation.published import KITTI, TABLES
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
 from sglpr_jax.reproduce.runs import Runs
@@ -13,6 +14,7 @@ from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
 from sglpr_jax.sim.dataset import write_sessions
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
+from sglpr_jax.training.recipe import TrainResult
 
 from .conftest import SENSOR, assert_one_line_error
 
@@ -123,6 +125,16 @@ def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
     more = command("reproduce", "table5", *options, "--steps", 6, "--plan")
     assert more.status == 0 and "0 of them there already" in more.error
     assert read_metrics(folder / "full" / "08" / "metrics.jsonl")[-1]["step"] == 4  # only said, not done
+
+
+def test_a_stopped_reproduction_says_how_it_goes_on(town, preset, random_params, tmp_path, command, monkeypatch):
+    config = load_preset(str(preset))
+    stopped = TrainResult(random_params(config.model), tmp_path / "run", 1, config, None)
+    monkeypatch.setattr(reproduce_command, "time_a_step", lambda *_: 1.0)
+    monkeypatch.setattr(Runs, "train", lambda *_, **__: stopped)
+    ended = command("reproduce", "table5", *OPTIONS, "--data", town, "--preset", preset, "--out", tmp_path / "out")
+    assert "stopped at step 1 of 4; the same command goes on" in ended.error
+    assert "--resume" not in ended.error
 
 
 def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, tmp_path, command):

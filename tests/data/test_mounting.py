@@ -97,6 +97,13 @@ def test_a_recording_takes_the_median_and_no_slope():
     assert common_mounting([]) is None
 
 
+def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
+    upright, hanging = Mounting(1.0, (0.6, 0.0, 0.8)), Mounting(3.0, (-0.6, 0.0, -0.8))
+    assert common_mounting([hanging, upright, None, hanging, Mounting(2.9, hanging.up)]) == hanging
+    assert common_mounting([upright, upright, hanging]) == upright
+    assert common_mounting([upright, hanging, hanging, upright]) is None
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda up: np.linalg.norm(up) > 0.1), st.floats(0, 4))
 def test_levelling_is_rigid_and_turns_up_to_z(up, height):

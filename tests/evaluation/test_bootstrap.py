@@ -62,6 +62,11 @@ def test_pairs_of_one_query_are_worth_less_than_pairs_of_many(pairs):
     assert lumps > 2 * singles  # twenty copies of twenty pairs tell no more than twenty pairs
 
 
+def test_frames_may_have_any_number(pairs):
+    scores, positive, query = pairs
+    assert f1_interval(scores, positive, query + 2**60) == f1_interval(scores, positive, query)
+
+
 def test_a_share_is_resampled_as_drawing_does():
     found = np.arange(200) < 150
     low, high = interval(resampled_means(found, np.random.default_rng(0)))

@@ -7,6 +7,8 @@ import pytest
 
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs import read_input
+from sglpr_jax.evaluation.inputs.agreement import check_agreement
+from sglpr_jax.evaluation.inputs.methods import read_methods
 from sglpr_jax.evaluation.protocols import ScoredPairs, TopK, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import check_names, chosen_protocols
 from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
@@ -51,6 +53,24 @@ def test_own_files_keep_what_nothing_replaces(tmp_path, make_file, two_laps, pos
     other = read_input(tmp_path / "own.npz", poses, sequence="x")
     assert (other.distance, other.pose_source) == ("cosine", "laps.csv (csv)")
     np.testing.assert_array_equal(other.positions, poses.positions)
+
+
+def test_own_files_keep_their_times_unless_times_are_given(tmp_path, make_file, two_laps, poses):
+    make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
+    bare = dataclasses.replace(poses, times=None)
+    for trajectory, seconds in ((bare, 0.1), (poses, 0.5)):
+        found = read_input(tmp_path / "own.npz", trajectory, sequence="x")
+        np.testing.assert_array_equal(found.times, np.arange(800) * seconds)
+
+
+@pytest.mark.parametrize("names", [("own.npz", "mine.npy", "pairs.txt"), ("mine.npy", "pairs.txt", "own.npz")])
+def test_methods_on_poses_without_times_share_those_of_an_own_file(tmp_path, make_file, two_laps, poses, names):
+    make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
+    np.save(tmp_path / "mine.npy", two_laps)
+    (tmp_path / "pairs.txt").write_text("400 0 0.5\n")
+    found = read_methods([tmp_path / name for name in names], poses=dataclasses.replace(poses, times=None))
+    np.testing.assert_array_equal(found["mine"].times, np.arange(800) * 0.1)
+    check_agreement(found["mine"], found["own"])
 
 
 def test_a_top_k_list_with_scores(read):

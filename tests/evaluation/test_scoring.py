@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.evaluation.protocols import PROTOCOLS, ScoredPairs, TopK, kind_of, protocols_taking
+from sglpr_jax.evaluation.protocols import PROTOCOLS, Kind, ScoredPairs, TopK, protocols_taking
 from sglpr_jax.evaluation.scoring import evaluate, score
 from sglpr_jax.evaluation.sessions import evaluate_session_files
 
@@ -55,6 +56,9 @@ def test_options_stand_in_for_what_a_file_says_itself(file, tmp_path):
     np.testing.assert_array_equal(moved.positions, file.positions[::-1] * 9)
     assert {result.pose_source for result in moved.results} == {"positions given as an array"}
     file.save(tmp_path / "town.npz")
+    by_path = evaluate(tmp_path / "town.npz", positions=file.positions[::-1] * 9)
+    assert [result.rule for result in by_path.results] == [result.rule for result in moved.results]
+    assert "last 30 s excluded" in by_path.results[0].rule
     assert scores(tmp_path / "town.npz", times=other.times) == scores(dataclasses.replace(file, times=other.times))
 
 
@@ -92,10 +96,10 @@ def test_what_is_missing_is_said(file, tmp_path):
         evaluate(tmp_path / "none.npz")
 
 
-def test_every_protocol_says_its_rule_its_source_and_what_it_takes(file):
+def test_every_protocol_says_its_rule_its_source_and_what_it_takes():
     for name, protocol in PROTOCOLS.items():
         assert protocol.name == name and protocol.rule and protocol.source and protocol.takes
-        assert protocol.fits(file) == (name in protocols_taking(kind_of(file)))
+        assert {kind for kind in get_args(Kind) if name in protocols_taking(kind)} == set(protocol.takes)
     assert [name for name, protocol in PROTOCOLS.items() if protocol.headline] == [
         "top1-f1max",
         "pairs-f1max",

@@ -1,11 +1,13 @@
 """A traced program that is kept: the same descriptors, by the next process without tracing, and never a wrong one."""
 
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -92,33 +94,51 @@ def test_where_nothing_can_be_kept_it_is_traced(folder, traced, random_params):
     assert folder.read_text() == "a file in the way"
 
 
-def test_other_code_settings_and_models_have_other_programs(folder, tmp_path, monkeypatch):
-    shapes = (jax.typeof(IMAGES),)
+def test_weights_of_another_type_and_other_settings_have_programs_of_their_own(folder, traced, random_params):
+    params = random_params(TINY)
+    half = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), params)
+    for some in (half, params, half):
+        np.testing.assert_array_equal(kept_describe(some)(IMAGES), np.asarray(sglpr_jax.describe(some, IMAGES)))
+    assert len(traced) == 2
+    with jax.default_matmul_precision("highest"):
+        kept_describe(params)(IMAGES)
+    assert len(traced) == 3 and len(list(folder.iterdir())) == 3
+
+
+def test_other_code_and_models_have_other_programs(tmp_path, monkeypatch):
     code = tmp_path / "package"
     code.mkdir()
     (code / "model.py").write_text("one = 1")
     monkeypatch.setattr(kept_program, "PACKAGE", code)
-    names = [kept_program._name(TINY, shapes)]
-    assert names == [kept_program._name(model_preset("tiny"), shapes)]
+    names = [kept_program._name((TINY,))]
+    assert names == [kept_program._name((model_preset("tiny"),))]
     (code / "model.py").write_text("one = 11")
-    names.append(kept_program._name(TINY, shapes))
+    names.append(kept_program._name((TINY,)))
     os.utime(code / "model.py", ns=(1, 1))
-    names.append(kept_program._name(TINY, shapes))
-    names.append(kept_program._name(model_preset("rings"), shapes))
-    names.append(kept_program._name(TINY, (jax.typeof(IMAGES[:1]),)))
-    with jax.default_matmul_precision("highest"):
-        names.append(kept_program._name(TINY, shapes))
+    names.append(kept_program._name((TINY,)))
+    names.append(kept_program._name((model_preset("rings"),)))
+    monkeypatch.setattr(kept_program.flax, "__version__", "0")
+    names.append(kept_program._name((TINY,)))
     assert len(set(names)) == len(names)
 
 
-def test_without_a_cache_it_is_describe(random_params, monkeypatch):
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", None)
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("jax_compilation_cache_dir", None),
+        ("jax_compilation_cache_dir", ""),
+        ("jax_compilation_cache_dir", "gs://bucket/cache"),
+        ("jax_enable_compilation_cache", False),
+    ],
+)
+def test_without_a_folder_to_keep_it_in_it_is_describe(random_params, setting, value):
+    before = getattr(jax.config, setting)
+    jax.config.update(setting, value)
     try:
         describe = kept_describe(random_params(TINY))
     finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-    assert describe.func is sglpr_jax.describe
+        jax.config.update(setting, before)
+    assert isinstance(describe, functools.partial) and describe.func is sglpr_jax.describe
 
 
 def test_another_process_begins_with_what_this_one_kept(folder, random_params, tmp_path):
@@ -129,6 +149,7 @@ def test_another_process_begins_with_what_this_one_kept(folder, random_params, t
     program = """
 import sys
 import jax
+import jax.numpy as jnp
 import numpy as np
 import sglpr_jax
 from sglpr_jax.models import kept_program

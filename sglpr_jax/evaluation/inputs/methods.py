@@ -1,10 +1,12 @@
 """The files of several methods on the same frames, to be compared."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs import Input, read_input
+from sglpr_jax.evaluation.protocols import ScoredPairs
 
 
 def read_methods(
@@ -17,8 +19,9 @@ def read_methods(
 ) -> dict[str, Input]:
     """Read the file of every method, by the name of the method: that of its file.
 
-    `poses` replace those of every file; those of the `dataset` serve files that have none of their own. `distance`
-    names how the descriptors of the first file, and of every .npy, are compared. Errors as of `read_input`.
+    `poses` replace those of every file; where they have no times, those of the first file that has some serve all.
+    Those of the `dataset` serve files that have none of their own. `distance` names how the descriptors of the first
+    file, and of every .npy, are compared. Errors as of `read_input`.
     """
     methods = {}
     for path in paths:
@@ -26,7 +29,17 @@ def read_methods(
         compared_by = distance if path == paths[0] or path.suffix == ".npy" else None
         name = sequence or path.stem
         methods[_name(path, paths)] = read_input(path, trajectory, sequence=name, distance=compared_by)
-    return methods
+    return methods if poses is None else _timed(methods)
+
+
+def _timed(methods: Mapping[str, Input]) -> dict[str, Input]:
+    """Give the methods without times those of the first that has some: with the same poses they have as many rows."""
+    retrieved = [method for method in methods.values() if not isinstance(method, ScoredPairs)]
+    times = next((method.times for method in retrieved if method.times is not None), None)
+    return {
+        name: method if isinstance(method, ScoredPairs) or method.times is not None else replace(method, times=times)
+        for name, method in methods.items()
+    }
 
 
 def _name(path: Path, others: Sequence[Path]) -> str:

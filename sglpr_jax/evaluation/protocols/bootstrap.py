@@ -52,9 +52,8 @@ def resampled_f1_max(
     edges = np.unique(scores[(true_if_accepted | missed_if_rejected) & np.isfinite(scores)])
     edges = edges[np.unique(np.linspace(0, len(edges) - 1, THRESHOLDS).round().astype(np.int64))]
     bins = np.searchsorted(edges, scores, side="right")  # accepted at the edges [:bins]
-    present = np.bincount(query) > 0
-    row = (np.cumsum(present) - 1)[query]
-    shape = (int(present.sum()), len(edges) + 1)
+    queries, row = np.unique(query, return_inverse=True)
+    shape = (len(queries), len(edges) + 1)
 
     def accepted(flags: Bool[np.ndarray, " n"]) -> Float32[np.ndarray, "queries edges"]:
         cells = np.bincount(row[flags] * shape[1] + bins[flags], minlength=shape[0] * shape[1]).reshape(shape)

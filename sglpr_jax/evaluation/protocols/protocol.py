@@ -34,10 +34,6 @@ class Protocol:
         """Score one source, or several sessions. Raises ValueError where positions are missing."""
         return self.score(*sources, seed=seed)
 
-    def fits(self, source: Source | ScoredPairs) -> bool:
-        """Return whether `source` is something the protocol can score."""
-        return kind_of(source) in self.takes
-
 
 def kind_of(source: Source | ScoredPairs) -> Kind:
     """Return what `source` is."""

@@ -13,7 +13,7 @@ METRES = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m"
 def top1_f1max(source: Source, *, seed: int = 0) -> Result:
     """Score top-1 retrieval as LoGG3D-Net and Locus do: 3 m / 20 m in 3-D, the last 30 s excluded.
 
-    Each query is answered with the nearest descriptor among the frames at least 30 s older (`poses.database_end` has
+    Each query is answered with the nearest descriptor among the frames at least 30 s older (`revisits.database_end` has
     the rule). Accepted, the answer is a true positive up to 3 m away, a false positive beyond 20 m, and counts for
     nothing in between. Rejected, it is a false negative if the query has any frame within 3 m in its database, else a
     true negative. Every distinct distance is a threshold; the published code takes 1000 of them (Locus: 200).
