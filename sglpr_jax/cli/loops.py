@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -11,6 +11,9 @@ from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, repo
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.loops.choices import MIN_PROBABILITY, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+
+if TYPE_CHECKING:
+    from sglpr_jax.loops.detector import DetectorConfig
 
 UNFINISHED = "unfinished"
 """The folder, in that of the results, of a run that has not ended."""
@@ -56,20 +59,31 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
-    from sglpr_jax.loops.optimization import check_installed
+    from sglpr_jax.loops.detector import DetectorConfig
     from sglpr_jax.loops.unfinished import alone  # these bring JAX and more, which --help does not need
 
-    if command.optimize and command.odometry is None:
+    _check(command)
+    config = DetectorConfig(min_probability=command.min_probability)
+    with alone(command.out / UNFINISHED):
+        return _search(command, config)
+
+
+def _check(command: LoopsCommand) -> None:
+    """Raise ValueError or ImportError for what is known before the search to end in an error, or in a loss."""
+    from sglpr_jax.loops.folder import TRAJECTORIES
+    from sglpr_jax.loops.optimization import check_installed
+
+    path, written = command.odometry, {(command.out / name).resolve() for name in TRAJECTORIES}
+    if command.optimize and path is None:
         raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
     if command.optimize:
         check_installed()
-    with alone(command.out / UNFINISHED):
-        return _search(command)
+    if path is not None and path.resolve() in written:
+        raise ValueError(f"{path}: expected odometry that stays, found a file that this run writes anew or removes")
 
 
-def _search(command: LoopsCommand) -> int:
+def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
     from sglpr_jax.evaluation.page.of_loops import write_loops_page
-    from sglpr_jax.loops.detector import DetectorConfig
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.folder import write_found
     from sglpr_jax.loops.optimization import optimize_trajectory
@@ -87,7 +101,7 @@ def _search(command: LoopsCommand) -> int:
             recording,
             params,
             odometry=odometry,
-            config=DetectorConfig(min_probability=command.min_probability),
+            config=config,
             registered=command.register,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=command.out / UNFINISHED,
@@ -101,7 +115,7 @@ def _search(command: LoopsCommand) -> int:
     if corrected is not None:
         print(f"trajectory corrected by {corrected.believed.sum()} of {len(found.loops)} loops")
     print(f"{command.out}: {', '.join(path.name for path in paths)}")
-    if stop():
+    if not found.whole:
         print("the same command goes on from here", file=sys.stderr)
         return stop.exit_status
     remove(command.out / UNFINISHED)

@@ -62,7 +62,7 @@ def write_map(command: MapCommand) -> int:
 
 
 def _add_places(command: MapCommand, params: "Params") -> int:
-    from sglpr_jax.loops.places import PlaceMap, map_recording
+    from sglpr_jax.loops.places import PlaceMap, map_recording, poses_by_id
     from sglpr_jax.loops.unfinished import remove
     from sglpr_jax.models.weights import weights_hash
 
@@ -83,7 +83,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             on_progress=show,
         )
     if len(places):
-        whole = places if before is None else before.merged(places)
+        whole = places if before is None else before.merged(places, drive=poses_by_id(recording, poses))
         whole.save(command.out)
         new = len(whole) - (0 if before is None else len(before))
         left_out = f", {len(skipped)} scans skipped" if skipped else ""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from sglpr_jax.cli.runtime import console, parse_command, run
@@ -69,11 +70,13 @@ def _as_json(found: "Relocated") -> dict:
 
 
 def _table(scan: Path, found: "list[Relocated]") -> Table:
-    table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=f"{scan.name} in the map")
+    title = escape(f"{scan.name} in the map")  # rich takes what stands in brackets for a style
+    table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title)
     for one in found:
         pose = one.world_from_query
         yaw = math.degrees(math.atan2(pose[1, 0], pose[0, 0]))
-        table.add_row(one.place, f"{one.probability:.4f}", *(f"{value:.2f}" for value in pose[:3, 3]), f"{yaw:.1f}")
+        place = escape(one.place)
+        table.add_row(place, f"{one.probability:.4f}", *(f"{value:.2f}" for value in pose[:3, 3]), f"{yaw:.1f}")
     return table
 
 

@@ -29,7 +29,7 @@ class ConsistencyConfig:
     support: int = 2
     """So many of these, itself among them, have to show the same place."""
     frames_a_frame: float = 3.0
-    """Without odometry: from one frame to the next the match moves on by so many frames, or fewer."""
+    """Without odometry: where queries are k frames apart, matches are apart by so many frames times k + 1, or fewer."""
     position_m: float = 0.5
     yaw_deg: float = 1.5
     """Standard deviations of the circle of two loops at one place, beside their covariances."""

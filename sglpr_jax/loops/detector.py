@@ -27,12 +27,18 @@ class DetectorConfig:
     min_probability: float = MIN_PROBABILITY
     """Of a loop that is returned."""
     min_neighbour_probability: float = 0.5
-    """Of those beside it that speak for it."""
+    """Of those beside it that speak for it; `min_probability` where that is less."""
     near_m: float = 200.0
     """With odometry, a loop has to agree with most of those that lie within so many metres of way."""
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
+
+    def __post_init__(self):
+        """Raise ValueError for a probability that is none."""
+        for name in ("min_probability", "min_neighbour_probability"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"expected {name} from 0 to 1, found {getattr(self, name)}")
 
 
 class LoopDetector:
@@ -97,7 +103,7 @@ class LoopDetector:
         if candidates:
             probabilities = self.model.probability(Evidence.stack([one.evidence for one in candidates]))
             best = int(np.argmax(probabilities))
-            if probabilities[best] >= self.config.min_neighbour_probability:
+            if probabilities[best] >= min(self.config.min_neighbour_probability, self.config.min_probability):
                 self._waiting.append(self._loop(candidates[best], float(probabilities[best])))
         first = len(self) - self.config.consistency.neighbours
         self._waiting = [loop for loop in self._waiting if loop.query >= first]

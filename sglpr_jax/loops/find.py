@@ -43,11 +43,19 @@ class FoundLoops:
     """All pairs that were looked at, loops or not."""
     model: LoopModel | None = None
     """What said how probable they are."""
+    unregistered: int = 0
+    """So many of the loops were to be registered and are not: none, unless it was stopped."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether all was done: not where it was stopped."""
+        return self.frames == len(self.recording) and not self.unregistered
 
     def __str__(self) -> str:
         found = f"{len(self.loops)} loops in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
         skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
-        return f"{found}, {len(self.refused)} refused afterwards{skipped}"
+        left = f", {self.unregistered} not registered" if self.unregistered else ""
+        return f"{found}, {len(self.refused)} refused afterwards{left}{skipped}"
 
 
 def find_loops(
@@ -73,9 +81,10 @@ def find_loops(
     A scan that cannot be read raises its error or, given `on_bad_scan(id, error)`, is left out; frames keep their
     numbers. Scans that show next to nothing have no loops. With `kept_in`, a folder, what was seen of the scans is kept
     there, and a run that was killed goes on from it, if the recording, the odometry, the weights and the settings are
-    the same; the folder stays. Ends early, with what was found, when `should_stop` says so. `on_progress` is told how
-    many scans are done. Raises ValueError for odometry of another length and where no scan can be read or shows
-    something, ImportError without the extra, and what reading the scans raises.
+    the same; the folder stays. Ends early, with what was found, when `should_stop` says so: loops that are not
+    registered then are in the plane, without an overlap. `on_progress` is told how many scans are done. Raises
+    ValueError for odometry of another length and where no scan can be read or shows something, ImportError without the
+    extra, and what reading the scans raises.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
@@ -110,8 +119,11 @@ def find_loops(
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
     if all(detector.finder.empty) and len(detector) == len(recording):
         raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
-    loops, refused = settled(recording, detector.loops, odometry, config, registered=registered)
-    seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model}
+    loops, refused = settled(
+        recording, detector.loops, odometry, config, registered=registered, should_stop=should_stop
+    )
+    left = sum(loop.overlap is None for loop in loops) if registered else 0
+    seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model, "unregistered": left}
     return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
 
 
@@ -144,11 +156,15 @@ def settled(
     config: DetectorConfig,
     *,
     registered: bool,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[Loop], list[Loop]]:
-    """The loops of a whole drive that agree and, where they are registered, overlap; and those that do not."""
+    """The loops of a whole drive that agree and, where they are registered, overlap; and those that do not.
+
+    Those that are not registered when `should_stop` says so are taken as they are.
+    """
     kept, refused = _agreeing(loops, odometry, recording.mounting, config)
     if registered:
-        kept, others = _registered(recording, kept)
+        kept, others = _registered(recording, kept, should_stop)
         refused = refused + others
     return kept, refused
 
@@ -169,10 +185,14 @@ def _agreeing(
     ]
 
 
-def _registered(recording: Recording, loops: list[Loop]) -> tuple[list[Loop], list[Loop]]:
-    """Loops with poses from full scans, and those whose scans do not overlap."""
+def _registered(
+    recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
+) -> tuple[list[Loop], list[Loop]]:
+    """Loops with poses from full scans, and those whose scans do not overlap; after a stop the others as they are."""
     kept, refused = [], []
-    for loop in loops:
+    for i, loop in enumerate(loops):
+        if should_stop():
+            return [*kept, *loops[i:]], refused
         found = register(recording.points(loop.query), recording.points(loop.match), initial=loop.match_from_query)
         values = {"match_from_query": found.match_from_query, "covariance": found.covariance, "overlap": found.overlap}
         (kept if found.overlap >= MIN_OVERLAP else refused).append(dataclasses.replace(loop, **values))

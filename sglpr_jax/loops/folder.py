@@ -9,6 +9,7 @@ from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
 
 GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
+TRAJECTORIES = ("trajectory.tum", "trajectory.kitti", "trajectory-optimized.tum", "trajectory-optimized.kitti")
 
 
 def write_found(
@@ -18,7 +19,8 @@ def write_found(
 
     The trajectory is the odometry as it was given, of the frames that were looked at; `optimized` is the corrected one,
     in files beside it. Their times are the recording's, or the numbers of the frames. Poses are those of the LiDAR.
-    Returns the paths written. Raises WriteError where one cannot be written.
+    Trajectories of an earlier run that this one does not have are removed. Returns the paths written. Raises WriteError
+    where one cannot be written.
     """
     folder = Path(folder)
     odometry = None if found.odometry is None else found.odometry[: found.frames]
@@ -33,4 +35,6 @@ def write_found(
             write_tum(folder / f"{stem}.tum", poses, clock)
             write_kitti(folder / f"{stem}.kitti", poses)
             names += [f"{stem}.tum", f"{stem}.kitti"]
+    for name in set(TRAJECTORIES) - set(names):
+        (folder / name).unlink(missing_ok=True)
     return [folder / name for name in names]

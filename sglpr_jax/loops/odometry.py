@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.formats.pose_files import columns_of
 from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
@@ -44,11 +45,17 @@ def at_scans(
 
     Poses go with the scans row by row. A tum file of another length is interpolated at the times of the scans; those
     more than 1 s between two poses, or before the first and after the last, are left out, which is told. Raises
-    ValueError where these are most.
+    ValueError where these are most, and where the length is another one and nothing tells the times.
     """
-    tum = (_format_of(path) if format == "auto" else format) == "tum"
-    if len(odometry) == len(recording) or recording.times is None or not tum:
+    if len(odometry) == len(recording):
         return recording, odometry
+    tum = (_format_of(path) if format == "auto" else format) == "tum"
+    if recording.times is None or not tum:
+        why = "the scans have no times" if tum else "the file has no times"
+        raise ValueError(
+            f"{path}: expected {len(recording)} poses, one for each scan of {recording.name}, found {len(odometry)}, "
+            f"and {why} to interpolate at"
+        )
     stamps, times = read_tum(path)[1], recording.times
     kept, positions = interpolate(stamps, odometry[:, :3, 3], times)
     if kept.mean() < LEAST_SHARE:
@@ -91,8 +98,7 @@ def _format_of(path: Path) -> OdometryFormat:
         raise FileNotFoundError(f"{path}: expected odometry, found no file")
     if path.suffix == ".g2o":
         return "g2o"
-    lines = (line.split() for line in path.read_text(errors="replace").splitlines() if not line.startswith("#"))
-    columns = len(next(lines, []))
+    columns = columns_of(path)
     if columns == 8:
         return "tum"
     found = "an empty file" if not columns else f"{columns} numbers a line"

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +27,8 @@ from sglpr_jax.retrieval.index import Index
 
 ARRAYS = ("images", "world_from_place", "mountings")
 """What a map's file holds beside the index."""
+Content = tuple[bytes | None, bytes]
+"""What tells a place from every other one: descriptor (None: not known yet) and pose."""
 
 
 class Relocated(NamedTuple):
@@ -87,18 +89,19 @@ class PlaceMap:
         height, *up = self.mountings[row].tolist()
         return Mounting(height, tuple(up))
 
-    def merged(self, other: "PlaceMap") -> "PlaceMap":
+    def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
         """The places of both, in one world frame; those of `other` that are here already are taken once.
 
-        Where its ids are taken by other places, its recordings are called ~2, ~3 and so on. Raises ValueError where
-        other weights or images made them.
+        Where its ids are taken by other places, its recordings are called ~2, ~3 and so on. Of a map that is not whole
+        yet `drive` has the poses of all scans (`poses_by_id`): its places are called as they will be in the whole one.
+        Raises ValueError where other weights or images made them.
         """
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
         known = set(self._contents())
         new = [row for row, content in enumerate(other._contents()) if content not in known]
         index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
-        new_ids = _not_taken([other.index.ids[row] for row in new], set(self.index.ids))
+        new_ids = self._names_of(other, new, drive or {})
         for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
             places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
             index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
@@ -150,6 +153,20 @@ class PlaceMap:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
         return cls(index, *(more[name] for name in ARRAYS))
 
+    def _names_of(self, other: "PlaceMap", new: list[int], drive: Mapping[str, Float[np.ndarray, "4 4"]]) -> list[str]:
+        """The ids, `recording/scan`, of new places here, with a number after the recording where one is taken.
+
+        What is new depends on how far a drive was mapped; so all of its scans are asked, and places of it that are here
+        already have their own ids.
+        """
+        names = [other.index.ids[row] for row in new]
+        scans: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in drive.items()}
+        scans |= zip(other.index.ids, other._contents(), strict=True)
+        recordings = {_recording_of(name) for name in names}
+        coming = {name: content for name, content in scans.items() if _recording_of(name) in recordings}
+        mark = _free_mark(dict(zip(self.index.ids, self._contents(), strict=True)), coming)
+        return [_marked(name, mark) for name in names]
+
     def _contents(self) -> Iterator[tuple[bytes, bytes]]:
         """What tells each place from every other one."""
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
@@ -161,12 +178,35 @@ class PlaceMap:
         return distance if np.isfinite(distance) else np.nan
 
 
-def _not_taken(ids: list[str], taken: set[str]) -> list[str]:
-    """The ids, `recording/scan`, with a number after the recording where one of them is taken."""
-    parts = [name.rpartition("/") for name in ids]
+def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """The pose of each scan by the id that its place has, or would have."""
+    return dict(zip(_place_ids(recording), np.asarray(poses, np.float64), strict=True))
+
+
+def _place_ids(recording: Recording) -> list[str]:
+    return [f"{recording.name}/{scan}" for scan in recording.ids]
+
+
+def _recording_of(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _marked(name: str, mark: str) -> str:
+    recording, slash, scan = name.rpartition("/")
+    return f"{recording}{mark}{slash}{scan}"
+
+
+def _free_mark(taken: Mapping[str, Content], coming: Mapping[str, Content]) -> str:
+    """The first of "", ~2, ~3, ... with which none of the coming places has the id of another one."""
+
+    def is_taken(name: str, content: Content) -> bool:
+        there = taken.get(name, content)
+        return there[1] != content[1] or content[0] not in (None, there[0])
+
     marks = itertools.chain([""], (f"~{number}" for number in itertools.count(2)))
-    marked = ([f"{recording}{mark}{slash}{scan}" for recording, slash, scan in parts] for mark in marks)
-    return next(names for names in marked if taken.isdisjoint(names))
+    return next(
+        mark for mark in marks if not any(is_taken(_marked(name, mark), content) for name, content in coming.items())
+    )
 
 
 class Mapped(NamedTuple):
@@ -197,7 +237,7 @@ def map_recording(
     ValueError for poses of another length, and for a recording without scans that show something.
     """
     if len(poses) != len(recording) or not len(recording):
-        raise ValueError(f"expected a pose for each of {len(recording)} scans of a recording, found {len(poses)}")
+        raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
     poses = np.asarray(poses, np.float64)
     finder = CandidateFinder(params)
     kept = None if kept_in is None else _recalled(Path(kept_in), finder, recording, poses, spacing_m, on_bad_scan)
@@ -254,7 +294,8 @@ def _places(
 ) -> PlaceMap:
     """The map of some `rows` of a recording, which are these `frames` of the finder."""
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
-    ids = [f"{recording.name}/{recording.ids[row]}" for row in rows]
+    names = _place_ids(recording)
+    ids = [names[row] for row in rows]
     index.add(finder.index.descriptors[frames], ids=ids, positions=poses[rows, :3, 3])
     images = [finder.images[frame] for frame in frames]
     sensor = recording.mounting or Mounting(MODEL_HEIGHT_M)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,11 +74,13 @@ class LoopModel:
         """Raises ValueError, naming the `source`, for anything but what `to_json` gave."""
         try:
             model = cls(**value)
-            numbers = [model.bias, *(model.weights[name] for name in model.means), *model.scales.values()]
+            columns = (model.weights, model.means, model.scales)
+            numbers = [model.bias, *(number for column in columns for number in column.values())]
             fits = set(model.weights) == set(model.means) == set(model.scales) <= set(ALL)
-        except (TypeError, KeyError, AttributeError):
-            numbers, fits = [], False
-        if not fits or not np.isfinite(numbers).all():
+            fits = fits and all(math.isfinite(number) for number in numbers)
+        except (TypeError, KeyError, AttributeError, OverflowError):
+            fits = False
+        if not fits:
             raise ValueError(f"{source}: expected a model of loops ({', '.join(ALL)}), found another value")
         return model
 

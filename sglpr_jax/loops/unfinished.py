@@ -2,13 +2,14 @@
 
 All that takes time is kept: descriptors, images, and how those of the candidates lie to each other. A file holds some
 frames, is called by the first of them, and is written whole or not at all; the frames after the last file are looked at
-again. What was seen with other settings is thrown away.
+again. What was seen with other settings is thrown away; a folder that is somebody else's is refused.
 """
 
 import contextlib
 import dataclasses
 import hashlib
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,19 @@ import numpy as np
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
-from sglpr_jax.files import alone_in, read_json, remove_half_written, replacing, write_json, writing
+from sglpr_jax.files import alone_in, read_json, replacing, write_json, writing
 from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Seen
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import fingerprint
 
-FORMAT = "sglpr-jax unfinished loops 1"
+KIND = "sglpr-jax unfinished loops"
+FORMAT = f"{KIND} 1"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
+OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
+"""The names of files of frames, and of what `files.replacing` leaves half-written."""
 ALIGNMENT_NUMBERS = 14
 """x, y, yaw, nine of the covariance, correlation, second."""
 FRAMES = 50
@@ -63,17 +67,15 @@ class Unfinished:
 
     @classmethod
     def opened(cls, folder: Path, wanted: dict[str, Any]) -> "Unfinished":
-        """The folder, emptied where other settings filled it, which is told. Raises WriteError."""
-        path = folder / SETTINGS
-        if folder.is_dir() and any(folder.iterdir()):
-            try:
-                other = [name for name, value in wanted.items() if read_json(path).get(name) != value]
-            except (ValueError, OSError, AttributeError):
-                other = ["format"]
-            if other:
-                warn(f"{folder}: expected what a run with the same settings has kept, found another {', '.join(other)}")
-                _empty(folder)
-        write_json(path, wanted)
+        """The folder, emptied where other settings filled it, which is told.
+
+        Raises FileExistsError where no such run has filled it and anything else is in it, WriteError where it cannot be
+        written.
+        """
+        if other := _other_settings(folder, wanted):
+            warn(f"{folder}: expected what a run with the same settings has kept, found another {', '.join(other)}")
+            _empty(folder)
+        write_json(folder / SETTINGS, wanted)
         return cls(folder)
 
     def recall(
@@ -149,11 +151,40 @@ def remove(folder: Path) -> None:
         folder.rmdir()
 
 
+def _other_settings(folder: Path, wanted: dict[str, Any]) -> list[str]:
+    """Those that a folder was not filled with; "format" where it says none. Errors are those of `opened`."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return []
+    try:
+        found = read_json(folder / SETTINGS)
+        ours = found["format"].startswith(KIND)
+    except (ValueError, OSError, LookupError, TypeError, AttributeError):
+        ours = False
+    if ours:
+        return [name for name, value in wanted.items() if found.get(name) != value]
+    _check_own(folder)
+    return ["format"]
+
+
+def _check_own(folder: Path) -> None:
+    """Raise FileExistsError where a folder holds anything but what a kill leaves there before the settings."""
+    others = sorted(path.name for path in folder.iterdir() if not _is_own(path))
+    if others:
+        raise FileExistsError(
+            f"{folder}: expected a new folder, an empty one or that of an unfinished run, found {others[0]}"
+            f"{' and more' if len(others) > 1 else ''}"
+        )
+
+
 def _empty(folder: Path) -> None:
     (folder / SETTINGS).unlink(missing_ok=True)  # first, so that what a kill here leaves is of no settings
-    for path in folder.glob(f"[0-9]*{ENDING}"):
-        path.unlink()
-    remove_half_written(folder)
+    for path in folder.glob("*"):
+        if _is_own(path):
+            path.unlink()
+
+
+def _is_own(path: Path) -> bool:
+    return OWN.fullmatch(path.name) is not None and path.is_file()
 
 
 def _columns(candidates: list[Candidate]) -> dict[str, np.ndarray]:

@@ -115,12 +115,13 @@ class FleetIndex:
     ) -> Found:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d) as `Index.query` does.
 
-        Few runs of places to `exclude`, as those of `recent`, cost little; thousands of runs are slow.
+        Fewer flags to `exclude` than there are places are those of the first ones: places that another process has
+        added since are not left out. Few runs of flags, as those of `recent`, cost little; thousands are slow.
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
         if exclude is not None or k < 1:
-            check_asked(k, exclude, places=len(self))
+            check_asked(k, exclude, places=len(self) if exclude is None else min(len(self), exclude.size))
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         where = "" if exclude is None else _without(exclude)

@@ -47,13 +47,26 @@ def embed_or_reuse(
 
 
 def fingerprint(recording: Recording) -> str:
-    """Name what a recording holds without reading its scans: ids, sizes of files, how they are read, positions."""
-    sizes = [path.stat().st_size for path in recording.paths if path.is_file()]
+    """Name what a recording holds without reading its scans: ids, files, how they are read, positions and times.
+
+    Of the files of scans and labels the size counts, and when they were last changed. Scans that are no files, as those
+    of a bag, are told by the rest.
+    """
+    scans, labels = ([_state(path) for path in paths] for paths in (recording.paths, recording.label_paths))
     mounting = None if recording.mounting is None else dataclasses.asdict(recording.mounting)
-    digest = hashlib.sha256(json.dumps([recording.ids, sizes, recording.read_options, mounting]).encode())
-    if recording.positions is not None:
-        digest.update(recording.positions.tobytes())
+    digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
+    for values in (recording.positions, recording.times):
+        if values is not None:
+            digest.update(values.tobytes())
     return digest.hexdigest()[:16]
+
+
+def _state(path: Path | None) -> tuple[int, int] | None:
+    """Size and last change of a file; None where there is none."""
+    if path is None or not path.is_file():
+        return None
+    found = path.stat()
+    return found.st_size, found.st_mtime_ns
 
 
 def _settings(method: Method, recording: Recording, corruption: Corruption, seed: int) -> dict[str, Any]:

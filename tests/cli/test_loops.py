@@ -77,6 +77,20 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
     assert "the same command goes on from here" in ended.error
 
 
+@pytest.mark.parametrize(("unregistered", "status"), [(0, 0), (2, 130)])
+def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
+    command, town, tmp_path, monkeypatch, unregistered, status
+):
+    def ended_meanwhile(recording, params, *, should_stop, **options):
+        should_stop.signal = 2
+        return find.FoundLoops(recording, len(recording), (), (), None, unregistered=unregistered)
+
+    monkeypatch.setattr(find, "find_loops", ended_meanwhile)
+    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
+    assert ended.status == status, ended.error
+    assert ("the same command goes on from here" in ended.error) == bool(status)
+
+
 @pytest.mark.slow
 def test_bad_scans_are_told_and_skipped(command, town, tmp_path):
     folder = tmp_path / "town"
@@ -108,6 +122,10 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     )
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry")
     assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
+    write_kitti(tmp_path / "short.txt", odometry[:7])
+    ended = command(*run, tmp_path / "short.txt", "--odometry-format", "kitti")
+    assert_one_line_error(ended, "short.txt: expected 40 poses, one for each scan of 08, found 7")
+    assert_one_line_error(command(*run, short, "--min-probability", "nan"), "min_probability from 0 to 1, found nan")
     assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line and their axes named, kitti")
     assert_one_line_error(command(*run, flat, "--odometry-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
@@ -128,6 +146,14 @@ def test_two_processes_do_not_search_into_one_folder(command, town, tmp_path):
         ended = command("loops", town, "--seq", "08", "--out", out)
     assert_one_line_error(ended, "unfinished: expected to be alone in it, found another process at work")
     assert not out.exists()
+
+
+def test_odometry_that_the_run_would_write_or_remove_is_refused(command, town, odometry, tmp_path):
+    path = tmp_path / "found" / "trajectory-optimized.tum"
+    write_tum(path, odometry, np.arange(float(SCANS)))
+    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry", path)
+    assert_one_line_error(ended, "trajectory-optimized.tum: expected odometry that stays")
+    assert path.exists()
 
 
 def test_images_cannot_be_registered(command, images, tmp_path):

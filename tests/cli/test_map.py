@@ -5,12 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import sglpr_jax
+from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops import places
 from sglpr_jax.loops.graph_files import write_tum
-from sglpr_jax.loops.places import PlaceMap, map_recording
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.places import PlaceMap, Relocated, map_recording
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.index import Index
@@ -109,6 +112,33 @@ def test_ctrl_c_keeps_what_was_found_and_the_same_command_goes_on(command, town,
     assert not out.with_suffix(".unfinished").exists()
 
 
+@pytest.mark.slow
+def test_a_stopped_map_of_a_name_that_is_taken_ends_as_if_not_stopped(command, town, poses, tmp_path, monkeypatch):
+    def stopped(recording, params, given, *, should_stop, on_progress, **options):
+        def show(done):
+            on_progress(done)
+            should_stop.signal = 2 if done == 10 else should_stop.signal
+
+        return map_recording(recording, params, given, **options, should_stop=should_stop, on_progress=show)
+
+    values = np.loadtxt(poses)
+    values[:, 1] += 5
+    np.savetxt(tmp_path / "moved.tum", values)
+    before, whole, out = (tmp_path / f"{name}.safetensors" for name in ("before", "whole", "out"))
+    run = ("map", town, "--seq", "08", "--out")
+    assert command(*run, before, "--poses", tmp_path / "moved.tum", "--spacing-m", "1e6").status == 0
+    run = (*run[:-1], "--poses", poses, "--spacing-m", "0")
+    assert command(*run, "--add-to", before, "--out", whole).status == 0
+    shutil.copy(before, out)
+    with monkeypatch.context() as patch:
+        patch.setattr(places, "map_recording", stopped)
+        assert command(*run, "--add-to", out, "--out", out).status == 130
+    assert command(*run, "--add-to", out, "--out", out).status == 0
+    assert out.read_bytes() == whole.read_bytes()
+    names = PlaceMap.load(out).index.ids
+    assert names[0] == "08/000000" and names[1:] == [f"08~2/{scan:06d}" for scan in range(40)]
+
+
 def test_two_processes_do_not_make_one_map(command, town, poses, tmp_path):
     out = tmp_path / "town.safetensors"
     with alone(out.with_suffix(".unfinished")):
@@ -133,6 +163,14 @@ def places_file(tmp_path):
     mountings = np.array([[1.73, 0, 0, 1.0]])
     PlaceMap(index, np.zeros((1, 152, 152), np.uint8), np.eye(4)[None], mountings).save(tmp_path / "one.safetensors")
     return tmp_path / "one.safetensors"
+
+
+def test_brackets_in_a_name_are_no_style(capsys):
+    loop = Loop(1, 0, np.eye(4), np.eye(6), 0.9)
+    answers = [Relocated("[red]sunday/000003", np.eye(4), loop)]
+    Console(width=140).print(_table(Path("[bold]scan.bin"), answers))
+    shown = capsys.readouterr().out
+    assert "[red]sunday/000003" in shown and "[bold]scan.bin in the map" in shown
 
 
 def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command, places_file, tmp_path):

@@ -7,11 +7,12 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, labelled, square_image
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen, labelled, square_image
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.find import MIN_OVERLAP, find_loops
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.verification import Alignment
 
 NOW = CandidateConfig(exclude_frames=0)
 
@@ -124,6 +125,26 @@ def test_one_probable_frame_is_no_loop_two_in_a_row_are(drive, params, revisit):
     returned = [detector.add(drive.points(frame)) for frame in places]
     assert [len(found) for found in returned[:2]] == [0, 0]
     assert detector.loops and all(loop.probability > 0.99 for loop in detector.loops)
+
+
+def test_a_least_probability_below_that_of_neighbours_is_theirs_too(params):
+    third = LoopModel({"distance": 0.0}, {"distance": 0.0}, {"distance": 1.0}, float(np.log(0.5)), "1 of 3")
+    alignment = Alignment(*np.zeros(3), np.eye(3), 0.8, 0.3)
+    for least, there in ((0.2, 2), (0.4, 0)):
+        config = DetectorConfig(min_probability=least, candidates=NOW)
+        detector = LoopDetector(params, model=third, config=config)
+        seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
+        for query in range(4):
+            pair = Candidate(query, query - 2, alignment, Evidence.of(1.0, 0.0, 0.8, 0.3))
+            detector.add_seen(seen, candidates=[pair] if query >= 2 else [])
+        assert len(detector.loops) == there
+
+
+@pytest.mark.parametrize("name", ["min_probability", "min_neighbour_probability"])
+@pytest.mark.parametrize("value", [-0.1, 1.01, np.nan])
+def test_what_is_no_probability_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"expected {name} from 0 to 1, found {value}"):
+        DetectorConfig(**{name: value})
 
 
 def test_scans_without_points_or_with_one_close_no_loops(params):

@@ -1,5 +1,7 @@
 """The folder of what was found holds what each program reads, of the frames that were looked at."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from recordings import of_images
@@ -32,6 +34,15 @@ def test_all_files_are_of_the_frames_looked_at(found, tmp_path):
     assert (
         len(read_loops_jsonl(tmp_path / "out" / "loops.jsonl")) == 1 == len(read_loops_csv(tmp_path / "out/loops.csv"))
     )
+
+
+def test_trajectories_of_an_earlier_run_do_not_stay_beside_other_loops(found, tmp_path):
+    out = tmp_path / "out"
+    assert len(write_found(found, out, optimized=found.odometry[:5])) == 7
+    (out / "mine.tum").write_text("stays")
+    for fewer, left in ((found, 6), (dataclasses.replace(found, odometry=None), 4)):
+        names = {path.name for path in write_found(fewer, out)}
+        assert {path.name for path in out.iterdir()} == names | {"mine.tum"} and len(names) == left - 1
 
 
 def test_a_file_that_cannot_be_written_is_named(found, tmp_path):

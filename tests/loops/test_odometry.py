@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
+from sglpr_jax.data.readable import only
 from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_tum
 from sglpr_jax.loops.odometry import at_scans, read_odometry
 from sglpr_jax.loops.transforms import transform
@@ -48,13 +49,22 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
         ValueError, match=r"odometry\.tum: expected odometry of 6 poses.* 2\.5 to 9\.0 s, found 5 of 0\.0 to"
     ):
         at_scans(late, poses, path, format="tum")
-    write_kitti(tmp_path / "kitti.txt", poses)
-    for same, name, format in (
-        (recording, "kitti.txt", "kitti"),
-        (dataclasses.replace(recording, times=None), "odometry.tum", "tum"),
-    ):
-        unchanged = at_scans(same, poses, tmp_path / name, format=format)
+    for same in (only(recording, range(5)), dataclasses.replace(only(recording, range(5)), times=None)):
+        unchanged = at_scans(same, poses, path, format="auto")
         assert unchanged[0] is same and unchanged[1] is poses
+
+
+@pytest.mark.parametrize(
+    ("name", "format", "times", "why"),
+    [("kitti.txt", "kitti", np.arange(6.0), "the file"), ("odometry.tum", "auto", None, "the scans")],
+)
+def test_as_many_other_poses_without_times_name_their_file_and_the_recording(tmp_path, poses, name, format, times, why):
+    write_kitti(tmp_path / "kitti.txt", poses)
+    write_tum(tmp_path / "odometry.tum", poses, np.arange(5.0))
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(6)}, times=times)
+    message = f"{name}: expected 6 poses, one for each scan of 08, found 5, and {why} ha.* no times to interpolate at"
+    with pytest.raises(ValueError, match=message):
+        at_scans(recording, poses, tmp_path / name, format=format)
 
 
 @pytest.mark.parametrize(
@@ -62,6 +72,7 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
     [
         ("", "auto", "found an empty file"),
         ("1 2 3\n", "auto", "found 3 numbers a line"),
+        ("\n0 0 0 0 0 0 0 1\n", "auto", "line 1: expected 8 numbers, found 0"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", "auto", "12 numbers a line and their axes named, kitti"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n", "lidar", "expected a rotation and a translation in row 1"),
         ("", "kitti", "expected at least one pose, found none"),

@@ -1,6 +1,7 @@
 """A map is kept, merged and asked; scans that it has not seen find themselves."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import unfinished
 from sglpr_jax.loops.places import PlaceMap, map_recording
 from sglpr_jax.loops.transforms import inverse, yaw_of
+from sglpr_jax.retrieval.index import Index
 
 MAPPED = 60
 
@@ -97,6 +99,32 @@ def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, fir
     assert three.merged(moved).index.ids == three.index.ids
 
 
+def synthetic(scans: Sequence[int], *, drive: int) -> PlaceMap:
+    """Places of scans of one of several drives, all called 08."""
+    poses = np.tile(np.eye(4), (len(scans), 1, 1))
+    poses[:, 0, 3], poses[:, 1, 3] = scans, drive
+    index = Index.empty(2)
+    index.add(poses[:, :2, 3], ids=[f"08/{scan}" for scan in scans], positions=poses[:, :3, 3])
+    return PlaceMap(index, np.zeros((len(scans), 2, 2), np.uint8), poses, np.ones((len(scans), 4)))
+
+
+@pytest.mark.parametrize(
+    ("here", "own", "mark"),
+    [([0], [], "~2"), ([9], [], "~2"), ([9], [4], "~2"), ([20], [], ""), ([], [3, 8], ""), ([20], [8, 9], "")],
+)
+def test_places_of_a_drive_are_called_the_same_wherever_it_was_stopped(here, own, mark):
+    """`here` are scans of another drive of this name, `own` those of the same drive, in the map before."""
+    before, whole = synthetic(here, drive=1).merged(synthetic(own, drive=2)), synthetic(range(10), drive=2)
+    drive = dict(zip(whole.index.ids, whole.world_from_place, strict=True))
+    expected = before.merged(whole, drive=drive)
+    new = [scan for scan in range(10) if scan not in own]
+    assert expected.index.ids[len(before) :] == [f"08{mark}/{scan}" for scan in new]
+    for stop in range(1, 10):
+        resumed = before.merged(synthetic(range(stop), drive=2), drive=drive).merged(whole, drive=drive)
+        assert resumed.index.to_bytes() == expected.index.to_bytes()
+        np.testing.assert_array_equal(resumed.world_from_place, expected.world_from_place)
+
+
 @pytest.mark.slow
 def test_a_map_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(first, places, params, tmp_path, monkeypatch):
     monkeypatch.setattr(unfinished, "FRAMES", 5)
@@ -155,7 +183,7 @@ def test_scans_that_cannot_be_read_are_left_out_of_a_map(first, places, params, 
 def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(first, places, params, tmp_path):
     recording, poses = first
     assert len(PlaceMap.of(recording, params, np.tile(poses[:1], (len(poses), 1, 1)))) == 1
-    with pytest.raises(ValueError, match="expected a pose for each of 30 scans of a recording, found 3"):
+    with pytest.raises(ValueError, match="08: expected a pose for each of 30 scans, found 3"):
         PlaceMap.of(recording, params, poses[:3])
     assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
     empty = with_points(recording, lambda path: np.full((1, 3), 5, np.float32))

@@ -100,7 +100,10 @@ def test_models_go_to_a_file_and_back(tmp_path):
     path = tmp_path / "models.json"
     path.write_text(json.dumps({"": model.to_json()}))
     assert models(path) == {"": model}
-    for wrong in ('{"": {"bias": 1}}', "[]", "no", '{"": 3}', json.dumps({"": {**model.to_json(), "bias": "x"}})):
+    values = model.to_json()
+    not_finite = [{**values, name: {**values[name], "margin": np.nan}} for name in ("weights", "means", "scales")]
+    others = [json.dumps({"": value}) for value in ({**values, "bias": "x"}, {**values, "bias": np.inf}, *not_finite)]
+    for wrong in ('{"": {"bias": 1}}', "[]", "no", '{"": 3}', *others):
         path.write_text(wrong)
         with pytest.raises(ValueError, match=r"models\.json: expected"):
             models(path)

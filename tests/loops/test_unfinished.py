@@ -1,6 +1,7 @@
 """A search that was stopped anywhere goes on and ends like one that was not; scans that cannot be read are left out."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ from recordings import with_points
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import unfinished
+from sglpr_jax.loops import find, unfinished
 from sglpr_jax.loops.candidates import CandidateConfig
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.folder import write_found
+from sglpr_jax.loops.registration import Registration
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
@@ -76,7 +78,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
         assert done[0] == (reached[-2] if len(reached) > 1 else 1)
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
-    (tmp_path / "kept" / ".000024.safetensors.1.tmp").write_bytes(b"half")
+    (tmp_path / "kept" / f".000024.safetensors.{32 * 'a'}.tmp").write_bytes(b"half")
     unfinished.remove(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
 
@@ -104,10 +106,7 @@ def test_what_is_damaged_is_seen_again_and_what_others_made_is_thrown_away(twice
         else:
             find_loops(recording, params, **change, **options, on_progress=done.append)
         assert done[0] == (1 if words else 24)
-    (kept / "settings.json").write_text("[]")
-    with pytest.warns(DataWarning, match="found another format"):
-        find_loops(recording, params, **options, should_stop=lambda: True)
-    assert sorted(path.name for path in kept.iterdir()) == ["mine.txt", "settings.json"]
+    assert (kept / "mine.txt").exists()
 
 
 @pytest.mark.slow
@@ -147,6 +146,62 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     ):
         with pytest.raises(ValueError, match=words):
             find_loops(with_points(recording, lambda path, cloud=cloud: cloud), params, config=CONFIG)
+
+
+@pytest.mark.parametrize("name", ["mine.txt", "2024.safetensors", ".mine.tmp", "settings.json", "000001.safetensors/a"])
+def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path, name):
+    folder = tmp_path / "kept"
+    for path in (folder / "000000.safetensors", folder / name):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(FileExistsError, match=rf"kept: expected a new folder.* found {Path(name).parts[0]}$"):
+        unfinished.Unfinished.opened(folder, {"format": unfinished.FORMAT})
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_of_a_run_with_other_settings_its_own_files_are_removed_and_no_others(tmp_path):
+    wanted = {"format": unfinished.FORMAT, "weights": "a"}
+    unfinished.Unfinished.opened(tmp_path, wanted)
+    own = ("000050.safetensors", "1000000.safetensors", f".settings.json.{32 * '0'}.tmp")
+    others = ("2024.safetensors", "000050.safetensors.bak", ".mine.tmp")
+    for name in (*own, *others):
+        (tmp_path / name).write_text("")
+    with pytest.warns(DataWarning, match="found another weights"):
+        unfinished.Unfinished.opened(tmp_path, {**wanted, "weights": "b"})
+    assert {path.name for path in tmp_path.iterdir()} == {*others, "settings.json"}
+    unfinished.remove(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(others)
+
+
+def test_what_a_kill_leaves_without_settings_is_thrown_away(tmp_path):
+    (tmp_path / "000050.safetensors").write_text("")
+    with pytest.warns(DataWarning, match="found another format"):
+        unfinished.Unfinished.opened(tmp_path, {"format": unfinished.FORMAT})
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+
+
+@pytest.mark.slow
+def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, monkeypatch):
+    recording, odometry = twice
+    done, asked = [], []
+
+    def registered(query, match, *, initial):
+        done.append(None)
+        return Registration(initial, np.eye(6), 0.9)
+
+    monkeypatch.setattr(find, "register", registered)
+    monkeypatch.setattr(find, "check_installed", lambda: None)
+    options = {"odometry": odometry, "config": CONFIG, "registered": True, "kept_in": tmp_path / "kept"}
+    stopped = find_loops(recording, params, **options, should_stop=lambda: len(done) >= 2)
+    overlaps = [loop.overlap for loop in stopped.loops]
+    assert overlaps == [0.9] * 2 + [None] * (len(overlaps) - 2) and len(overlaps) >= 8
+    assert stopped.frames == 24 and not stopped.whole and stopped.unregistered == len(overlaps) - 2
+    assert str(stopped).endswith(f", {len(overlaps) - 2} not registered")
+    read = with_points(recording, lambda path: asked.append(path) or recording.read(path, None, False).points)
+    found = find_loops(read, params, **options)
+    assert found.whole and all(loop.overlap == 0.9 for loop in found.loops)
+    assert len(asked) == 2 * len(found.loops)  # for their registration: no scan was looked at again
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):

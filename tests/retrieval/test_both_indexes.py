@@ -94,5 +94,5 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(new: New):
     with pytest.raises(ValueError, match="k of 1 or more"):
         index.query(draw(1), 0)
     with pytest.raises(ValueError, match="one flag for each of 5"):
-        index.query(draw(1), exclude=np.zeros(4, bool))
+        index.query(draw(1), exclude=np.zeros(6, bool))
     assert len(index) == 5

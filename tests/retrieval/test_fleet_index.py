@@ -51,6 +51,16 @@ def test_it_comes_back_from_its_folder_and_others_see_what_is_added(tmp_path):
     assert index.query(draw(1, seed=9)[0]).rows.tolist() == [30] and index.ids[-1] == "new" and len(index) == 31
 
 
+def test_places_that_another_process_adds_meanwhile_are_not_left_out(tmp_path):
+    index = filled(tmp_path, 30)
+    recent = index.recent(frames=10)
+    FleetIndex(tmp_path, width=WIDTH).add(draw(1, seed=9)[0], times=15.0, positions=np.zeros(3))
+    rows = index.query(draw(1, seed=9)[0], 31, exclude=recent).rows
+    assert rows[0] == 30 and sorted(rows[rows >= 0].tolist()) == [*range(20), 30]
+    with pytest.raises(ValueError, match="one flag for each of 31 places"):
+        index.query(draw(1), exclude=np.zeros(32, bool))
+
+
 def test_an_index_of_another_model_is_refused(tmp_path):
     filled(tmp_path, 5, weights_hash="abc")
     with pytest.raises(ValueError, match="expected descriptors of the weights abc, found those of xyz"):

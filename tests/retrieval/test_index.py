@@ -99,6 +99,11 @@ def test_an_index_of_another_model_is_refused(tmp_path):
         Index.load(tmp_path / "places.safetensors", weights_hash="xyz")
 
 
+def test_fewer_flags_than_places_are_refused():
+    with pytest.raises(ValueError, match="one flag for each of 5"):
+        index_of(5).query(draw(1), exclude=np.zeros(4, bool))
+
+
 def test_an_unknown_distance_is_refused():
     with pytest.raises(ValueError, match="expected a distance among"):
         Index.empty(WIDTH, distance="nearness")
