@@ -59,7 +59,7 @@ class Writer:
         return tuple(self.line.split())
 
 
-RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/hard-negatives/*")
+RUN_FILES = ("*/checkpoints/*", "*/environment.json", "*/metrics.jsonl", "*/learning-curves.png", "*/mining/*")
 TRAINED = f"--seq 08 --data {TOWN} --preset {TINY} --steps 8 --method solid"
 WRITERS = {
     writer.name: writer

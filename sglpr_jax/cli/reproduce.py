@@ -85,7 +85,7 @@ def reproduce(command: ReproduceCommand) -> Path:
         progress_bar,
     )
     seqs = command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(runs.data))
-    check(runs, names, seqs, command.method)
+    check(runs, names, seqs, command.method, command.nclt)
     plan = make_plan(runs, names, seqs)
     print(plan.text(time_a_step(runs, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
     if command.plan:

@@ -21,7 +21,7 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
     """The recording with the mounting that `height` asks for, and what was found in words.
 
     `known` says that the layout tells how its scans are mounted; where their ground is elsewhere, a `DataWarning` says
-    so. Where no ground is found nothing is changed.
+    so. Where the ground does not tell it nothing is changed.
     """
     if recording.has_images:
         return recording
@@ -36,15 +36,21 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
 
 def _estimated(recording: Recording) -> Recording:
     each = _of_scans(recording, SCANS)
-    mounting, seen = common_mounting(each), sum(found is not None for found in each)
+    mounting = common_mounting(each)
+    hanging = [scan.up[2] < 0 for scan in each if scan is not None]
     if mounting is None:
-        found = (
-            f"sensor: no ground found but in {seen} of {len(each)} scans, taken to be {MODEL_HEIGHT_M} m above it;"
-            " say --sensor-height"
-        )
+        found = f"sensor: {_unclear(hanging, len(each))}, taken to be {MODEL_HEIGHT_M} m above it; say --sensor-height"
     else:
-        found = f"sensor: {mounting}, estimated from the ground in {seen} of {len(each)} scans"
+        agreed = hanging.count(mounting.up[2] < 0)
+        found = f"sensor: {mounting}, estimated from the ground in {agreed} of {len(each)} scans"
     return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+
+
+def _unclear(hanging: list[bool], scans: int) -> str:
+    """Why the scans tell no mounting; `hanging` says of each that shows ground whether the sensor hangs there."""
+    if 2 * len(hanging) < scans:
+        return f"no ground found but in {len(hanging)} of {scans} scans"
+    return f"the ground is below it in {hanging.count(False)} of {scans} scans and above it in {hanging.count(True)}"
 
 
 def _check_layout(recording: Recording) -> None:

@@ -1,6 +1,7 @@
 """What can be known to be wrong with a reproduction before anything is trained for it."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from sglpr_jax.data import recording_names
 from sglpr_jax.evaluation import figures
@@ -9,9 +10,12 @@ from sglpr_jax.reproduce.experiments import EXPERIMENTS
 from sglpr_jax.reproduce.runs import Runs
 
 
-def check(runs: Runs, names: Sequence[str], seqs: Sequence[str], methods: Sequence[str]) -> None:
-    """Raise ValueError for an unknown method, recordings without poses, points or labels where they are needed, or no
-    second recording to train on; ImportError for figures without matplotlib."""
+def check(
+    runs: Runs, names: Sequence[str], seqs: Sequence[str], methods: Sequence[str], nclt: Path | None = None
+) -> None:
+    """Raise ValueError for an unknown method, recordings without poses, points or labels where they are needed, no
+    second recording to train on, or no second session in `nclt`; FileNotFoundError where no sessions are there at all;
+    ImportError for figures without matplotlib."""
     if not names:
         raise ValueError(f"expected tables or figures, found none; there are all, {', '.join(EXPERIMENTS)}")
     if not seqs:
@@ -20,6 +24,8 @@ def check(runs: Runs, names: Sequence[str], seqs: Sequence[str], methods: Sequen
     if any(EXPERIMENTS[name].kind == "figure" for name in names) and not figures.can_draw():
         raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
     _check_recordings(runs, seqs)
+    if nclt is not None and any(EXPERIMENTS[name].across_sessions for name in names):
+        _check_sessions(nclt)
     for name in names:
         _check_labels(runs, name)
         if EXPERIMENTS[name].beside_handcrafted:
@@ -35,6 +41,13 @@ def _check_recordings(runs: Runs, seqs: Sequence[str]) -> None:
     for seq in (*seqs, *recordings):
         if runs.recording(seq).positions is None:
             raise ValueError(f"{runs.data}: sequence {seq} has no poses; training and scoring need them")
+
+
+def _check_sessions(root: Path) -> None:
+    """The first session is the database, the others ask it."""
+    sessions = recording_names(root)
+    if len(sessions) < 2:
+        raise ValueError(f"{root}: expected two sessions or more, found {', '.join(sessions)}")
 
 
 def _check_labels(runs: Runs, name: str) -> None:

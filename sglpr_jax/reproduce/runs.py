@@ -22,7 +22,7 @@ from sglpr_jax.training.callbacks import Callbacks
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.progress_bar import ProgressBar
 from sglpr_jax.training.recipe import TrainResult, train
-from sglpr_jax.training.run_folder import require_same_settings
+from sglpr_jax.training.run_folder import CONFIG_FILE, require_same_settings
 
 ROTATION_SEED = 0
 BATCH = 16
@@ -34,6 +34,11 @@ WITHOUT_TRAINING = "without-training"
 def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
     """A recording, listed once: a scan that vanishes later is missed, where another list would do without it."""
     return open_recording(data, seq, pose_source=pose_source)
+
+
+def _begun(folder: Path) -> bool:
+    """Whether there is a run to go on with; a process that was killed at once may leave a folder without one."""
+    return (folder / CONFIG_FILE).is_file()
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Runs:
     def is_trained(self, variant: str, seq: str) -> bool:
         """Whether nothing is left to train of a run. Raises ValueError where it was made with other settings."""
         folder = self._folder(variant, seq)
-        if not folder.exists():
+        if not _begun(folder):
             return False
         require_same_settings(folder, self.config_of(variant), self._settings(seq))
         done = folder / DONE_FILE
@@ -74,7 +79,7 @@ class Runs:
             self.recordings_but(seq),
             out=folder,
             test=self.recording(seq),
-            resume=folder.exists(),
+            resume=_begun(folder),
             callback=Callbacks(ProgressBar(), LearningCurves(folder)),
             stopped=stopped,
             settings=self._settings(seq),

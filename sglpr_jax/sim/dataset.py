@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -47,9 +48,10 @@ def write_dataset(
     are kept, so a run that was cut off goes on where it stopped, to the same bytes; every file is whole or not there.
     `progress(name, done, scans)` is called as scans are done.
 
-    Raises ValueError for unknown names, malformed pose files, and where `root` holds another dataset or one of other
-    settings; OSError, with the file's name, where something cannot be written.
+    Raises ValueError for unknown names, a rate not above 0, a seed below 0, malformed pose files, and where `root`
+    holds another dataset or one of other settings; OSError, with the file's name, where something cannot be written.
     """
+    _require_numbers(rate_hz, seed)
     files = {**dict.fromkeys(names), **{name_of_path(file): file for file in along}}
     unknown = [name for name in names if name not in ROLES]
     if unknown or scans < 2:
@@ -87,6 +89,7 @@ def write_sessions(
     Of the arguments and the drives see `plan_sessions`, of files, progress and errors `write_dataset`. Sessions cannot
     be added: with more days the streets are others.
     """
+    _require_numbers(rate_hz, seed)
     what = {"route": route, "scans": scans, "seed": seed, "rate_hz": rate_hz}
     sessions = plan_sessions(dates, sensor=sensor, scenery=scenery, **what)
     _claim(root, {"layout": "nclt", "sessions": dates, **what, **_settings(sensor, scenery)}, {})
@@ -94,6 +97,13 @@ def write_sessions(
         show = functools.partial(progress, date) if progress else lambda done, scans: None
         _write_drive(root, date, simulate, ids=ids, layout=LAYOUTS["nclt"], progress=show)
     return root
+
+
+def _require_numbers(rate_hz: float, seed: int) -> None:
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise ValueError(f"rate_hz: expected scans per second, more than 0, found {rate_hz}")
+    if seed < 0:
+        raise ValueError(f"seed: expected a whole number, 0 or more, found {seed}")
 
 
 def _settings(sensor: Sensor, scenery: Scenery) -> dict:

@@ -3,6 +3,10 @@
 Along one ray, the ground is taken for a parabola that starts with the height and slope below the sensor, so that the
 ray meets it by a quadratic equation. The first parabola has the curvature below the sensor too, and tells about where
 the ray meets the ground; the second one passes through the true height there.
+
+That is made for the gentle hills of towns, where hits are off by at most .04 m at 30 to 40 m and .21 m at 40 to 60 m.
+In the outskirts they are off by up to .04 m up to 20 m, 6 % of them by more than .2 m at 30 to 40 m (at most .85 m),
+and 14 % by more than .2 m at 40 to 60 m. Shapes stand on the true height.
 """
 
 from typing import NamedTuple

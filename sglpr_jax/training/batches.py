@@ -57,8 +57,7 @@ class TupleBatches(BatchSource):
         main = read(self._recordings, self._pool, self._frames(step), part=own_part(self._tuples))
         if self._also_pool is None:
             return main
-        draw = self._also_pool.draw if config.also_triplets else self._also_pool.draw_places
-        second = read(self._also, self._also_pool, draw(seed=config.seed, step=step, tuples=config.also_tuples))
+        second = read(self._also, self._also_pool, self._also_frames(self._also_pool, step))
         return mix(main, second, triplets=config.also_triplets, share_negatives=config.share_negatives)
 
     def refresh(self, step: int, params: Params) -> None:
@@ -67,17 +66,19 @@ class TupleBatches(BatchSource):
             self._mining.refresh(step, params)
 
     def places(self, step: int) -> str:
-        """Name the places of a step's batch: their recordings, and the scans there."""
-        frames = np.unique(self._frames(step))
-        named = []
-        for number, recording in enumerate(self._recordings):
-            ids = [recording.ids[self._pool.frame[f]] for f in frames[self._pool.recording[frames] == number]]
-            named += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
+        """Name the places of a step's batch, of both datasets: their recordings, and the scans there."""
+        named = _named(self._recordings, self._pool, self._frames(step))
+        if self._also_pool is not None:
+            named += _named(self._also, self._also_pool, self._also_frames(self._also_pool, step))
         return "; ".join(named)
 
     def _frames(self, step: int) -> Int[np.ndarray, "t k"]:
         cache = self._mining.cache if self._mining else None
         return self._pool.draw(seed=self._config.seed, step=step, tuples=self._tuples, cache=cache)
+
+    def _also_frames(self, pool: TuplePool, step: int) -> Int[np.ndarray, "t k"]:
+        draw = pool.draw if self._config.also_triplets else pool.draw_places
+        return draw(seed=self._config.seed, step=step, tuples=self._config.also_tuples)
 
     def _read_batch(self):
         config = self._config
@@ -88,3 +89,12 @@ class TupleBatches(BatchSource):
             categories=config.model.categories,
             image=config.model.image,
         )
+
+
+def _named(recordings: Sequence[Recording], pool: TuplePool, frames: Int[np.ndarray, "t k"]) -> list[str]:
+    """In words the recordings that some frames of a pool are of, and the scans there."""
+    places, named = np.unique(frames), []
+    for number, recording in enumerate(recordings):
+        ids = [recording.ids[pool.frame[f]] for f in places[pool.recording[places] == number]]
+        named += [f"recording {recording.name} frames {' '.join(ids)}"] if ids else []
+    return named

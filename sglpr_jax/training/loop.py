@@ -84,9 +84,9 @@ def run_steps(
     return state
 
 
-def has_checkpoint(folder: Path) -> bool:
-    """Whether the run in `folder` has a whole checkpoint to go on from."""
-    return any(path.name.isdigit() for path in (folder / CHECKPOINTS).glob("*"))
+def checkpoint_steps(folder: Path) -> list[int]:
+    """The steps after which the run in `folder` has a whole checkpoint to go on from, in order."""
+    return sorted(int(path.name) for path in (folder / CHECKPOINTS).glob("*") if path.name.isdecimal())
 
 
 def best_params(folder: Path, config: TrainConfig) -> Params:
@@ -110,9 +110,10 @@ def _steps(
     """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps.
 
     `unlogged` holds the measurements of the steps since then. A stop in between yields the state and no measurements,
-    so that the lines are those of a run that was not stopped.
+    so that the lines are those of a run that was not stopped. The first measurements say nothing of time: every
+    process compiles the step anew.
     """
-    since, waited, made, stop = time.perf_counter(), 0.0, 0, False
+    since, waited, made, stop, compiled = time.perf_counter(), 0.0, 0, False, False
     while int(state.step) < config.steps and not stop:
         batches.prepare(own_copy(state.params))
         asked = time.perf_counter()
@@ -125,10 +126,11 @@ def _steps(
         _require_finite(unlogged[-1], step, source)
         if step % config.log_every == 0 or _scored(config, step):
             seconds = time.perf_counter() - since
+            times = {"steps_per_second": made / seconds, "data_wait": waited / seconds} if compiled else {}
             means = {name: float(np.mean([measured[name] for measured in unlogged])) for name in unlogged[-1]}
             unlogged.clear()
-            yield state, means | {"steps_per_second": made / seconds, "data_wait": waited / seconds}
-            since, waited, made = time.perf_counter(), 0.0, 0
+            yield state, means | times
+            since, waited, made, compiled = time.perf_counter(), 0.0, 0, True
         elif stop:
             yield state, {}
 

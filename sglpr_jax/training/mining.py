@@ -1,6 +1,6 @@
 """Hard negatives: which places look alike to the network as it is now, found out anew every so many steps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +23,18 @@ class Mining:
     goes on from a checkpoint in between reads the same numbers, so that its batches are those of a run never stopped.
     """
 
-    def __init__(self, describe: DescribeFn, places: int, config: TrainConfig, folder: Path):
-        """`places`: how many the pool has."""
+    def __init__(
+        self,
+        describe: DescribeFn,
+        places: int,
+        config: TrainConfig,
+        folder: Path,
+        *,
+        checkpoints: Callable[[], Collection[int]],
+    ):
+        """`places`: how many the pool has. `checkpoints`: the steps of the run's checkpoints that are whole."""
         self._describe, self._places, self._config, self._folder = describe, places, config, folder
+        self._checkpoints = checkpoints
         self.cache: DescriptorCache | None = None
 
     def refresh(self, step: int, params: Params) -> None:
@@ -40,7 +49,7 @@ class Mining:
             return
         self.cache = self._described(step, params)
         self.cache.save(path)
-        self._drop_before(step - 3 * self._config.score_every - every)
+        self._drop_unneeded()
 
     def _described(self, step: int, params: Params) -> DescriptorCache:
         wanted = self._config.sampling.mined_places
@@ -50,8 +59,14 @@ class Mining:
             places = np.sort(rng.choice(self._places, wanted, replace=False))
         return DescriptorCache(places, self._describe(params, places))
 
-    def _drop_before(self, step: int) -> None:
-        """Remove caches that no checkpoint can ask for: one is at most two scores old, or three where it is damaged."""
+    def _drop_unneeded(self) -> None:
+        """Remove caches that no checkpoint kept asks for, be it the best one and old.
+
+        A run that goes on from a checkpoint reads the cache of its next step and makes those after it anew. A newer
+        checkpoint than those there may be on its way to the disk: all that it can ask for stays.
+        """
+        every = self._config.sampling.refresh_steps
+        asked = {step - step % every for step in self._checkpoints()}
         for path in self._folder.glob("*.npz"):
-            if path.stem.isdecimal() and int(path.stem) < step:
+            if path.stem.isdecimal() and int(path.stem) not in asked and int(path.stem) < max(asked, default=0):
                 path.unlink()

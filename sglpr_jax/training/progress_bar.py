@@ -36,6 +36,7 @@ class ProgressBar(Callback):
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
+            self._tasks.clear()  # another training gets bars of its own
 
     def _show(self, title: str, done: int, total: int | None, *, terms: str = "") -> None:
         if self._progress is None:

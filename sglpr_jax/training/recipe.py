@@ -25,7 +25,7 @@ from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.describe_places import describe_places
 from sglpr_jax.training.devices import own_copy
 from sglpr_jax.training.hosts import is_first_host, on_all_hosts
-from sglpr_jax.training.loop import METRICS_FILE, ScoreFn, best_params, has_checkpoint, run_steps
+from sglpr_jax.training.loop import METRICS_FILE, ScoreFn, best_params, checkpoint_steps, run_steps
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.mining import FOLDER as MINING
 from sglpr_jax.training.mining import Mining
@@ -101,9 +101,9 @@ def train(
 
     Returns the weights, and how the run went.
 
-    Raises ValueError where the recordings cannot be trained on as `config` says, or a resumed run has other settings;
-    FileExistsError where there is a run already, FileNotFoundError where there is none to resume; FloatingPointError
-    where the loss is no longer finite; OSError where something cannot be read or written.
+    Raises ValueError where the recordings cannot be trained on as `config` says, or a resumed run has other settings or
+    has made more steps; FileExistsError where there is a run already, FileNotFoundError where there is none to resume;
+    FloatingPointError where the loss is no longer finite; OSError where something cannot be read or written.
 
     Example:
       recordings = [open_recording("KITTI", name) for name in ("00", "05")]
@@ -121,9 +121,9 @@ def train(
         pack = functools.partial(_packed, cache=cache, callback=followed, stopped=stopped)
         recordings, also = on_all_hosts(lambda: (pack(recordings), pack(also)))
         source, score = _source_and_score(recordings, also, config, folder)
-        begun = resume and has_checkpoint(folder)
-        start_from = None if weights is None or begun else _grafted(weights, config)
-        claim = claimed(folder, config, settings, resume=resume)
+        made = max(checkpoint_steps(folder), default=0) if resume else 0
+        start_from = None if weights is None or made else _grafted(weights, config)
+        claim = claimed(folder, config, settings, resume=resume, made=made)
         on_all_hosts(lambda: is_first_host() and opened.enter_context(claim))
         state = run_steps(
             config,
@@ -167,6 +167,8 @@ def _finish(last: Params, steps: int, folder: Path, config: TrainConfig) -> Trai
 def _require_usable(
     config: TrainConfig, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording | None
 ) -> None:
+    if not recordings:
+        raise ValueError("expected recordings to train on, found none")
     if jax.process_count() > 1 and (also or config.sampling.mining != "none"):
         raise ValueError(
             f"mined negatives and a second dataset work on one host only, found {jax.process_count()} hosts"
@@ -219,7 +221,8 @@ def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfi
     def describe(params: Params, places: np.ndarray) -> np.ndarray:
         return describe_places(params, recordings, pool, places, np.zeros(len(places)), config)
 
-    return Mining(describe, len(pool), config, folder / MINING)
+    checkpoints = functools.partial(checkpoint_steps, folder)
+    return Mining(describe, len(pool), config, folder / MINING, checkpoints=checkpoints)
 
 
 def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:

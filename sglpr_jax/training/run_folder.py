@@ -15,16 +15,20 @@ CONFIG_FILE = "config.json"
 
 
 @contextlib.contextmanager
-def claimed(folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool) -> Iterator[None]:
+def claimed(
+    folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool, made: int = 0
+) -> Iterator[None]:
     """Be the only process that trains in a run's folder, for as long as the block lasts.
 
-    The configuration and further `settings` are written into it; what a killed process left is removed. Raises
-    FileExistsError where there is a run already and this one is not to `resume` it, BlockingIOError where another
-    process trains there; otherwise as `require_same_settings`.
+    The configuration and further `settings` are written into it; what a killed process left is removed. `made` are the
+    steps that the run to `resume` has made. Raises FileExistsError where there is a run already and this one is not to
+    resume it, BlockingIOError where another process trains there, ValueError where fewer steps are asked for than are
+    made; otherwise as `require_same_settings`.
     """
     path = folder / CONFIG_FILE
     if resume:
         require_same_settings(folder, config, settings)
+        _require_steps(folder, config, made)
     folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
         if path.exists() and not resume:
@@ -50,6 +54,11 @@ def require_same_settings(folder: Path, config: TrainConfig, settings: Mapping[s
         raise ValueError(
             f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
         )
+
+
+def _require_steps(folder: Path, config: TrainConfig, made: int) -> None:
+    if config.steps < made:
+        raise ValueError(f"{folder}: expected steps of at least the {made} made, found {config.steps}")
 
 
 def _as_json(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:

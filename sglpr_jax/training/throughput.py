@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,15 @@ class Throughput:
 
 
 def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
-    """The throughput over all lines but the first, in which the step is compiled; None where there is only that."""
-    timed = [line for line in lines if "steps_per_second" in line]
-    if len(timed) < 2:
+    """The throughput over all lines that say how fast they were; None where none does.
+
+    The first line after each start does not: the step is compiled there. (Older logs say it; their first line is left
+    out, those after a resume are not.)
+    """
+    timed = [(line["step"] - before["step"], line) for before, line in pairwise(lines) if "steps_per_second" in line]
+    if not timed:
         return None
-    steps = np.diff([line["step"] for line in timed])
-    seconds = steps / [line["steps_per_second"] for line in timed[1:]]
-    waited = seconds * [line["data_wait"] for line in timed[1:]]
+    steps = np.array([made for made, _ in timed])
+    seconds = steps / [line["steps_per_second"] for _, line in timed]
+    waited = seconds * [line["data_wait"] for _, line in timed]
     return Throughput(float(steps.sum() / seconds.sum()), float(waited.sum() / seconds.sum()))

@@ -7,6 +7,7 @@ import pytest
 
 from sglpr_jax.cli import reproduce as reproduce_command
 from sglpr_jax.evaluation.published import KITTI, TABLES
+from sglpr_jax.reproduce import runs as runs_module
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
 from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.reproduce.scores import published_rows
@@ -135,6 +136,33 @@ def test_a_stopped_reproduction_says_how_it_goes_on(town, preset, random_params,
     ended = command("reproduce", "table5", *OPTIONS, "--data", town, "--preset", preset, "--out", tmp_path / "out")
     assert "stopped at step 1 of 4; the same command goes on" in ended.error
     assert "--resume" not in ended.error
+
+
+def test_a_run_killed_before_its_settings_were_written_is_begun_anew(
+    town, preset, random_params, tmp_path, monkeypatch
+):
+    runs, asked = Runs(tmp_path, town, str(preset), load_preset(str(preset))), []
+
+    def begin(config, recordings, *, resume, **_):
+        asked.append(resume)
+        return TrainResult(random_params(config.model), tmp_path, 1, config, None)
+
+    monkeypatch.setattr(runs_module, "train", begin)
+    (tmp_path / "full" / "08").mkdir(parents=True)
+    assert not runs.is_trained("full", "08")
+    runs.train("full", "08")
+    (tmp_path / "full" / "08" / "config.json").write_text("{}")
+    runs.train("full", "08")
+    assert asked == [False, True]
+
+
+def test_sessions_are_looked_at_before_anything_is_trained(town, preset, tmp_path, command):
+    options = ("--data", town, "--seq", "08", "--method", "polar-fft", "--preset", preset, "--out", tmp_path / "out")
+    none, one = tmp_path / "none", tmp_path / "one"
+    write_sessions(one, dates=DAYS[:1], scans=2, sensor=SENSOR)
+    assert_one_line_error(command("reproduce", "table3", "--nclt", none, *options), none)
+    assert_one_line_error(command("reproduce", "figure8", "--nclt", one, *options), one, "two sessions", DAYS[0])
+    assert not (tmp_path / "out").exists()
 
 
 def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, tmp_path, command):

@@ -70,3 +70,20 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images,
     with pytest.raises(ValueError, match="expected labels beside every scan of sequence 00, found 0 of 30"):
         train(reads, [recording], out=tmp_path / "run")
     assert not list(tmp_path.iterdir())
+
+
+def test_nothing_to_train_on_is_refused(images, preset, tmp_path):
+    with pytest.raises(ValueError, match="expected recordings to train on, found none"):
+        train(load_preset(str(preset)), [], out=tmp_path / "run")
+
+
+def test_a_run_is_not_resumed_with_fewer_steps_than_it_has_made(images, preset, tmp_path):
+    config, recordings, out = load_preset(str(preset)), [open_recording(images, "00")], tmp_path / "run"
+    (out / "checkpoints" / "3").mkdir(parents=True)
+    names = {"recordings": ["00"], "also": [], "test": None}
+    before = json.dumps({**names, "config": dataclasses.asdict(config)}, default=str)
+    (out / "config.json").write_text(before)
+    with pytest.raises(ValueError, match=rf"{out}: expected steps of at least the 3 made, found 2"):
+        train(dataclasses.replace(config, steps=2), recordings, out=out, resume=True)
+    assert (out / "config.json").read_text() == before
+    assert sorted(path.name for path in out.iterdir()) == ["checkpoints", "config.json"]

@@ -234,3 +234,14 @@ def test_scans_and_images_do_not_mix(recordings, pool):
         read([recordings[0], pictures], pool)
     with pytest.raises(ValueError, match="expected all recordings of a batch to be images, found scans in 05"):
         read([pictures, recordings[1]], pool, np.array([[20, 21, 22, 23]]))
+
+
+def test_images_of_two_sizes_are_refused(pool):
+    sizes = {"00": (16, 16), "05": (12, 20)}
+    mixed = [
+        of_images({Path(f"{name}-{i}.png"): np.zeros(size, np.float32) for i in range(len(SIZES))}, name=name)
+        for name, size in sizes.items()
+    ]
+    words = "recording 05, frame 05-1: expected an image of 16 x 16 pixels, as of 00, found 12 x 20"
+    with pytest.raises(ValueError, match=words):
+        read(mixed, pool, np.array([[0, 1, 17, 2]]))

@@ -1,15 +1,17 @@
 """The sensor's height and tilt: found from the ground, said by the user, and undone before a model looks."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import of_images
+from recordings import of_images, of_scans
 
 import sglpr_jax
 from sglpr_jax.bev import Grid
+from sglpr_jax.data import mounted as mounted_module
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.mounted import mounted
@@ -102,6 +104,23 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
     assert common_mounting([hanging, upright, None, hanging, Mounting(2.9, hanging.up)]) == hanging
     assert common_mounting([upright, upright, hanging]) == upright
     assert common_mounting([upright, hanging, hanging, upright]) is None
+
+
+@pytest.mark.parametrize(
+    ("heights", "said"),
+    [
+        ((1.0, 1.0, -2.0, 1.0), "1.00 m above the ground, estimated from the ground in 3 of 4 scans"),
+        ((1.0, -2.0, -2.0, 1.0), "the ground is below it in 2 of 4 scans and above it in 2, taken to be 1.73 m"),
+        ((1.0, None, None, None), "no ground found but in 1 of 4 scans, taken to be 1.73 m"),
+    ],
+)
+def test_what_is_said_of_scans_that_disagree(heights, said, monkeypatch):
+    """Negative heights are those of a sensor that hangs."""
+    each = [h if h is None else Mounting(abs(h), (0.0, 0.0, float(np.sign(h)))) for h in heights]
+    scans = {Path(f"{i}.bin"): np.full((1, 3), i, np.float32) for i in range(4)}
+    monkeypatch.setattr(mounted_module, "estimate_mounting", lambda points: each[int(points[0, 0])])
+    found = mounted(of_scans(scans), "estimate", known=False).found[-1]
+    assert found.startswith(f"sensor: {said}")
 
 
 @settings(max_examples=25, deadline=None)

@@ -16,7 +16,7 @@ from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
 from sglpr_jax.labels import to_classes
 from sglpr_jax.poses import positions_from_camera
-from sglpr_jax.sim import SENSORS, Sensor, recording, scan, simulate_recording, write_dataset
+from sglpr_jax.sim import SENSORS, Sensor, recording, scan, simulate_recording, write_dataset, write_sessions
 from sglpr_jax.sim.scenery import OUTSKIRTS
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
@@ -251,6 +251,24 @@ def test_damaged_settings_are_named(tmp_path):
 def test_unknown_drives_and_too_few_scans_are_refused(tmp_path, changes):
     with pytest.raises(ValueError, match=r"expected drives among 00, 01, .* 10 with 2 scans"):
         write(tmp_path / "none", **changes)
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rate_hz": 0.0}, "rate_hz: expected scans per second, more than 0, found 0.0"),
+        ({"rate_hz": -4.0}, "rate_hz: .*found -4.0"),
+        ({"rate_hz": float("nan")}, "rate_hz: .*found nan"),
+        ({"rate_hz": float("inf")}, "rate_hz: .*found inf"),
+        ({"seed": -1}, "seed: expected a whole number, 0 or more, found -1"),
+    ],
+)
+def test_a_strange_rate_or_seed_is_refused_before_anything_is_written(tmp_path, changes, said):
+    with pytest.raises(ValueError, match=said):
+        write(tmp_path / "none", **changes)
+    with pytest.raises(ValueError, match=said):
+        write_sessions(tmp_path / "none", dates=("2012-01-15",), scans=SCANS, sensor=TINY, **changes)
     assert not (tmp_path / "none").exists()
 
 

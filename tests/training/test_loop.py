@@ -81,7 +81,6 @@ def test_stopped_and_resumed_is_uninterrupted(config, make_batch, fast_step, tmp
     chex.assert_trees_all_equal(resumed, whole)
     assert logged(folders[1]) == logged(folders[0])
     assert [line["step"] for line in logged(folders[0])] == [1, 2, 2, 3, 4, 4, 5, 6, 6]
-    assert all(line.keys() > TIMES for line in read_metrics(folders[0] / METRICS_FILE) if "loss" in line)
 
     finished = run_steps(config, Made(make_batch), folders[1], score=size_of_weights, resume=True)
     chex.assert_trees_all_equal(finished, whole)
@@ -117,6 +116,15 @@ def test_a_stop_between_two_lines_of_the_log_leaves_no_trace_in_it(config, make_
     assert logged(folders[1]) == logged(folders[0])
     losses = [(line["step"], line["loss"]) for line in logged(folders[0]) if "loss" in line]
     assert losses == [(5, 3), (8, 7), (10, 9.5), (12, 11.5)]
+
+
+def test_the_first_line_after_each_start_says_nothing_of_time(config, make_batch, fake_step, tmp_path):
+    fake_step()
+    run_steps(config, Made(make_batch), tmp_path, score=size_of_weights, stopped=after(3))
+    run_steps(config, Made(make_batch), tmp_path, score=size_of_weights, resume=True)
+    lines = [line for line in read_metrics(tmp_path / METRICS_FILE) if "loss" in line]
+    assert [line["step"] for line in lines if line.keys() > TIMES] == [2, 3, 5, 6]
+    assert not [line for line in lines if line["step"] in (1, 4) and TIMES & line.keys()]
 
 
 def test_measurements_are_means_since_the_last_line(config, make_batch, fake_step, tmp_path):

@@ -33,13 +33,13 @@ def weights(number: float) -> Params:
 
 
 def test_the_cache_is_that_of_the_weights_at_the_last_refresh(mined, tmp_path):
-    mining = Mining(described_by, PLACES, mined, tmp_path)
+    mining = Mining(described_by, PLACES, mined, tmp_path, checkpoints=list)
     assert mining.cache is None
     mining.refresh(8, weights(0.5))
     np.testing.assert_array_equal(mining.cache.places, np.arange(PLACES))
     np.testing.assert_array_equal(mining.cache.descriptors, described_by(weights(0.5), np.arange(PLACES)))
 
-    resumed = Mining(described_by, PLACES, mined, tmp_path)
+    resumed = Mining(described_by, PLACES, mined, tmp_path, checkpoints=list)
     resumed.refresh(11, weights(7.0))  # of a later step: what counts are the weights of step 8
     np.testing.assert_array_equal(resumed.cache.descriptors, mining.cache.descriptors)
     with pytest.raises(FileNotFoundError, match=r"12\.npz: expected descriptors of places"):
@@ -50,7 +50,7 @@ def test_some_places_are_others_each_time_and_the_same_for_the_same_step(mined, 
     some = dataclasses.replace(mined, sampling=dataclasses.replace(mined.sampling, mined_places=10))
     places = []
     for folder, step in (("a", 4), ("b", 4), ("a", 8)):
-        mining = Mining(described_by, PLACES, some, tmp_path / folder)
+        mining = Mining(described_by, PLACES, some, tmp_path / folder, checkpoints=list)
         mining.refresh(step, weights(1.0))
         places.append(mining.cache.places.tolist())
     assert places[0] == places[1] != places[2]
@@ -58,11 +58,24 @@ def test_some_places_are_others_each_time_and_the_same_for_the_same_step(mined, 
 
 
 def test_caches_that_no_checkpoint_can_need_are_removed(mined, tmp_path):
-    mining = Mining(described_by, PLACES, mined, tmp_path)
-    for step in range(0, 21, 4):
+    kept: list[int] = []
+    mining = Mining(described_by, PLACES, mined, tmp_path, checkpoints=lambda: kept)
+    for step in range(0, 29, 4):
+        kept[:] = [6, step - 6, step - 4] if step > 8 else []  # that of step 6 is the best; newer ones are on their way
         mining.refresh(step, weights(step))
-    # At step 20 the newest whole checkpoint may be that of step 16, whose batches use the cache of step 16.
-    assert sorted(int(path.stem) for path in tmp_path.iterdir()) == [12, 16, 20]
+    # At step 28 the checkpoints are those of steps 6, 22 and 24.
+    assert sorted(int(path.stem) for path in tmp_path.iterdir()) == [4, 20, 24, 28]
+
+
+def test_a_run_goes_on_from_its_best_checkpoint_however_old(mined, tmp_path):
+    mining = Mining(described_by, PLACES, mined, tmp_path, checkpoints=lambda: [6, 38, 40])
+    for step in range(0, 41, 4):
+        mining.refresh(step, weights(step))
+    resumed = Mining(described_by, PLACES, mined, tmp_path, checkpoints=lambda: [6])
+    resumed.refresh(6, weights(7.0))
+    np.testing.assert_array_equal(resumed.cache.descriptors, described_by(weights(4), np.arange(PLACES)))
+    resumed.refresh(8, weights(8.0))
+    np.testing.assert_array_equal(resumed.cache.descriptors, described_by(weights(8), np.arange(PLACES)))
 
 
 def test_batches_are_never_read_past_a_refresh():

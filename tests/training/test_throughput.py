@@ -1,4 +1,4 @@
-"""The throughput of a run is that of all its steps together, the compiled first line apart."""
+"""The throughput of a run is that of all its steps together, the lines apart in which the step is compiled."""
 
 import pytest
 
@@ -18,6 +18,21 @@ def test_steps_and_waits_are_added_up():
     assert found.data_wait == pytest.approx(0.125)
 
 
-@pytest.mark.parametrize("lines", [[], [{"step": 4, "steps_per_second": 1.0, "data_wait": 0.1}]])
+def test_each_compilation_is_left_out():
+    lines = [
+        {"step": 10, "loss": 1.0},
+        {"step": 20, "steps_per_second": 10.0, "data_wait": 0.5},
+        {"step": 20, "score": 0.5},
+        {"step": 30, "loss": 1.0},  # the first after a resume
+        {"step": 50, "steps_per_second": 20.0, "data_wait": 0.0},
+    ]
+    found = throughput(lines)
+    assert found is not None
+    assert (found.steps_per_second, found.data_wait) == pytest.approx((15, 0.25))
+
+
+@pytest.mark.parametrize(
+    "lines", [[], [{"step": 4, "loss": 1.0}], [{"step": 4, "steps_per_second": 1.0, "data_wait": 0.1}]]
+)
 def test_a_run_that_only_compiled_has_none(lines):
     assert throughput(lines) is None

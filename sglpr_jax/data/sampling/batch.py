@@ -85,6 +85,7 @@ def read_batch(
     labelled = np.array([classes is not None for _, classes in found])
     common = {"labelled": labelled, "negatives": negatives[part], "positives": pool.config.positives}
     if pictures:
+        _require_one_size(places, found)
         stacked, maps = _stacked(found)
         return Batch(**common, images=stacked, maps=maps if has_labels else None)
     points, count, classes = _padded(found, max_points)
@@ -127,6 +128,16 @@ def _read(recording: Recording, frame: int, *, images: bool, labels: bool) -> Re
     if record.points is not None:
         check_cloud(record.points, name=record.name)
     return record
+
+
+def _require_one_size(places: list[tuple[Recording, int]], pictures: list[Place]) -> None:
+    expected = pictures[0][0].shape
+    for (recording, frame), (image, _) in zip(places, pictures, strict=True):
+        if image.shape != expected:
+            raise ValueError(
+                f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of {expected[0]} x"
+                f" {expected[1]} pixels, as of {places[0][0].name}, found {image.shape[0]} x {image.shape[1]}"
+            )
 
 
 def _stacked(pictures: list[Place]) -> tuple[np.ndarray, np.ndarray]:
