@@ -9,6 +9,7 @@ import tyro
 
 from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.choices import MIN_PROBABILITY, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -73,13 +74,14 @@ def _check(command: LoopsCommand) -> None:
     from sglpr_jax.loops.folder import TRAJECTORIES
     from sglpr_jax.loops.optimization import check_installed
 
-    path, written = command.odometry, {(command.out / name).resolve() for name in TRAJECTORIES}
-    if command.optimize and path is None:
+    written = {(command.out / name).resolve() for name in TRAJECTORIES}
+    if command.optimize and command.odometry is None:
         raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
     if command.optimize:
         check_installed()
-    if path is not None and path.resolve() in written:
-        raise ValueError(f"{path}: expected odometry that stays, found a file that this run writes anew or removes")
+    for path in (command.odometry, command.source.poses, command.source.times):
+        if path is not None and path.resolve() in written:
+            raise ValueError(f"{path}: expected a file that stays, found one that this run may write anew")
 
 
 def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
@@ -95,6 +97,11 @@ def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
         recording, odometry = source.open(command.recording), None
     else:
         recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
+    if recording.times is None and len(recording) <= config.candidates.exclude_frames:
+        warn(
+            f"{recording.name}: without times the last {config.candidates.exclude_frames} scans are neighbours, and "
+            f"there are {len(recording)}: no loop can be found; name --times"
+        )
     params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(

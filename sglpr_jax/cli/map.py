@@ -82,18 +82,32 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             should_stop=stop,
             on_progress=show,
         )
+    stopped = scans < len(recording)
     if len(places):
         whole = places if before is None else before.merged(places, drive=poses_by_id(recording, poses))
-        whole.save(command.out)
-        new = len(whole) - (0 if before is None else len(before))
-        left_out = f", {len(skipped)} scans skipped" if skipped else ""
-        of = f"{scans} of {len(recording)}" if scans < len(recording) else f"{scans}"
-        print(f"{command.out}: {len(whole)} places, {new} of them from {of} scans of {recording.name}{left_out}")
-    if scans < len(recording):
+        if stopped and _holds_more(command.out, len(whole)):
+            print(f"{command.out}: stays as it is, with more places than the {len(whole)} of so few scans")
+        else:
+            whole.save(command.out)
+            new = len(whole) - (0 if before is None else len(before))
+            left_out = f", {len(skipped)} scans skipped" if skipped else ""
+            of = f"{scans} of {len(recording)}" if stopped else f"{scans}"
+            print(f"{command.out}: {len(whole)} places, {new} of them from {of} scans of {recording.name}{left_out}")
+    if stopped:
         print("the same command goes on from here", file=sys.stderr)
         return stop.exit_status
     remove(unfinished)
     return 0
+
+
+def _holds_more(path: Path, places: int) -> bool:
+    """Whether a map lies there already with more places: whoever uses it would be lost with fewer."""
+    from sglpr_jax.loops.places import PlaceMap
+
+    try:
+        return len(PlaceMap.load(path)) > places
+    except (OSError, ValueError):
+        return False
 
 
 def main() -> None:

@@ -3,22 +3,35 @@
 import re
 from collections import Counter
 from collections.abc import Iterable
+from decimal import Decimal
 from pathlib import Path
+
+_DECIMAL = re.compile(r"(\d+\.\d+)(\.[A-Za-z]\w*)*$")
+"""The name of a file that is called by its time, with its endings."""
 
 
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
-    """Return the files of `folder` with one of these endings, in natural order; none where there is no such folder.
+    """Return the files of `folder` with one of these endings, small or in capitals, in natural order.
+
+    None where there is no such folder.
 
     Hidden files are none: a Mac leaves `._000003.bin` beside each scan that it copies.
     """
     if not folder.is_dir():
         return ()
-    return in_order(path for path in folder.iterdir() if path.name.endswith(endings) and not hidden(path))
+    return in_order(path for path in folder.iterdir() if path.name.lower().endswith(endings) and not hidden(path))
 
 
 def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
-    """Return paths by name, numbers in the names as numbers: full2 before full10."""
-    return tuple(sorted(paths, key=lambda path: _natural(path.name)))
+    """Return paths by name, numbers in the names as numbers: full2 before full10.
+
+    Where all names are decimal numbers, as of scans that are called by their times, 1.25 is before 1.5.
+    """
+    found = list(paths)
+    times = {path: time[1] for path in found if (time := _DECIMAL.match(path.name))}
+    if len(times) == len(found):
+        return tuple(sorted(found, key=lambda path: (Decimal(times[path]), path.name)))
+    return tuple(sorted(found, key=lambda path: _natural(path.name)))
 
 
 def hidden(path: Path) -> bool:

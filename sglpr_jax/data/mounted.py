@@ -49,7 +49,7 @@ def _estimated(recording: Recording) -> Recording:
 def _unclear(hanging: list[bool], scans: int) -> str:
     """Why the scans tell no mounting; `hanging` says of each that shows ground whether the sensor hangs there."""
     if 2 * len(hanging) < scans:
-        return f"no ground found but in {len(hanging)} of {scans} scans"
+        return f"ground found in {len(hanging)} of {scans} scans (is z up in these files?)"
     return f"the ground is below it in {hanging.count(False)} of {scans} scans and above it in {hanging.count(True)}"
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
 
@@ -19,8 +20,8 @@ def write_found(
 
     The trajectory is the odometry as it was given, of the frames that were looked at; `optimized` is the corrected one,
     in files beside it. Their times are the recording's, or the numbers of the frames. Poses are those of the LiDAR.
-    Trajectories of an earlier run that this one does not have are removed. Returns the paths written. Raises WriteError
-    where one cannot be written.
+    Other trajectories that lie there under these names stay, which is told. Returns the paths written. Raises
+    WriteError where one cannot be written.
     """
     folder = Path(folder)
     odometry = None if found.odometry is None else found.odometry[: found.frames]
@@ -35,6 +36,7 @@ def write_found(
             write_tum(folder / f"{stem}.tum", poses, clock)
             write_kitti(folder / f"{stem}.kitti", poses)
             names += [f"{stem}.tum", f"{stem}.kitti"]
-    for name in set(TRAJECTORIES) - set(names):
-        (folder / name).unlink(missing_ok=True)
+    others = [name for name in TRAJECTORIES if name not in names and (folder / name).exists()]
+    if others:
+        warn(f"{folder}: {', '.join(others)} lay there before and have nothing to do with these loops")
     return [folder / name for name in names]

@@ -43,13 +43,14 @@ def at_scans(
 ) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
     """The recording, and a pose for each of its scans from what `read_odometry` found at `path`.
 
-    Poses go with the scans row by row. A tum file of another length is interpolated at the times of the scans; those
-    more than 1 s between two poses, or before the first and after the last, are left out, which is told. Raises
-    ValueError where these are most, and where the length is another one and nothing tells the times.
+    Poses go with the scans row by row; where the scans have no times, they get those of a tum file. One of another
+    length is interpolated at the times of the scans; those more than 1 s between two poses, or before the first and
+    after the last, are left out, which is told. Raises ValueError where these are most, and where the length is another
+    one and nothing tells the times.
     """
-    if len(odometry) == len(recording):
-        return recording, odometry
     tum = (_format_of(path) if format == "auto" else format) == "tum"
+    if len(odometry) == len(recording):
+        return (_timed(recording, path) if tum and recording.times is None else recording), odometry
     if recording.times is None or not tum:
         why = "the scans have no times" if tum else "the file has no times"
         raise ValueError(
@@ -70,6 +71,12 @@ def at_scans(
     said = f"odometry: {len(odometry)} poses of {path.name}, interpolated at the times of the scans{left_out}"
     chosen = only(recording, np.flatnonzero(kept).tolist())
     return dataclasses.replace(chosen, found=(*chosen.found, said)), poses_of(positions, turned)[kept]
+
+
+def _timed(recording: Recording, path: Path) -> Recording:
+    """The recording with the times of a tum file that has a row for each scan."""
+    times = read_tum(path)[1]
+    return dataclasses.replace(recording, times=times, found=(*recording.found, f"times: those of {path.name}"))
 
 
 def is_own(path: Path, root: Path) -> bool:

@@ -77,14 +77,18 @@ def describe(
     bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
-    """The descriptor of each bird's-eye-view image of point counts: 256 numbers of unit length.
+    """The descriptor of each bird's-eye-view image, as `scan_image` makes it: 256 numbers of unit length.
 
-    Any leading axes; works under jit, vmap and grad; computes nothing of the segmentation head. The distance between
-    two descriptors is the dissimilarity of their places (equation 2). A head that reads labels (`head.input`) needs the
-    maps of classes too. A density image is float counts 0 to 10, or the uint8 grey values 0 to 255 of its file. Raises
-    ValueError for images of another size than `params.config.grid`, for density images of other integers, and for
-    labels that are missing or that nothing reads. An empty image has a descriptor too: see `is_describable`.
+    The weights that ship want density images (`params.config.image`); `rasterize` makes images for models that want
+    counts of points. Any leading axes; works under jit, vmap and grad; computes nothing of the segmentation head. The
+    distance between two descriptors is the dissimilarity of their places (equation 2). A head that reads labels
+    (`head.input`) needs the maps of classes too. A density image is float counts 0 to 10, or the uint8 grey values 0 to
+    255 of its file. Raises ValueError for images of another size than `params.config.grid`, for density images of other
+    integers, and for labels that are missing or that nothing reads. An empty image has a descriptor too: see
+    `is_describable`.
     """
+    if 0 in bev.shape[:-2]:
+        return jnp.zeros((*bev.shape[:-2], params.config.head.descriptor_size))
     return forward(params, bev, labels, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
 
 
@@ -124,6 +128,8 @@ def forward(
     grid = config.grid
     if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
         raise ValueError(f"expected images [..., H, W] of {grid.height} x {grid.width} cells, found shape {bev.shape}")
+    if 0 in bev.shape:
+        raise ValueError(f"expected at least one image, found shape {bev.shape}")
     _check_labels(labels, bev.shape, config)
     image = prepare(bev.reshape(-1, grid.height, grid.width), config)
     if labels is not None:

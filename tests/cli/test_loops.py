@@ -148,12 +148,25 @@ def test_two_processes_do_not_search_into_one_folder(command, town, tmp_path):
     assert not out.exists()
 
 
-def test_odometry_that_the_run_would_write_or_remove_is_refused(command, town, odometry, tmp_path):
+@pytest.mark.parametrize("flag", ["--odometry", "--poses", "--times"])
+def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_path, flag):
     path = tmp_path / "found" / "trajectory-optimized.tum"
     write_tum(path, odometry, np.arange(float(SCANS)))
-    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry", path)
-    assert_one_line_error(ended, "trajectory-optimized.tum: expected odometry that stays")
+    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", flag, path)
+    assert_one_line_error(ended, "trajectory-optimized.tum: expected a file that stays")
     assert path.exists()
+
+
+@pytest.mark.slow
+def test_a_short_recording_without_times_is_told_why_it_has_no_loops(command, town, odometry, tmp_path):
+    scans = shutil.copytree(town / "sequences" / "08" / "velodyne", tmp_path / "scans")
+    ended = command("loops", scans, "--out", tmp_path / "found")
+    assert ended.status == 0 and "without times the last 290 scans are neighbours, and there are 40" in ended.error
+    times = open_recording(town, "08").times + 1.6e9
+    write_tum(tmp_path / "odometry.tum", odometry, times)
+    ended = command("loops", scans, "--out", tmp_path / "timed", "--odometry", tmp_path / "odometry.tum")
+    assert ended.status == 0 and "times: those of odometry.tum" in ended.error and "warning" not in ended.error
+    np.testing.assert_allclose(read_tum(tmp_path / "timed" / "trajectory.tum")[1], times, atol=1e-5)
 
 
 def test_images_cannot_be_registered(command, images, tmp_path):

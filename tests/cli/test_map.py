@@ -105,6 +105,10 @@ def test_ctrl_c_keeps_what_was_found_and_the_same_command_goes_on(command, town,
         assert "the same command goes on from here" in ended.error
         add_to = ("--add-to", out)
         assert out.with_suffix(".unfinished").is_dir() and len(PlaceMap.load(out)) == stop_at
+    stop_at, whole = 10, other.read_bytes()
+    ended = command(*run, "--out", other)  # the whole map anew, stopped
+    assert ended.status == 130 and "stays as it is, with more places than the 10 of so few scans" in ended.out
+    assert other.read_bytes() == whole and other.with_suffix(".unfinished").is_dir()
     stop_at = 0
     ended = command(*run, *add_to, "--out", out)
     assert ended.status == 0 and ended.out == f"{out}: 40 places, 15 of them from 40 scans of 08\n"

@@ -111,7 +111,7 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
     [
         ((1.0, 1.0, -2.0, 1.0), "1.00 m above the ground, estimated from the ground in 3 of 4 scans"),
         ((1.0, -2.0, -2.0, 1.0), "the ground is below it in 2 of 4 scans and above it in 2, taken to be 1.73 m"),
-        ((1.0, None, None, None), "no ground found but in 1 of 4 scans, taken to be 1.73 m"),
+        ((1.0, None, None, None), "ground found in 1 of 4 scans (is z up in these files?), taken to be 1.73 m"),
     ],
 )
 def test_what_is_said_of_scans_that_disagree(heights, said, monkeypatch):
@@ -189,7 +189,7 @@ def test_layouts_that_know_their_sensor_are_left_alone_unless_asked(kitti_root, 
     assert open_recording(kitti_root, "08").mounting is None
     assert open_recording(kitti_root, "08", sensor_height=1.2).mounting == Mounting(1.2)
     asked = open_recording(kitti_root, "08", sensor_height="estimate")
-    assert asked.mounting is None and "no ground found but in 0 of 3 scans" in asked.found[-1]
+    assert asked.mounting is None and "ground found in 0 of 3 scans (is z up in these files?)" in asked.found[-1]
     assert open_recording(bev_root, "06", sensor_height=1.2).mounting is None
     assert mounted(of_images({}), "estimate", known=False).mounting is None
 

@@ -43,6 +43,8 @@ def test_nclt_is_decoded_in_double_precision_and_turned_not_mirrored(tmp_path):
         ("sweeps/a__LIDAR_TOP__1.pcd.bin", "nuscenes", "a__LIDAR_TOP__1"),
         ("velodyne_sync/1326652795280148.bin", "nclt", "1326652795280148"),
         ("clouds/16_beams.pcd", "pcd", "16_beams"),
+        ("clouds/16_BEAMS.PCD", "pcd", "16_BEAMS"),
+        ("clouds/1.25.bin", "kitti", "1.25"),
     ],
 )
 def test_format_and_id_come_from_the_name(name, format, stem):

@@ -132,6 +132,18 @@ def test_numbers_in_names_sort_as_numbers(tmp_path):
     assert open_recording(folder).ids == ("full0", "full1", "full2", "full02", "full10")
 
 
+def test_names_that_are_times_sort_as_times(tmp_path):
+    folder = write_scans(tmp_path / "scans", *(f"1600000000.{part}.bin" for part in ("5", "0", "75", "25")))
+    assert open_recording(folder).ids == tuple(f"1600000000.{part}" for part in ("0", "25", "5", "75"))
+    dates = write_scans(tmp_path / "dates", "2012.10.2.bin", "2012.9.15.bin")
+    assert open_recording(dates).ids == ("2012.9.15", "2012.10.2")
+
+
+def test_endings_may_be_in_capitals(tmp_path):
+    folder = write_scans(tmp_path / "scans", "1.BIN", "2.bin")
+    assert open_recording(folder).ids == ("1", "2")
+
+
 def test_hidden_files_are_no_scans(tmp_path):
     folder = write_scans(tmp_path / "scans", "000003.bin", "._000003.bin", ".old.pcd")
     assert open_recording(folder).ids == ("000003",)

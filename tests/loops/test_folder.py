@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from recordings import of_images
 
+from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.folder import write_found
@@ -36,13 +37,16 @@ def test_all_files_are_of_the_frames_looked_at(found, tmp_path):
     )
 
 
-def test_trajectories_of_an_earlier_run_do_not_stay_beside_other_loops(found, tmp_path):
+def test_other_trajectories_stay_which_is_told(found, tmp_path):
     out = tmp_path / "out"
-    assert len(write_found(found, out, optimized=found.odometry[:5])) == 7
-    (out / "mine.tum").write_text("stays")
-    for fewer, left in ((found, 6), (dataclasses.replace(found, odometry=None), 4)):
-        names = {path.name for path in write_found(fewer, out)}
-        assert {path.name for path in out.iterdir()} == names | {"mine.tum"} and len(names) == left - 1
+    written = {path.name: path.read_bytes() for path in write_found(found, out, optimized=found.odometry[:5])}
+    assert len(written) == 7
+    with pytest.warns(DataWarning, match=r"out: trajectory-optimized.tum, trajectory-optimized.kitti lay there before"):
+        assert len(write_found(found, out)) == 5
+    with pytest.warns(DataWarning, match=r"out: trajectory.tum, .* lay there before"):
+        assert len(write_found(dataclasses.replace(found, odometry=None), out)) == 3
+    for name in written.keys() - {"loops.g2o"}:
+        assert (out / name).read_bytes() == written[name]
 
 
 def test_a_file_that_cannot_be_written_is_named(found, tmp_path):

@@ -49,9 +49,19 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
         ValueError, match=r"odometry\.tum: expected odometry of 6 poses.* 2\.5 to 9\.0 s, found 5 of 0\.0 to"
     ):
         at_scans(late, poses, path, format="tum")
-    for same in (only(recording, range(5)), dataclasses.replace(only(recording, range(5)), times=None)):
-        unchanged = at_scans(same, poses, path, format="auto")
-        assert unchanged[0] is same and unchanged[1] is poses
+    same = only(recording, range(5))
+    unchanged = at_scans(same, poses, path, format="auto")
+    assert unchanged[0] is same and unchanged[1] is poses
+
+
+def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(5)}, times=None)
+    write_tum(tmp_path / "odometry.tum", poses, 1.6e9 + np.arange(5.0))
+    write_kitti(tmp_path / "kitti.txt", poses)
+    found, given = at_scans(recording, poses, tmp_path / "odometry.tum", format="auto")
+    np.testing.assert_array_equal(found.times, 1.6e9 + np.arange(5.0))
+    assert given is poses and found.found[-1] == "times: those of odometry.tum"
+    assert at_scans(recording, poses, tmp_path / "kitti.txt", format="kitti")[0] is recording
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,14 @@ def test_any_leading_axes_and_counts_of_any_type_give_the_same(params, images, d
     np.testing.assert_allclose(many.reshape(6, 256), descriptors, atol=1e-5)
 
 
+@pytest.mark.parametrize("leading", [(0,), (2, 0)])
+def test_no_images_have_no_descriptors(params, images, leading):
+    none = jnp.zeros((*leading, *images.shape[-2:]))
+    assert describe(params, none).shape == (*leading, params.config.head.descriptor_size)
+    with pytest.raises(ValueError, match="expected at least one image"):
+        segment(params, none)
+
+
 def test_vmap_agrees(params, images, descriptors):
     mapped = jax.jit(jax.vmap(describe, in_axes=(None, 0)), compiler_options=FAST_COMPILE)
     np.testing.assert_allclose(mapped(params, images), descriptors, atol=1e-5)

@@ -29,8 +29,8 @@ ARRAY_ENDINGS = (".npy", ".npz", ".las")
 
 def scan_id(path: Path) -> str:
     """Return the name of a scan file without its endings: "000052" for 000052.bin, "sweep" for sweep.pcd.bin."""
-    name = path.name.removesuffix(".bin")
-    return next((name.removesuffix(f".{ending}") for ending in READERS if name.endswith(f".{ending}")), name)
+    name = path.stem if path.suffix.lower() == ".bin" else path.name
+    return Path(name).stem if Path(name).suffix.lower()[1:] in READERS else name
 
 
 def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
@@ -40,9 +40,9 @@ def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
     other .bin does not say what it holds: it is `records`.
     """
     for format in READERS:
-        if path.suffix == f".{format}":
+        if path.suffix.lower() == f".{format}":
             return format
-    if path.name.endswith(".pcd.bin"):
+    if path.name.lower().endswith(".pcd.bin"):
         return "nuscenes"
     return "nclt" if path.parent.name == "velodyne_sync" else records
 

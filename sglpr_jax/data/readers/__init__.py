@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
+from sglpr_jax.data.listing import left_aside
 from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
@@ -88,5 +89,5 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
             else ""
         )
         raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{scan}")
-    found = "nothing of the kind" if root.is_dir() else "no such folder"
+    found = f"nothing of the kind: {left_aside(root, ()) or 'no files'}" if root.is_dir() else "no such folder"
     raise FileNotFoundError(f"{root}: expected {', '.join(layouts)} or {last}, found {found}")
