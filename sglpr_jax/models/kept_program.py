@@ -52,9 +52,10 @@ def kept_describe(params: Params) -> Callable[..., Float[Array, "*b d"]]:
 
 def _folder() -> Path | None:
     """Where programs are kept; None where JAX keeps none, or not in a folder of this machine."""
-    folder = jax.config.jax_compilation_cache_dir
-    kept = jax.config.jax_enable_compilation_cache and folder and "://" not in folder
-    return Path(folder) / "traced" if kept else None
+    folder, kept = (
+        getattr(jax.config, f"jax_{name}") for name in ("compilation_cache_dir", "enable_compilation_cache")
+    )
+    return Path(folder) / "traced" if kept and folder and "://" not in folder else None
 
 
 def _program(config: ModelConfig, arguments: tuple[Any, ...], file: Path) -> jax.export.Exported:
