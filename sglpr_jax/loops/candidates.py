@@ -18,8 +18,8 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import image_view, picture, view
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
-from sglpr_jax.models.kept_program import kept_describe
 from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.poses import NEGATIVE_M
 from sglpr_jax.retrieval.embed import OnBadScan
@@ -79,7 +79,6 @@ class CandidateFinder:
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
         self.params, self.config, self.verification = params, config, verification
-        self._describe = kept_describe(params)
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
@@ -136,7 +135,7 @@ class CandidateFinder:
             bev = image_view(whole, None, model.grid).image
         else:
             bev = view(record, model.grid, image=model.image).image
-        return Seen(np.asarray(self._describe(bev)), _kept(whole), record.mounting)
+        return Seen(np.asarray(describe(self.params, bev)), _kept(whole), record.mounting)
 
     def seen_scan(self, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
         """What is seen of a recording's scan; None where it cannot be read, which `on_bad_scan(id, error)` is told.

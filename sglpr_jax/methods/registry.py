@@ -1,6 +1,7 @@
 """Every method that a descriptor can come from: the network, and the handcrafted methods."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -12,10 +13,9 @@ from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.input_image import field_of_view
-from sglpr_jax.models.kept_program import kept_describe
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import init
+from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
@@ -50,8 +50,9 @@ def network(params: Params) -> ImageMethod:
     """Return the method that describes by `params`."""
     config = params.config
     about = {"method": NETWORK, "model": dataclasses.asdict(config)}
+    describe_views = functools.partial(describe, params)
     return ImageMethod(
-        kept_describe(params),
+        describe_views,
         config.grid,
         about,
         weights_hash(params),

@@ -1,11 +1,13 @@
 """`describe` with its weights inside, as a program for runtimes that do not know this package: StableHLO and ONNX."""
 
+import contextlib
 import dataclasses
 import hashlib
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -26,7 +28,6 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.files import check_holds_only, replacing, write_json
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.kept_program import without_source_locations
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import for_places
@@ -35,7 +36,8 @@ from sglpr_jax.models.weights_file import CONFIG_FILE, save
 ProgramFormat = Literal["stablehlo", "onnx"]
 PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
-NEEDS_ONNX = "pip install 'sglpr-jax[export]' && pip install --no-deps jax2onnx==0.17.1"
+NEEDS = "pip install 'sglpr-jax[export]'"
+NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
 """Without its own requirements: they ask for an older Orbax than this package's, and the conversion uses none."""
 
 
@@ -46,9 +48,9 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
     a scan becomes the program's input, and the program's SHA-256. Both take any number of images (b, h, w) in float32
     and return (b, d).
 
-    `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; `onnx` needs jax2onnx. Raises
-    ImportError, with the command that installs it, where that is missing; FileExistsError where the folder holds
-    other files; ValueError for a model that reads labels too.
+    `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; it needs the package flatbuffers. `onnx`
+    needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; FileExistsError where
+    the folder holds other files; ValueError for a model that reads labels too.
     """
     folder = Path(folder)
     if params.config.head.reads_labels:
@@ -67,12 +69,28 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
 
 def stablehlo(params: Params) -> bytes:
     """`describe` of these weights as `jax.export` serialises it, with a symbolic number of images."""
+    try:
+        import flatbuffers  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"StableHLO needs the package flatbuffers: {NEEDS}") from error
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))
-    with without_source_locations():
+    with _no_source_locations():
         exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32))
         return bytes(exported.serialize())
+
+
+@contextlib.contextmanager
+def _no_source_locations() -> Iterator[None]:
+    """Leave out of programs where the files of their author lie: the same weights give the same bytes anywhere."""
+    limit = "jax_traceback_in_locations_limit"
+    before = getattr(jax.config, limit)
+    jax.config.update(limit, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(limit, before)
 
 
 def onnx(params: Params) -> bytes:

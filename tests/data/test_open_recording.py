@@ -43,11 +43,12 @@ def test_an_unknown_sequence_lists_those_that_exist(kitti_root, bev_root):
 
 
 def test_an_unknown_layout_says_what_was_expected(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"expected sequences/NN/velodyne.*NN/imgs.*nothing of the kind: no files"):
+    expected = r"expected sequences/NN/velodyne.*NN/imgs.*nothing of the kind: "
+    with pytest.raises(FileNotFoundError, match=f"{expected}no files"):
         recording_names(tmp_path)
     (tmp_path / "scans").mkdir()
     (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(FileNotFoundError, match=r"nothing of the kind: 1 .txt, 1 folder \(scans\)"):
+    with pytest.raises(FileNotFoundError, match=rf"{expected}1 .txt, 1 folder \(scans\)"):
         recording_names(tmp_path)
     with pytest.raises(FileNotFoundError, match="found no such folder"):
         open_recording(tmp_path / "none", "08")
