@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,8 +57,8 @@ def own_names(text: str) -> str:
 @functools.cache
 def _installed_commands() -> tuple[str, ...]:
     """The commands that `pip install` gives, as bin/ has them."""
-    scripts = [script.name for script in entry_points(group="console_scripts")]
-    return tuple(name.removeprefix(_INSTALLED_AS) for name in scripts if name.startswith(_INSTALLED_AS))
+    scripts = distribution("sglpr-jax").entry_points.select(group="console_scripts")
+    return tuple(script.name.removeprefix(_INSTALLED_AS) for script in scripts)
 
 
 def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:

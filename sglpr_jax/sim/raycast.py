@@ -20,8 +20,8 @@ COLUMNS = 32
 SLOTS = 64, 48, 128
 """The most boxes, cylinders and ellipsoids that a sector may meet; of more, the nearest are kept.
 
-Not all that towns have: in two of them up to 50 cylinders and 160 ellipsoids fell into one sector. About one sector in
-a hundred has too many ellipsoids; what is left out there is 47 m away or farther.
+Not all that towns have: in two of them (counted once, routes 00 and 02) up to 50 cylinders and 160 ellipsoids fell into
+one sector. About one sector in a hundred has too many ellipsoids; what is left out there is 47 m away or farther.
 """
 UNROLL = 2
 """Shapes tried between two looks at what is left; divides every number of slots."""
