@@ -18,8 +18,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from sglpr_jax.bev import Grid, rasterize
+from sglpr_jax.bev import rasterize
 from sglpr_jax.data.density_image import density_image
+from sglpr_jax.grid import Grid
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile

@@ -5,10 +5,10 @@ import dataclasses
 import jax
 import numpy as np
 
-from sglpr_jax.bev import Grid, ImageKind
-from sglpr_jax.data.density_image import SIZE
+from sglpr_jax.data.density_grid import SIZE
 from sglpr_jax.data.sampling.batch import Batch
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid, ImageKind
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset

@@ -19,8 +19,8 @@ import sglpr_jax
 from sglpr_jax.evaluation.protocols.bootstrap import interval, resampled_f1_max
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.scoring import evaluate
-from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
 from sglpr_jax.revisits import database_end, has_near
+from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 PROTOCOLS = ("top1-f1max", "pairs-f1max", "bevplace-recall-at-1")
 

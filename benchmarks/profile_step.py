@@ -68,6 +68,7 @@ def profiled(
     program = train_step.lower(state, batch, config=config).compile()
     for _ in range(WARM_UP):
         state, _ = program(state, batch)
+    jax.block_until_ready(state)  # or they would be measured too
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             for _ in range(steps):

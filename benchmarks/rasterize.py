@@ -9,7 +9,8 @@ import tyro
 from inputs import random_scans
 from ratio import Contender, Job, alternate, check_equal, report
 
-from sglpr_jax.bev import Grid, rasterize, rasterize_labels
+from sglpr_jax.bev import rasterize, rasterize_labels
+from sglpr_jax.grid import Grid
 
 
 def main(*, points: int = 120_000, size: int = 224, repeats: int = 51, calls: int = 20, threads: int = 2) -> None:

@@ -11,8 +11,8 @@ from range_images import range_image_paths, read_range_image
 from scan_statistics import HISTOGRAMS, NUMBERS, Measures, image_measures, scan_measures, total_variation
 
 from sglpr_jax.data import Recording, open_recording, recording_names
+from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.density_image import density_image
-from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.evaluation.figures import save
 from sglpr_jax.labels import to_classes
 

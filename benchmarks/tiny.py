@@ -2,9 +2,9 @@
 
 import dataclasses
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig

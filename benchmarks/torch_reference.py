@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sglpr_jax.losses import DICE_EPSILON
 from sglpr_jax.models.backbones.attention import BLOCKED, relative_position_index, shift_mask
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.backbones.swin_layers import MLP_RATIO
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import Params

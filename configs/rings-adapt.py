@@ -9,7 +9,7 @@ and 1.000 (means of two seeds). The 240 steps take four to five minutes on one C
 Command: bin/train --seq 06 --data KITTI_BEV --also SIMULATED --weights rings --preset rings-adapt
 """
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

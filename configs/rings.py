@@ -10,7 +10,7 @@ Expect: on the KITTI BEV images, trained on 00 and 02 for 320 steps (docs/log/re
 Command: bin/train --seq 06 --data KITTI_BEV --preset rings
 """
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

@@ -9,7 +9,7 @@ Expect: on the KITTI BEV images, trained on simulated towns alone, the numbers o
 Command: bin/train --seq 08 --data TOWNS --preset sglpr
 """
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

@@ -9,7 +9,7 @@ was not trained on, where the commonest class everywhere has .02.
 Command: bin/train --seq 08 --data TOWNS --preset small-stem
 """
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

@@ -9,7 +9,7 @@ Expect: on the KITTI BEV images, trained on 00 and 02 and tested on 06: top-1 F1
 Command: bin/train --seq 06 --data KITTI_BEV --preset small
 """
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 

@@ -21,11 +21,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sglpr_jax.bev import Grid, count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
+    from sglpr_jax.bev import count_outside, rasterize, rasterize_labels, rotate_image, rotate_points
     from sglpr_jax.data import Record, Recording, open_recording, read_scan, recording_names
     from sglpr_jax.data.density_image import density_bev
     from sglpr_jax.data.mounting import Mounting, estimate_mounting
     from sglpr_jax.evaluation.scoring import Evaluation, evaluate
+    from sglpr_jax.grid import Grid
     from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes
     from sglpr_jax.loops.detector import LoopDetector
     from sglpr_jax.loops.find import find_loops
@@ -33,9 +34,9 @@ if TYPE_CHECKING:
     from sglpr_jax.loops.odometry import read_odometry
     from sglpr_jax.loops.optimization import optimize_trajectory
     from sglpr_jax.loops.places import PlaceMap
-    from sglpr_jax.models.backbones.rings import RingConfig
-    from sglpr_jax.models.backbones.sglpr import SglprConfig
-    from sglpr_jax.models.backbones.swin import SwinConfig
+    from sglpr_jax.models.backbones.rings_config import RingConfig
+    from sglpr_jax.models.backbones.sglpr_config import SglprConfig
+    from sglpr_jax.models.backbones.swin_config import SwinConfig
     from sglpr_jax.models.config import HeadConfig, ModelConfig
     from sglpr_jax.models.params import Params
     from sglpr_jax.models.presets import MODELS, model_preset
@@ -56,11 +57,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "bev": ("Grid", "count_outside", "rasterize", "rasterize_labels", "rotate_image", "rotate_points"),
+    "bev": ("count_outside", "rasterize", "rasterize_labels", "rotate_image", "rotate_points"),
     "data": ("Record", "Recording", "open_recording", "read_scan", "recording_names"),
     "data.density_image": ("density_bev",),
     "data.mounting": ("Mounting", "estimate_mounting"),
     "evaluation.scoring": ("Evaluation", "evaluate"),
+    "grid": ("Grid",),
     "labels": ("CATEGORIES", "taxonomy", "to_classes"),
     "loops.detector": ("LoopDetector",),
     "loops.find": ("find_loops",),
@@ -68,9 +70,9 @@ _HOMES = {
     "loops.odometry": ("read_odometry",),
     "loops.optimization": ("optimize_trajectory",),
     "loops.places": ("PlaceMap",),
-    "models.backbones.rings": ("RingConfig",),
-    "models.backbones.sglpr": ("SglprConfig",),
-    "models.backbones.swin": ("SwinConfig",),
+    "models.backbones.rings_config": ("RingConfig",),
+    "models.backbones.sglpr_config": ("SglprConfig",),
+    "models.backbones.swin_config": ("SwinConfig",),
     "models.config": ("HeadConfig", "ModelConfig"),
     "models.params": ("Params",),
     "models.presets": ("MODELS", "model_preset"),

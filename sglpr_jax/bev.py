@@ -4,9 +4,8 @@ Points are metres in the LiDAR frame: x forward, y left, z up. Images are `image
 against the row v. Functions on clouds take any leading batch axes; a padded cloud says how many of its points count.
 """
 
-import dataclasses
 import functools
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,25 +13,7 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Float, Int, Num, Shaped
 
-from sglpr_jax.fields import Positive, Size, check_fields
-
-ImageKind = Literal["points", "density"]
-"""What the cells of a scan's image count: its points (equation 1), or voxels, as in the ready-made images of KITTI."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Grid:
-    """The image plane of equation 1: cells of `resolution_m` metres, the sensor at the corner of the middle four."""
-
-    resolution_m: Positive = 0.2
-    height: Size = 224
-    width: Size = 224
-
-    def __post_init__(self):
-        check_fields(self)
-        for name, size in (("height", self.height), ("width", self.width)):
-            if size % 2:
-                raise ValueError(f"{name}: expected an even number of cells, found {size}")
+from sglpr_jax.grid import Grid
 
 
 def _cell_of_point(points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array, "*b"] | None) -> Int[Array, "*b n"]:

@@ -58,6 +58,11 @@ def is_config(annotation: Any) -> bool:
     return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
 
 
+def has_bounds(annotation: Any) -> bool:
+    """Whether a field with this annotation holds numbers within `Bounds`."""
+    return any(isinstance(part, Bounds) or has_bounds(part) for part in typing.get_args(annotation))
+
+
 def check_value(value: Any, annotation: Any, field: str) -> None:
     """Raise ValueError, which begins with `field`, unless a field with this annotation may hold the value."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)

@@ -137,8 +137,16 @@ def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
 
 def in_short(error: Exception) -> str:
     """What an error of another library says, on one line of at most 100 characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 100 else f"{text[:97]}..."
+    return _cut(" ".join(str(error).split()) or type(error).__name__, most=100)
+
+
+def json_in_short(value: Any) -> str:
+    """A value as JSON has it, a text without quotes, in at most 80 characters."""
+    return _cut(value if isinstance(value, str) else json.dumps(value), most=80)
+
+
+def _cut(text: str, *, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 @contextlib.contextmanager

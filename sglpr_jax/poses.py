@@ -1,12 +1,8 @@
-"""Positions and their distances: what "the same place" means in metres."""
+"""Positions and their distances, rotations."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-POSITIVE_M = 3.0
-"""Two scans no farther apart than this show the same place."""
-NEGATIVE_M = 20.0
-"""Two scans farther apart than this show different places; in between nothing is claimed."""
 ROTATION_TOLERANCE = 0.01
 """Of what files say with few digits."""
 

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from sglpr_jax.poses import POSITIVE_M, distances
+from sglpr_jax.poses import distances
+from sglpr_jax.same_place import POSITIVE_M
 
 EXCLUDED_S = 30.0
 """A query is never matched with frames younger than this: they are neighbours, not a revisit."""

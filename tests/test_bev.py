@@ -8,14 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import (
-    Grid,
-    count_outside,
-    rasterize,
-    rasterize_labels,
-)
+from sglpr_jax.bev import count_outside, rasterize, rasterize_labels
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers.kitti import open_recording
+from sglpr_jax.grid import Grid
 
 # At 0.26 m, 1 / r rounded once differs from the reciprocal of a rounded r, and from a division.
 GRIDS = [Grid(), Grid(0.1), Grid(0.4, 128, 128), Grid(0.26, 96, 160), Grid(0.7, 2, 6)]

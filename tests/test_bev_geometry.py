@@ -8,16 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import (
-    Grid,
-    centre_crop,
-    even_cells,
-    rasterize,
-    rotate_image,
-    rotate_labels,
-    rotate_points,
-    uncropped,
-)
+from sglpr_jax.bev import centre_crop, even_cells, rasterize, rotate_image, rotate_labels, rotate_points, uncropped
+from sglpr_jax.grid import Grid
 
 angles = st.floats(-10, 10, width=32)
 

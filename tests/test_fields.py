@@ -6,15 +6,13 @@ from typing import Literal
 
 import pytest
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.fields import Bounds, Positive, Share, Sizes, check_fields
-from sglpr_jax.models.backbones.sglpr import SglprConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.sglpr_config import SglprConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.training.config import TrainConfig
-from sglpr_jax.training.loss import LossConfig
-from sglpr_jax.training.optimizer import OptimizerConfig
+from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from sglpr_jax.files import (
     WriteError,
     alone_in,
     half_written,
+    json_in_short,
     read_json,
     remove_half_written,
     replacing,
@@ -144,3 +145,10 @@ def test_json_that_is_damaged_names_its_file(tmp_path, content):
         read_json(tmp_path / "a.json")
     with pytest.raises(FileNotFoundError, match=rf"^{tmp_path}/b\.json: expected a JSON file, found none"):
         read_json(tmp_path / "b.json")
+
+
+def test_a_value_is_said_in_short():
+    assert json_in_short({"kind": "noise", "strength": None}) == '{"kind": "noise", "strength": null}'
+    assert json_in_short("l2") == "l2"
+    long = json_in_short(list(range(100)))
+    assert len(long) == 80 and long.startswith("[0, 1, 2") and long.endswith("...")

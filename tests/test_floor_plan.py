@@ -9,7 +9,20 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "sglpr_jax"
 FLOORS = (
-    ("bev", "fields", "files", "labels", "losses", "metrics", "poses", "progress", "revisits"),
+    (
+        "bev",
+        "categories",
+        "fields",
+        "files",
+        "grid",
+        "labels",
+        "losses",
+        "metrics",
+        "poses",
+        "progress",
+        "revisits",
+        "same_place",
+    ),
     ("data",),
     ("models", "sim"),
     ("methods",),

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.labels import CATEGORIES, RAW_NAMES, taxonomy, to_classes, to_raw
+from sglpr_jax.categories import RAW_NAMES
+from sglpr_jax.labels import CATEGORIES, taxonomy, to_classes, to_raw
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "reference" / "labels.md"
 SETTINGS = (6, 15, 20, 25, 34)

@@ -2,25 +2,16 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sglpr_jax
+
 SLOW = ("jax", "flax", "numpy", "jaxtyping")
-QUICK = (
-    "convert",
-    "demo",
-    "embed",
-    "evaluate",
-    "export",
-    "loops",
-    "map",
-    "relocalize",
-    "segment",
-    "simulate",
-    "stress",
-)
-"""Commands whose --help does not wait for JAX."""
+CLI = Path(sglpr_jax.__file__).parent / "cli"
+COMMANDS = sorted(path.stem for path in CLI.glob("*.py") if (CLI.parents[1] / "bin" / path.stem).exists())
 
 
 def imported_by(program: str, *, of: tuple[str, ...] = SLOW) -> set[str]:
@@ -31,7 +22,7 @@ def imported_by(program: str, *, of: tuple[str, ...] = SLOW) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "module", ["sglpr_jax", "sglpr_jax.data", "sglpr_jax.sim", *(f"sglpr_jax.cli.{name}" for name in QUICK)]
+    "module", ["sglpr_jax", "sglpr_jax.data", "sglpr_jax.sim", *(f"sglpr_jax.cli.{name}" for name in COMMANDS)]
 )
 def test_an_import_brings_nothing_slow(module):
     assert imported_by(f"import {module}") == set()
@@ -53,7 +44,7 @@ assert len(open_recording(Path({str(tmp_path)!r}), None, sensor_height=1.7)) == 
     assert imported_by(program, of=("scipy", "sglpr_jax.sim.simulation")) == set()
 
 
-@pytest.mark.parametrize("command", QUICK)
+@pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("flags", ["'--help'", "'--no-such-flag'"])
 def test_help_and_wrong_flags_do_not_wait_for_jax(command, flags):
     program = f"""

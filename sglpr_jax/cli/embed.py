@@ -7,7 +7,8 @@ import tyro
 
 from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
-from sglpr_jax.methods.names import MethodName
+from sglpr_jax.fields import CountOrNone, Size
+from sglpr_jax.methods.names import NETWORK, MethodName
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,11 +34,11 @@ class EmbedCommand:
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     rotate: bool = False
     """Rotate every scan about z by its own random angle first."""
-    seed: int = 0
+    seed: CountOrNone = 0
     """Draws the angles of --rotate."""
     skip_bad: bool = False
     """Report scans that cannot be read and go on without them."""
-    batch: int = 8
+    batch: Size = 8
     """Images described at a time."""
 
 
@@ -46,6 +47,8 @@ def embed_recording(command: EmbedCommand) -> Path:
     from sglpr_jax.methods.registry import method_named  # these bring JAX and more, which --help does not need
     from sglpr_jax.retrieval.embed import embed
 
+    if command.weights is not None and command.method != NETWORK:
+        raise ValueError(f"{command.weights}: expected no --weights beside --method {command.method}, found some")
     if command.out.suffix != ".npz":
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():

@@ -38,7 +38,9 @@ class EvaluateCommand:
     out: Path | None = None
     """Folder for results.json, report.html and the pictures. None: FILE without its ending."""
     poses: Path | None = None
-    """Where the frames were taken, a row each. None: as the descriptor file says, or the sequence of --data."""
+    """Where the frames were taken, a row each; of a descriptor file with times also poses of other times, which are
+    interpolated, and of one that --skip-bad left scans out of a row for each scan. None: as the descriptor file says,
+    or the sequence of --data."""
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
@@ -48,7 +50,8 @@ class EvaluateCommand:
     protocol: tuple[str, ...] = ()
     """Their names, or `all`. None named: top1-f1max, pairs-f1max and bevplace-recall-at-1."""
     compare: tuple[Path, ...] = ()
-    """Files of other methods on the same frames, to stand beside FILE."""
+    """Files of other methods on the same frames, to stand beside FILE, whose poses and times they get if they have none
+    of their own."""
     data: Path | None = None
     """A dataset with the frames as scans or images: the page then shows them. --seq says which of its sequences, and
     names a FILE that has no name of its own; published splits go by it."""

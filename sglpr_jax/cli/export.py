@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
+from sglpr_jax.fields import NotNegative
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 
@@ -35,7 +36,7 @@ class ExportCommand:
     whiten: tuple[Path, ...] = ()
     """Datasets or folders of scans; to their descriptors a last layer is fitted that evens out the spread over the
     directions (models/whitening.py), in place of one that is there."""
-    whiten_power: float = 0.5
+    whiten_power: NotNegative = 0.5
     """By which power of its spread a principal component is divided: 1 evens out all."""
 
 

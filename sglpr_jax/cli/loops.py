@@ -41,7 +41,8 @@ class LoopsCommand:
     out: Path
     """The folder to write into."""
     odometry: Path | None = None
-    """A pose for each scan, drifting as it may, or the bag itself. Without it, loops are judged by the scans alone."""
+    """A pose for each scan, drifting as it may, or poses of other times (tum), which are interpolated, or the bag
+    itself. Without it, loops are judged by the scans alone."""
     odometry_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
     weights: str = DEFAULT_WEIGHTS

@@ -33,7 +33,8 @@ class MapCommand:
     recording: Annotated[Path, tyro.conf.Positional]
     """A dataset, a bag or a folder of scans, of any layout that is known."""
     poses: Path
-    """A pose in the world for each scan: a corrected trajectory, not raw odometry; or the bag itself."""
+    """A pose in the world for each scan, or poses of other times (tum), which are interpolated: a corrected trajectory,
+    not raw odometry; or the bag itself."""
     out: Path
     """The map to write (.safetensors)."""
     pose_format: OdometryFormat = "auto"
@@ -56,6 +57,8 @@ def write_map(command: MapCommand) -> int:
 
     if command.out.suffix != ".safetensors":
         raise ValueError(f"expected --out to end in .safetensors, found {command.out}")
+    if command.out.is_dir():
+        raise IsADirectoryError(f"{command.out}: expected a file to write, found a folder")
     params = load(command.weights)
     with alone(command.out.with_suffix(UNFINISHED)):  # from reading the map that is added to until it is written
         return _add_places(command, params)

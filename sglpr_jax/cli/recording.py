@@ -44,7 +44,8 @@ class PosedRecordingOptions(RecordingOptions):
     """Which recording of a folder, how it is read, and where a plain folder of scans was taken."""
 
     poses: Path | None = None
-    """The pose file of a plain folder, a row for each scan, where none lies beside the scans."""
+    """The pose file of a plain folder, where none lies beside the scans: a row for each scan, or poses of other times,
+    which are interpolated where the scans have times too."""
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
@@ -56,7 +57,7 @@ def open_with_poses(
 ) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']]":
     """Open a recording, with a pose for each scan from the file at `path` or, where that is the bag itself, from it.
 
-    Scans about whose times a tum file has no pose are left out, which is said.
+    Poses of other times than the scans' are interpolated; scans without one are left out, which is said.
     """
     from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
 

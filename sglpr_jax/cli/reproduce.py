@@ -8,22 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.datasets import cached_sessions, dataset_root
 from sglpr_jax.cli.runtime import console, parse_command, preset_asked_for, progress_bar, run, stop_on_signal
 from sglpr_jax.cli.train import exit_unless_finished
-from sglpr_jax.data import recording_names
 from sglpr_jax.data.choices import PoseChoice
-from sglpr_jax.files import write_json
-from sglpr_jax.reproduce.check import check
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
-from sglpr_jax.reproduce.plan import make_plan, time_a_step
-from sglpr_jax.reproduce.reproduction import Reproduction, chosen_experiments, write_experiment
-from sglpr_jax.reproduce.runs import Runs
-from sglpr_jax.reproduce.tables import PaperTable
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset
 
 if TYPE_CHECKING:
+    from sglpr_jax.reproduce.plan import Plan
+    from sglpr_jax.reproduce.runs import Runs
+
     What = str
 else:
     What = Literal[("all", *EXPERIMENTS)]
@@ -75,27 +70,43 @@ def parse(arguments: list[str] | None = None) -> ReproduceCommand:
 
 def reproduce(command: ReproduceCommand) -> Path:
     """Do what the command says; returns its folder."""
+    from sglpr_jax.cli.datasets import dataset_root  # these bring JAX and more, which --help does not need
+    from sglpr_jax.data import recording_names
+    from sglpr_jax.reproduce.check import check
+    from sglpr_jax.reproduce.plan import make_plan, time_a_step
+    from sglpr_jax.reproduce.reproduction import chosen_experiments
+    from sglpr_jax.reproduce.runs import Runs
+
     names = chosen_experiments(command.what)
-    runs = Runs(
-        command.out,
-        dataset_root(command.data),
-        command.preset,
-        command.config,
-        command.pose_source,
-        progress_bar,
-    )
+    root = dataset_root(command.data)
+    runs = Runs(command.out, root, command.preset, command.config, command.pose_source, progress_bar)
     seqs = command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(runs.data))
     check(runs, names, seqs, command.method, command.nclt)
     plan = make_plan(runs, names, seqs)
     print(plan.text(time_a_step(runs, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
-    if command.plan:
-        return command.out
+    if not command.plan:
+        _train(runs, plan)
+        _write(command, names, runs, seqs)
+    return command.out
+
+
+def _train(runs: "Runs", plan: "Plan") -> None:
+    """Train what is missing; where that is asked to stop, exit with what was made saved."""
     for done, (variant, seq) in enumerate(plan.missing):
         print(f"run {done + 1} of {len(plan.missing)}: {variant}, {seq}", file=sys.stderr)
         with stop_on_signal() as stopped:
             result = runs.train(variant, seq, stopped=stopped)
         print(result, file=sys.stderr)
         exit_unless_finished(result, stopped, go_on="the same command goes on")
+
+
+def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tuple[str, ...]) -> None:
+    """Make the tables and figures of finished runs; write and print them."""
+    from sglpr_jax.cli.datasets import cached_sessions
+    from sglpr_jax.files import write_json
+    from sglpr_jax.reproduce.reproduction import Reproduction, write_experiment
+    from sglpr_jax.reproduce.tables import PaperTable
+
     write_json(command.out / "config.json", json.loads(json.dumps(dataclasses.asdict(command), default=str)))
     found = Reproduction(runs, seqs, command.method, lambda: command.nclt or cached_sessions())
     for name in names:
@@ -104,7 +115,6 @@ def reproduce(command: ReproduceCommand) -> Path:
             console().print(made)
         else:
             print(*(f"written: {path}" for path in made), sep="\n")
-    return command.out
 
 
 def main() -> None:

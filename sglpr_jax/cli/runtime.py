@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.fields import check_value, field_types, has_bounds
 
 _TABLE_WIDTH = 140
 _INSTALLED_AS = "sglpr-"
@@ -62,9 +63,21 @@ def _installed_commands() -> tuple[str, ...]:
 
 
 def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:
-    """What the flags say; the help speaks of the commands by their own names. `options` are those of `tyro.cli`."""
+    """What the flags say; the help speaks of the commands by their own names. `options` are those of `tyro.cli`.
+
+    Raises ValueError for a number that its annotation (`fields.py`) does not allow.
+    """
     about = {"prog": own_names(f"bin/{name}"), "description": own_names(inspect.getdoc(command) or ""), **options}
-    return tyro.cli(command, args=arguments, **about)
+    found = tyro.cli(command, args=arguments, **about)
+    _check_numbers(found)
+    return found
+
+
+def _check_numbers(command: Any) -> None:
+    """Raise ValueError, which begins with the flag, for a number that is not within the bounds of its annotation."""
+    for name, annotation in field_types(type(command)).items():
+        if has_bounds(annotation):
+            check_value(getattr(command, name), annotation, f"--{name.replace('_', '-')}")
 
 
 def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:

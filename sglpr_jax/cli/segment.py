@@ -7,6 +7,7 @@ import tyro
 
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
+from sglpr_jax.fields import Share
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 RESULT_FILE = "segmentation.json"
@@ -31,7 +32,7 @@ class SegmentCommand:
     weights: str = DEFAULT_WEIGHTS
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
-    min_confidence: float = 0.0
+    min_confidence: Share = 0.0
     """Leave cells unlabelled, and out of the score, whose likeliest class has a smaller probability."""
 
 
@@ -45,10 +46,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
 
-    recording = command.source.open(command.data)
-    least = command.min_confidence
-    if not 0 <= least <= 1:
-        raise ValueError(f"--min-confidence is a probability: expected 0 to 1, found {least}")
+    recording, least = command.source.open(command.data), command.min_confidence
     params = load(command.weights)
     if not params.config.segments:
         raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none in them")

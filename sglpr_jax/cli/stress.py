@@ -8,6 +8,7 @@ import tyro
 
 from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
+from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import MethodName
 
 
@@ -36,9 +37,9 @@ class StressCommand:
     corruption: tuple[str, ...] = ()
     """Names (beams-16) or kinds (beams) of corruptions. None named: all; of ready-made images rotation alone."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
-    seed: int = 0
+    seed: CountOrNone = 0
     """A scan's corruption is a function of it and the scan's number."""
-    batch: int = 8
+    batch: Size = 8
     """Images described at a time."""
 
 

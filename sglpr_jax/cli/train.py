@@ -4,11 +4,10 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
 from sglpr_jax.cli.recording import report_bad_scan
 from sglpr_jax.cli.runtime import (
     StopRequest,
@@ -20,19 +19,14 @@ from sglpr_jax.cli.runtime import (
     run,
     stop_on_signal,
 )
-from sglpr_jax.data import Recording
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
-from sglpr_jax.data.pseudo_labels import with_pseudo_labels
-from sglpr_jax.evaluation.final_test import final_test
-from sglpr_jax.evaluation.learning_curves import LearningCurves
 from sglpr_jax.methods.names import BESIDE, BesideName
-from sglpr_jax.training.callbacks import Callbacks
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
-from sglpr_jax.training.hosts import connected, is_first_host
 from sglpr_jax.training.presets import load_preset, preset_names
-from sglpr_jax.training.progress_bar import ProgressBar
-from sglpr_jax.training.recipe import TrainResult, train
-from sglpr_jax.training.tensorboard import EVENTS, EventFiles
+
+if TYPE_CHECKING:
+    from sglpr_jax.data import Recording
+    from sglpr_jax.training.recipe import TrainResult
 
 SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source")
 """Flags that a resumed run must have the same, beside its configuration."""
@@ -115,6 +109,9 @@ def parse(arguments: list[str] | None = None) -> TrainCommand:
 
 def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
     """Do what the command says; returns the run's folder. `go_on` says how a stopped training can go on."""
+    from sglpr_jax.evaluation.final_test import final_test  # these bring JAX and more, which --help does not need
+    from sglpr_jax.training.hosts import connected, is_first_host
+
     folder = run_folder(command)
     with connected(hosts=command.hosts, host_index=command.host_index, coordinator=command.coordinator):
         recordings, also, test = _recordings(command)
@@ -139,9 +136,21 @@ def settings(command: TrainCommand) -> dict[str, object]:
 
 
 def _train(
-    command: TrainCommand, recordings: Sequence[Recording], also: Sequence[Recording], test: Recording, *, go_on: str
-) -> TrainResult:
+    command: TrainCommand,
+    recordings: "Sequence[Recording]",
+    also: "Sequence[Recording]",
+    test: "Recording",
+    *,
+    go_on: str,
+) -> "TrainResult":
     """Train; where that is asked to stop, exit with what was made saved."""
+    from sglpr_jax.evaluation.learning_curves import LearningCurves
+    from sglpr_jax.training.callbacks import Callbacks
+    from sglpr_jax.training.hosts import is_first_host
+    from sglpr_jax.training.progress_bar import ProgressBar
+    from sglpr_jax.training.recipe import train
+    from sglpr_jax.training.tensorboard import EVENTS, EventFiles
+
     folder = run_folder(command)
     watched = [EventFiles(folder / EVENTS)] if command.tensorboard else []
     with stop_on_signal() as stopped:
@@ -164,15 +173,17 @@ def _train(
     return result
 
 
-def exit_unless_finished(result: TrainResult, stopped: StopRequest, *, go_on: str) -> None:
+def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, go_on: str) -> None:
     """End this process where a training was asked to stop: with 0 after SIGTERM, with 130 after Ctrl-C."""
     if not result.finished:
         print(f"stopped at step {result.steps} of {result.config.steps}; {go_on}", file=sys.stderr)
         sys.exit(stopped.exit_status)
 
 
-def _recordings(command: TrainCommand) -> tuple[Sequence[Recording], Sequence[Recording], Recording]:
+def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
     """The recordings to train on, those of --also, and the one to test on. ValueError where one cannot be used."""
+    from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
+
     root = dataset_root(command.data)
     options = {name: getattr(command, name) for name in ("pose_source", "format", "sensor_height")}
     recordings, test = leave_one_out(root, command.seq, train_seqs=command.train_seq, **options)
@@ -189,7 +200,9 @@ def _recordings(command: TrainCommand) -> tuple[Sequence[Recording], Sequence[Re
     return recordings, also, test
 
 
-def _pseudo_labelled(recordings: Sequence[Recording], folder: Path, config: TrainConfig) -> Sequence[Recording]:
+def _pseudo_labelled(recordings: "Sequence[Recording]", folder: Path, config: TrainConfig) -> "Sequence[Recording]":
+    from sglpr_jax.data.pseudo_labels import with_pseudo_labels
+
     if not config.model.segments:
         raise ValueError("--pseudo-labels are for the segmentation head: expected losses that train one, found none")
     labelled = with_pseudo_labels(recordings, folder)

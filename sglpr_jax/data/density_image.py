@@ -6,13 +6,11 @@ image as `bev_images.read_image` reads it, in the orientation of eq. 1 and on th
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, Num, UInt8
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M, as_counts
+from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M, SIZE
+from sglpr_jax.data.readers.bev_images import as_counts
 
-SIZE = 151
-"""Rows and columns of an image. The crop leaves the outer 13 empty."""
 REACH_M = 25.0
 """Points count where |x| and |y| are below this."""
 FLOOR_M = -1.2
@@ -26,6 +24,8 @@ SOME_POINTS, SOME_VOXELS = 18_000, 2**16
 """A quick count sees every n-th point, but at least so many, and voxels whose numbers differ by so many as one."""
 EDGE_STEP_M = 0.05
 FIRST_EDGE_M = 0.10
+BEYOND_COUNTS = 2.0
+"""An image that was resized smoothly has counts a little below 0 or above 10; what is farther off is no count."""
 
 
 def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 151"]:
@@ -43,12 +43,17 @@ def density_label_bev(
     return np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
 
 
-def check_density_grid(grid: Grid) -> None:
-    """Raises ValueError for a grid that cannot be cut out of density images."""
-    if grid.resolution_m != RESOLUTION_M or max(grid.height, grid.width) > SIZE:
+def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
+    """Raise ValueError, which begins with `name`, for floats that are no counts 0 to 10: grey values, counts of points.
+
+    To a model they would be a place like any other.
+    """
+    least, most = image.min(initial=0), image.max(initial=0)
+    within = least >= -BEYOND_COUNTS and most <= MAX_COUNT + BEYOND_COUNTS  # NaN is not
+    if np.issubdtype(image.dtype, np.floating) and not within:
         raise ValueError(
-            f"density images have {SIZE} x {SIZE} cells of {RESOLUTION_M} m: expected a grid of such cells, no larger, "
-            f"found {grid.height} x {grid.width} cells of {grid.resolution_m} m"
+            f"{name}: expected a density image, floats from 0 to {MAX_COUNT}, found floats from {least:g} to {most:g};"
+            f" are these grey values, of which 255 stands for {MAX_COUNT}, or counts of points?"
         )
 
 

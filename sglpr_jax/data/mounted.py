@@ -8,6 +8,7 @@ from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
+from sglpr_jax.fields import require
 
 SCANS = 11
 """From so many scans, all over a recording, the mounting is found."""
@@ -30,6 +31,7 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
         return recording
     if height in ("auto", "estimate"):
         return _estimated(recording)
+    require(height, not isinstance(height, str), "metres over the ground, 'auto' or 'estimate'", "sensor_height")
     mounting = Mounting(float(height))
     return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, f"sensor: {mounting}, as said"))
 

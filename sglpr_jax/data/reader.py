@@ -6,11 +6,12 @@ from pathlib import Path
 
 from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.fields import check_value, field_types
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a user may say about a dataset; a reader uses what concerns it."""
+    """What a user may say about a dataset; a reader uses what concerns it. Raises ValueError for an unknown choice."""
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
@@ -22,6 +23,10 @@ class ReadOptions:
     """Seconds, one number a line."""
     pose_topic: str | None = None
     """The topic of a bag's poses, where it has several."""
+
+    def __post_init__(self):
+        for name in ("pose_source", "format", "pose_format"):
+            check_value(getattr(self, name), field_types(ReadOptions)[name], name)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float, Float32, Int, Int32, Num
 
 from sglpr_jax.bev import (
-    Grid,
-    ImageKind,
     centre_crop,
     even_cells,
     rasterize,
@@ -22,8 +20,10 @@ from sglpr_jax.bev import (
     rotate_points,
 )
 from sglpr_jax.data.degenerate import check_cloud
-from sglpr_jax.data.density_image import check_density_grid, density_bev, density_label_bev
+from sglpr_jax.data.density_grid import check_density_grid
+from sglpr_jax.data.density_image import check_density_counts, density_bev, density_label_bev
 from sglpr_jax.data.record import Record
+from sglpr_jax.grid import Grid, ImageKind
 
 _POINTS_STEP = 16384
 """Clouds are padded to a multiple of this, so that few sizes are compiled."""
@@ -49,11 +49,12 @@ def view(
 
     `image` says what the points of a scan are made into; a ready-made image is cut to the grid, or left whole with
     None. With `angle` (radians, counter-clockwise) the place is rotated first. Raises ValueError for a scan that shows
-    no place (`check_cloud`) or has no grid, for a grid that has no density image, and for a record without the labels
-    asked for.
+    no place (`check_cloud`) or has no grid, for a grid that has no density image, for a ready-made image that is none
+    of densities where one is asked for, and for a record without the labels asked for.
     """
     classes = classes_of(record, categories) if categories else None
     if record.points is None:
+        check_ready_made(record, image)
         return image_view(*picture(record, classes), grid, angle)
     check_cloud(record.points, name=record.name)
     if grid is None:
@@ -66,6 +67,12 @@ def view(
     points = jnp.asarray(np.pad(record.upright_points, ((0, padding), (0, 0))))
     padded = None if classes is None else jnp.asarray(np.pad(classes, (0, padding)))
     return cloud_view(points, padded, jnp.int32(len(record.points)), grid, angle)
+
+
+def check_ready_made(record: Record, image: ImageKind) -> None:
+    """Raise ValueError for a record with a ready-made image that cannot be of this kind."""
+    if image == "density" and record.image is not None:
+        check_density_counts(record.image, name=record.name)
 
 
 def classes_of(record: Record, categories: int) -> Int32[np.ndarray, "..."]:

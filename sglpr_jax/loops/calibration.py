@@ -21,7 +21,7 @@ from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, reca
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import align
 from sglpr_jax.models.params import Params
-from sglpr_jax.poses import NEGATIVE_M
+from sglpr_jax.same_place import NEGATIVE_M
 
 NEAR_M = (2.0, 10.0)
 """How far apart the frames of a certain loop are."""

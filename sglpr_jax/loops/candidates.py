@@ -11,20 +11,21 @@ from jaxtyping import Bool, Float, Float32, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.readers.bev_images import MAX_COUNT
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import image_view, picture, view
+from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
-from sglpr_jax.poses import NEGATIVE_M
 from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
+from sglpr_jax.same_place import NEGATIVE_M
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +77,7 @@ class CandidateFinder:
         config: CandidateConfig = CandidateConfig(),
         verification: VerificationConfig = VerificationConfig(),
     ):
+        check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
         self.params, self.config, self.verification = params, config, verification

@@ -3,21 +3,19 @@
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.choices import MIN_PROBABILITY
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
+from sglpr_jax.loops.given import given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import VerificationConfig
 from sglpr_jax.models.params import Params
-from sglpr_jax.poses import are_rotations
-
-MOST_COLUMNS = 8
-"""No image is as narrow; points with so many are rows of a file, with intensity and more."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +62,8 @@ class LoopDetector:
         """All pairs that were looked at."""
         self.loops: list[Loop] = []
         """All that were returned."""
+        self.by_scans: set[int] = set()
+        """The frames that would have a loop by the scans alone: odometry that most of them contradict is none."""
         self._waiting: list[Loop] = []
 
     def __len__(self) -> int:
@@ -72,19 +72,20 @@ class LoopDetector:
 
     def add(
         self,
-        scan: Record | Float[np.ndarray, "..."],
+        scan: Record | ArrayLike,
         *,
         time: float | None = None,
-        odometry: Float[np.ndarray, "4 4"] | None = None,
+        odometry: ArrayLike | None = None,
     ) -> list[Loop]:
         """Add the next frame; return the loops that it closes or confirms, of this and of the last few frames.
 
         `scan` is a record (with the sensor's mounting, where it has one), points (n, 3) in metres or an image (h, w) as
         `density_bev` makes them; `time` seconds; `odometry` the pose of the LiDAR in a frame that stays, drifting as it
         may. Raises ValueError for values of another shape, for times that go back, and where some frames have a time or
-        odometry and others not.
+        odometry and others not; TypeError for what is no array of numbers, a path for instance.
         """
-        return self.add_seen(self.finder.seen(_record(scan)), time=time, odometry=_pose(odometry))
+        record, pose = given_record(scan), given_pose(odometry)
+        return self.add_seen(self.finder.seen(record), time=given_time(time), odometry=pose)
 
     def add_seen(
         self,
@@ -115,19 +116,18 @@ class LoopDetector:
         """Probable loops of the last frames that neighbours and, where there is odometry, other loops speak for."""
         rules = self.config.consistency
         odometry = np.stack(self.finder.odometry) if self.finder.odometry else None
-        if odometry is None:
-            pairs = agree_in_order(self._waiting, config=rules)
-        else:
-            pairs = agree(self._waiting, odometry, mounting=self.finder.mounting, config=rules)
+        found = self._supported(agree_in_order(self._waiting, config=rules))
+        self.by_scans |= {loop.query for loop in found}
+        if odometry is not None:
+            found = self._supported(agree(self._waiting, odometry, mounting=self.finder.mounting, config=rules))
         done = {loop.query for loop in self.loops[-rules.neighbours :]}
-        return [
-            loop
-            for loop, supporters in zip(self._waiting, pairs.sum(axis=1), strict=True)
-            if loop.probability >= self.config.min_probability
-            and supporters >= rules.support
-            and loop.query not in done
-            and (odometry is None or self._agrees(loop, odometry))
-        ]
+        return [loop for loop in found if loop.query not in done and (odometry is None or self._agrees(loop, odometry))]
+
+    def _supported(self, pairs: Bool[np.ndarray, "n n"]) -> list[Loop]:
+        """The probable loops of the last frames with which enough of these agree; `pairs` says which do."""
+        enough = pairs.sum(axis=1) >= self.config.consistency.support
+        probable = [loop.probability >= self.config.min_probability for loop in self._waiting]
+        return [loop for loop, fits in zip(self._waiting, enough & probable, strict=True) if fits]
 
     def _agrees(self, loop: Loop, odometry: Float[np.ndarray, "n 4 4"]) -> bool:
         """Whether it agrees with most of the loops about it."""
@@ -143,24 +143,3 @@ class LoopDetector:
     def _loop(self, one: Candidate, probability: float) -> Loop:
         mountings = dict.fromkeys(("query_mounting", "match_mounting"), self.finder.mounting)
         return planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
-
-
-def _record(scan: Record | Float[np.ndarray, "..."]) -> Record:
-    if isinstance(scan, Record):
-        return scan
-    values = np.asarray(scan, np.float32)
-    if values.ndim != 2:
-        raise ValueError(f"expected points (n, 3) or an image (h, w), found an array of shape {values.shape}")
-    if 3 < values.shape[1] <= MOST_COLUMNS:
-        raise ValueError(f"expected points of x, y and z alone, (n, 3), found an array of shape {values.shape}")
-    return Record(points=values) if values.shape[1] == 3 else Record(image=values)
-
-
-def _pose(odometry: Float[np.ndarray, "..."] | None) -> Float[np.ndarray, "4 4"] | None:
-    if odometry is None:
-        return None
-    pose = np.asarray(odometry, np.float64)
-    turned = pose[:3, :3] if pose.shape == (4, 4) else np.zeros((3, 3))
-    if not (np.isfinite(pose).all() and are_rotations(turned)):
-        raise ValueError(f"expected odometry as a 4 x 4 pose with a rotation, found {pose.tolist()}")
-    return pose

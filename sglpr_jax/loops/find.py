@@ -8,21 +8,27 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.candidates import Candidate, Seen
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.given import check_is, given_poses
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.registration import check_installed, register
 from sglpr_jax.loops.unfinished import Unfinished, settings
+from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.embed import OnBadScan
 
 MIN_OVERLAP = 0.6
 """Registered scans that share less of their space show two places. Measured: docs/decisions/loops.md."""
+FEWEST_AGAINST = 5
+"""Fewer loops than this contradict good odometry now and then."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ def find_loops(
     recording: Recording,
     params: Params,
     *,
-    odometry: Float[np.ndarray, "n 4 4"] | None = None,
+    odometry: ArrayLike | None = None,
     model: LoopModel | None = None,
     config: DetectorConfig = DetectorConfig(),
     registered: bool = False,
@@ -82,13 +88,16 @@ def find_loops(
     numbers. Scans that show next to nothing have no loops. With `kept_in`, a folder, what was seen of the scans is kept
     there, and a run that was killed goes on from it, if the recording, the odometry, the weights and the settings are
     the same; the folder stays. Ends early, with what was found, when `should_stop` says so: loops that are not
-    registered then are in the plane, without an overlap. `on_progress` is told how many scans are done. Raises
-    ValueError for odometry of another length and where no scan can be read or shows something, ImportError without the
-    extra, and what reading the scans raises.
+    registered then are in the plane, without an overlap. `on_progress` is told how many scans are done. Warns of
+    odometry that most of the loops contradict, as they do in other axes. Raises ValueError for odometry of another
+    length or shape and where no scan can be read or shows something, TypeError for what is no recording, no params or
+    no array, ImportError without the extra, and what reading the scans raises.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
+    check_is(recording, Recording, by="open_recording")
+    odometry = None if odometry is None else given_poses(odometry, of="odometry")
     if odometry is not None and len(odometry) != len(recording):
         raise ValueError(
             f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(odometry)}"
@@ -97,6 +106,8 @@ def find_loops(
         raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
     if registered:
         check_installed()
+    if odometry is not None:
+        check_level(odometry, recording.mounting, name=recording.name)
     detector = LoopDetector(params, model=model, config=config)
     given = functools.partial(_given, recording, odometry)
     kept = None
@@ -122,6 +133,8 @@ def find_loops(
     loops, refused = settled(
         recording, detector.loops, odometry, config, registered=registered, should_stop=should_stop
     )
+    if odometry is not None:
+        _check_odometry(recording.name, detector.by_scans, loops, refused)
     left = sum(loop.overlap is None for loop in loops) if registered else 0
     seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model, "unregistered": left}
     return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
@@ -147,6 +160,23 @@ def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i:
     """Time and odometry of a frame."""
     time = None if recording.times is None else float(recording.times[i])
     return {"time": time, "odometry": None if odometry is None else odometry[i]}
+
+
+def _check_odometry(name: str, by_scans: set[int], loops: list[Loop], refused: list[Loop]) -> None:
+    """Warn where most frames that have a loop by the scans alone have none that agrees with the odometry.
+
+    Drift does not do that, other axes do: the loops left are then few, and `refused` has not those that the detector
+    did not return.
+    """
+    agreeing = {loop.query for loop in loops} | {loop.query for loop in refused if loop.overlap is not None}
+    against = by_scans - agreeing
+    if len(against) < FEWEST_AGAINST or 2 * len(against) <= len(by_scans):
+        return
+    warn(
+        f"{name}: expected odometry that most loops agree with, found {len(against)} of {len(by_scans)} loops that are "
+        "probable by the scans against it: check the frame and the axes of its file (x forward, y left, z up, of the "
+        "LiDAR, not of a camera), and whether its poses are those of these scans"
+    )
 
 
 def settled(

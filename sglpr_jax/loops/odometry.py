@@ -7,16 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import columns_of
-from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.formats.scan_poses import poses_at_scans
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.choices import OdometryFormat
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
-from sglpr_jax.loops.transforms import quaternions
 from sglpr_jax.poses import are_rotations
 
-LEAST_SHARE = 0.5
-"""Of the scans must have poses about their times, for a file to be their odometry."""
 BAGS = (".bag", ".mcap", ".db3")
 
 
@@ -43,40 +40,22 @@ def at_scans(
 ) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
     """The recording, and a pose for each of its scans from what `read_odometry` found at `path`.
 
-    Poses go with the scans row by row; where the scans have no times, they get those of a tum file. One of another
-    length is interpolated at the times of the scans; those more than 1 s between two poses, or before the first and
-    after the last, are left out, which is told. Raises ValueError where these are most, and where the length is another
-    one and nothing tells the times.
+    Poses go with the scans row by row, or by the times of a tum file where these are others (`poses_at_scans`, whose
+    errors these are); scans without a pose are left out, which is told. Scans without times get those of a tum file.
     """
     tum = (_format_of(path) if format == "auto" else format) == "tum"
-    if len(odometry) == len(recording):
-        return (_timed(recording, path) if tum and recording.times is None else recording), odometry
-    if recording.times is None or not tum:
-        why = "the scans have no times" if tum else "the file has no times"
-        raise ValueError(
-            f"{path}: expected {len(recording)} poses, one for each scan of {recording.name}, found {len(odometry)}, "
-            f"and {why} to interpolate at"
-        )
-    stamps, times = read_tum(path)[1], recording.times
-    kept, positions = interpolate(stamps, odometry[:, :3, 3], times)
-    if kept.mean() < LEAST_SHARE:
-        raise ValueError(
-            f"{path}: expected odometry of {len(recording)} poses, one for each scan of {recording.name}, or poses at "
-            f"most 1 s apart about the times of these, {times[0]:.1f} to {times[-1]:.1f} s, found {len(odometry)} of "
-            f"{stamps[0]:.1f} to {stamps[-1]:.1f} s"
-        )
-    turned = interpolate_turns(stamps, quaternions(odometry), times)
-    missing = len(kept) - int(kept.sum())
-    left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
-    said = f"odometry: {len(odometry)} poses of {path.name}, interpolated at the times of the scans{left_out}"
-    chosen = only(recording, np.flatnonzero(kept).tolist())
-    return dataclasses.replace(chosen, found=(*chosen.found, said)), poses_of(positions, turned)[kept]
-
-
-def _timed(recording: Recording, path: Path) -> Recording:
-    """The recording with the times of a tum file that has a row for each scan."""
-    times = read_tum(path)[1]
-    return dataclasses.replace(recording, times=times, found=(*recording.found, f"times: those of {path.name}"))
+    stamps = read_tum(path)[1] if tum else None
+    found = poses_at_scans(
+        str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
+    )
+    if recording.times is None and stamps is not None:
+        said = f"times: those of {path.name}"
+        return dataclasses.replace(recording, times=stamps, found=(*recording.found, said)), found.poses
+    if not found.said:
+        return recording, found.poses
+    chosen = only(recording, np.flatnonzero(found.kept).tolist())
+    said = f"odometry: {len(odometry)} poses of {path.name}, {found.said}"
+    return dataclasses.replace(chosen, found=(*chosen.found, said)), found.poses
 
 
 def is_own(path: Path, root: Path) -> bool:
@@ -102,7 +81,7 @@ def _format_of(path: Path) -> OdometryFormat:
     if path.suffix in BAGS:
         raise ValueError(f"{path}: expected odometry from a file, or the bag that has the scans, found another bag")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected odometry, found no file")
+        raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
     if path.suffix == ".g2o":
         return "g2o"
     columns = columns_of(path)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Num
 from scipy.ndimage import map_coordinates
 
-from sglpr_jax.data.readers.bev_images import RESOLUTION_M
+from sglpr_jax.data.density_grid import RESOLUTION_M
 from sglpr_jax.loops.transforms import inverse
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
@@ -16,14 +17,16 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Seen
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
+from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.unfinished import Unfinished, settings
+from sglpr_jax.loops.upright import check_level
 from sglpr_jax.loops.verification import VerificationConfig, align_all
 from sglpr_jax.models.params import Params
-from sglpr_jax.poses import NEGATIVE_M
 from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.same_place import NEGATIVE_M
 
 ARRAYS = ("images", "world_from_place", "mountings")
 """What a map's file holds beside the index."""
@@ -73,7 +76,7 @@ class PlaceMap:
         cls,
         recording: Recording,
         params: Params,
-        poses: Float[np.ndarray, "n 4 4"],
+        poses: ArrayLike,
         *,
         spacing_m: float = SPACING_M,
         on_progress: Callable[[int], None] = lambda done: None,
@@ -109,14 +112,21 @@ class PlaceMap:
         return PlaceMap(index, *both)
 
     def relocate(
-        self, params: Params, record: Record, *, model: LoopModel | None = None, candidates: int = CANDIDATES
+        self,
+        params: Params,
+        record: Record | ArrayLike,
+        *,
+        model: LoopModel | None = None,
+        candidates: int = CANDIDATES,
     ) -> list[Relocated]:
         """Where a scan or image may have been taken: the poses by its nearest places, the most probable first.
 
-        The record's mounting says how its sensor is mounted; `mounting()` is that of the map's. None for a scan that
-        shows next to nothing. Raises ValueError where other weights made the map.
+        The record's mounting says how its sensor is mounted; `mounting()` is that of the map's, which points (n, 3) are
+        taken to have. None for a scan that shows next to nothing. Raises ValueError where other weights made the map
+        and for an array of another shape, TypeError for what is no record, no params and no array.
         """
         finder = CandidateFinder(params)
+        record = given_record(record, mounting=self.mounting() if len(self) else None)
         descriptor, image, mounting = finder.seen(record)
         exclude = np.full(len(self), finder.is_empty(image))
         found = self.index.query(descriptor, candidates, exclude=exclude, weights_hash=finder.index.weights_hash)
@@ -222,7 +232,7 @@ class Mapped(NamedTuple):
 def map_recording(
     recording: Recording,
     params: Params,
-    poses: Float[np.ndarray, "n 4 4"],
+    poses: ArrayLike,
     *,
     spacing_m: float = SPACING_M,
     on_bad_scan: OnBadScan | None = None,
@@ -234,11 +244,14 @@ def map_recording(
 
     A place's id is `RECORDING/SCAN`. Scans nearer than `spacing_m` to the last place are not read; those that show next
     to nothing are left out. `on_bad_scan`, `kept_in`, `should_stop` and `on_progress` are as in `find_loops`. Raises
-    ValueError for poses of another length, and for a recording without scans that show something.
+    ValueError for poses of another length or shape, and for a recording without scans that show something; TypeError
+    for what is no recording, no params or no array.
     """
+    check_is(recording, Recording, by="open_recording")
+    poses = given_poses(poses, of="poses")
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
-    poses = np.asarray(poses, np.float64)
+    check_level(poses, recording.mounting, name=recording.name)
     finder = CandidateFinder(params)
     kept = None if kept_in is None else _recalled(Path(kept_in), finder, recording, poses, spacing_m, on_bad_scan)
     looked_at: list[int] = []  # rows of the recording, whose frames the finder has

@@ -19,9 +19,11 @@ def read_query(
 
     "auto" looks into a .bin whose name says nothing, as opening a folder of such does.
     `sensor_height` is metres above the ground, "estimate" finds it and the tilt from the scan, "auto" takes the
-    mounting of the map's last place. Raises what `scan_record` and `read_image` do, and ValueError where there is no
-    ground to estimate from.
+    mounting of the map's last place. Raises what `scan_record` and `read_image` do, IsADirectoryError for a folder, and
+    ValueError where there is no ground to estimate from.
     """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected one scan or image, found a folder; name a file in it")
     if path.suffix == ".png":
         return Record(image=read_image(path))
     record = scan_record(path, format=_found(path) if format == "auto" else format)

@@ -130,8 +130,11 @@ class Unfinished:
 def alone(folder: Path) -> Iterator[None]:
     """Make the folder, keep other processes out of it, and remove in the end what was made where nothing is in it.
 
-    Raises BlockingIOError where another process has it.
+    Raises BlockingIOError where another process has it, NotADirectoryError where a file lies in the way.
     """
+    there = next(one for one in (folder, *folder.parents) if one.exists())
+    if not there.is_dir():
+        raise NotADirectoryError(f"{there}: expected a folder to write into, found a file")
     made = [one for one in (folder, *folder.parents) if not one.exists()]
     with writing(folder, *folder.parents):
         folder.mkdir(parents=True, exist_ok=True)

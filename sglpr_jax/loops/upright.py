@@ -8,7 +8,26 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.transforms import inverse
+
+LEAST_WAY_M = 20.0
+"""Of shorter ways nothing is said."""
+STEEPEST = 0.7
+"""No vehicle goes on more steeply than that over all of its way: the sine of 45 degrees."""
+
+
+def check_level(poses: Float[np.ndarray, "n 4 4"], mounting: Mounting | None, *, name: str) -> None:
+    """Warn of poses by which the sensor goes up or down more than on: a camera's, whose z is forward, were read."""
+    steps = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
+    way = float(np.linalg.norm(steps, axis=1).sum())
+    up = (0.0, 0.0, 1.0) if mounting is None else mounting.up
+    climbed = float(np.abs(steps @ np.array(up)).sum())
+    if way > LEAST_WAY_M and climbed > STEEPEST * way:
+        warn(
+            f"{name}: expected poses of a LiDAR that goes along the ground (x forward, y left, z up), found "
+            f"{climbed:.0f} of {way:.0f} m of way up or down: are they in the axes of a camera (kitti)?"
+        )
 
 
 def upright_from_lidar(mounting: Mounting | None) -> Float[np.ndarray, "4 4"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, Num
 from scipy.fft import next_fast_len
 
 from sglpr_jax.bev import centre_crop, rotate_image
-from sglpr_jax.data.readers.bev_images import RESOLUTION_M
+from sglpr_jax.data.density_grid import RESOLUTION_M
 
 
 @dataclasses.dataclass(frozen=True)

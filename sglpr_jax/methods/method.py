@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
-from sglpr_jax.bev import Grid, ImageKind
+from sglpr_jax.grid import Grid, ImageKind
 
 DescribeFn = Callable[..., Float[Any, "b d"]]
 """Images of point counts (b, h, w) and, where asked for, maps of classes (b, h, w) in; one descriptor each out."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from sglpr_jax.bev import Grid
 from sglpr_jax.data import Recording
+from sglpr_jax.grid import Grid
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED

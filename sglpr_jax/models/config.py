@@ -1,18 +1,19 @@
 """What a model is, as plain values: the static part of its parameters.
 
-Here stands what all models share; each backbone keeps its own configuration beside its layers.
+Here stands what all models share; each backbone keeps its own configuration beside its layers. Neither imports JAX, so
+that a command line can name all fields at once.
 """
 
 import dataclasses
 from typing import Literal
 
-from sglpr_jax.bev import Grid, ImageKind
-from sglpr_jax.data.density_image import check_density_grid
+from sglpr_jax.categories import RAW_IDS, Categories
+from sglpr_jax.data.density_grid import check_density_grid
 from sglpr_jax.fields import NotNegative, Size, SizeOrNone, Sizes, check_fields
-from sglpr_jax.labels import Categories, taxonomy
-from sglpr_jax.models.backbones.rings import RingConfig
-from sglpr_jax.models.backbones.sglpr import SglprConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid, ImageKind
+from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.sglpr_config import SglprConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 
 BackboneConfig = SwinConfig | RingConfig | SglprConfig
 """The backbones there are; `models/backbones/interface.py` says what each one has."""
@@ -153,7 +154,7 @@ class ModelConfig:
     @property
     def classes(self) -> int:
         """Classes of a semantic map, the unlabelled one included."""
-        return len(taxonomy(self.categories).names) if self.categories else 0
+        return len(RAW_IDS[self.categories]) if self.categories else 0
 
     @property
     def categories_read(self) -> int:

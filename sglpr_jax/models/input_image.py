@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.data.readers.bev_images import MAX_COUNT
+from sglpr_jax.data.density_grid import MAX_COUNT
+from sglpr_jax.grid import Grid
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.polar import to_polar
 

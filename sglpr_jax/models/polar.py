@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.grid import Grid
 
 
 class Taps(NamedTuple):

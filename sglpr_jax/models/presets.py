@@ -2,10 +2,10 @@
 
 import dataclasses
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.models.backbones.rings import RingConfig
-from sglpr_jax.models.backbones.sglpr import SglprConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.sglpr_config import SglprConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 
 _PAPER = ModelConfig()

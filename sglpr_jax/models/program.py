@@ -15,7 +15,7 @@ import jax
 import jax.export
 import numpy as np
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.data.density_image import (
     CEILING_M,
     EDGE_STEP_M,
@@ -25,8 +25,9 @@ from sglpr_jax.data.density_image import (
     REACH_M,
 )
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
-from sglpr_jax.data.readers.bev_images import MAX_COUNT, RESOLUTION_M
+from sglpr_jax.fields import check_value
 from sglpr_jax.files import check_holds_only, replacing, write_json
+from sglpr_jax.grid import Grid
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
@@ -50,8 +51,9 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
 
     `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; it needs the package flatbuffers. `onnx`
     needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; FileExistsError where
-    the folder holds other files; ValueError for a model that reads labels too.
+    the folder holds other files; ValueError for another format and for a model that reads labels too.
     """
+    check_value(format, ProgramFormat, "format")
     folder = Path(folder)
     if params.config.head.reads_labels:
         raise ValueError(f"expected a model that reads images alone, found one that reads {params.config.head.input}")

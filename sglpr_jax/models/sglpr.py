@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
+from sglpr_jax.models.backbones.build import build
 from sglpr_jax.models.backbones.interface import Backbone, Seen
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.heads.place import PlaceHead
@@ -53,7 +54,7 @@ class SGLPR(nn.Module):
             features = raw_input(image, labels, config)
             descriptor, maps = place_head(features)
             return Outputs(descriptor, None, {"raw_input": features, **maps})
-        backbone = config.backbone.build(circular=config.polar is not None)
+        backbone = build(config.backbone, circular=config.polar is not None)
         seen = backbone(backbone_view(image, config), train=train)
         pixels = backbone.decode(seen) if config.head.tap == "pixels" else None
         descriptor, maps = place_head(seen.features if pixels is None else pixels)

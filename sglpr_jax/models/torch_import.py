@@ -13,7 +13,7 @@ import safetensors
 import safetensors.numpy
 
 from sglpr_jax.files import in_short
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import SGLPR

@@ -8,6 +8,7 @@ import jax
 
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS
 from sglpr_jax.reproduce.runs import Runs
+from sglpr_jax.revisits import revisits
 from sglpr_jax.training.batches import TupleBatches, tuple_pool
 from sglpr_jax.training.state import new_state
 from sglpr_jax.training.step import train_step
@@ -22,6 +23,8 @@ class Plan:
     runs: tuple[tuple[str, str], ...]
     missing: tuple[tuple[str, str], ...]
     steps: int
+    without_revisits: tuple[str, ...] = ()
+    """The recordings to be tested on that never come back: nothing scores there."""
 
     def text(self, seconds_per_step: float | None) -> str:
         """The plan in words."""
@@ -30,6 +33,8 @@ class Plan:
         for variant in dict.fromkeys(variant for variant, _ in self.missing):
             recordings = ", ".join(seq for name, seq in self.missing if name == variant)
             lines.append(f"  {VARIANTS[variant].label}: to train for {recordings}")
+        if self.without_revisits:
+            lines.append(f"no revisits in {', '.join(self.without_revisits)}: no scores there, and no means")
         if self.missing and seconds_per_step is not None:
             minutes = len(self.missing) * self.steps * seconds_per_step / 60
             lines.append(f"about {minutes:.0f} min of training ({seconds_per_step:.2g} s a step), and compilation")
@@ -46,7 +51,14 @@ def make_plan(runs: Runs, names: Sequence[str], seqs: Sequence[str]) -> Plan:
         of_one = seqs[:1] if EXPERIMENTS[name].across_sessions else seqs
         needed |= {(variant, seq): None for variant in EXPERIMENTS[name].variants for seq in of_one}
     missing = tuple(run for run in needed if not runs.is_trained(*run))
-    return Plan(tuple(needed), missing, runs.config.steps)
+    scored = () if all(EXPERIMENTS[name].across_sessions for name in names) else seqs
+    return Plan(tuple(needed), missing, runs.config.steps, tuple(seq for seq in scored if not _comes_back(runs, seq)))
+
+
+def _comes_back(runs: Runs, seq: str) -> bool:
+    """Whether a recording has a revisit, by the rule of top-1 F1max."""
+    recording = runs.recording(seq)
+    return recording.positions is None or bool(revisits(recording.positions, times=recording.times).any())
 
 
 def time_a_step(runs: Runs, variant: str, seq: str) -> float:

@@ -10,6 +10,8 @@ from rich.table import Table
 from sglpr_jax.evaluation.report import PrintsItself
 
 OURS, PUBLISHED = "here", "published"
+NONE, NO_REVISITS = "-", "no revisits"
+"""What a cell says in place of a number: there is none, and why ours is missing."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,9 @@ class PaperTable(PrintsItself):
         return ["method", "source", *self.columns, "mean", *(["change"] if self._has_change else [])]
 
     def _cells(self, row: Row) -> list[str]:
-        scores = (_text(row.scores.get(name)) for name in self.columns)
-        change = "" if row.change is None else f"{row.change:+.3f}"
+        missing = NO_REVISITS if row.source == OURS else NONE
+        scores = (_text(row.scores.get(name), missing) for name in self.columns)
+        change = NONE if row.change is None else f"{row.change:+.3f}"
         return [row.label, row.source, *scores, _text(row.mean(self.columns)), *([change] if self._has_change else [])]
 
 
@@ -83,5 +86,5 @@ def score_or_none(score: float) -> float | None:
     return None if math.isnan(score) else score
 
 
-def _text(score: float | None) -> str:
-    return "" if score is None else f"{score:.3f}"
+def _text(score: float | None, missing: str = NONE) -> str:
+    return missing if score is None else f"{score:.3f}"

@@ -2,16 +2,18 @@
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sglpr_jax.files import parse_json, read_arrays, replacing
+from sglpr_jax.files import json_in_short, parse_json, read_arrays, replacing
 
 FORMAT = "sglpr-jax descriptors 2"
 """Stands in every file; its number grows when an older reader could no longer understand one."""
+SKIPPED = "skipped"
+"""The key of `config` under which stand the rows of a recording that were left out."""
 FORMAT_1 = "sglpr-jax descriptors 1"
 """Knew no distance: its descriptors are compared by L2."""
 
@@ -66,6 +68,27 @@ class DescriptorFile:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @property
+    def recorded(self) -> np.ndarray:
+        """Of each scan of the recording, those too that were left out, whether it is here.
+
+        Raises ValueError where `config` does not say it in numbers of rows.
+        """
+        skipped = self.config.get(SKIPPED, [])
+        n = len(self) + len(skipped) if isinstance(skipped, list) else 0
+        if not n or len({row for row in skipped if type(row) is int and 0 <= row < n}) < len(skipped):
+            raise ValueError(f"expected the rows that were skipped, found {skipped!r:.60}")
+        return ~np.isin(np.arange(n), skipped)
+
+    def only(self, rows: np.ndarray) -> "DescriptorFile":
+        """The file of those of its scans of which `rows`, a mask, says that they stay."""
+        arrays = {name: getattr(self, name) for name in ("positions", "times", "descriptors")}
+        chosen = {name: None if array is None else array[rows] for name, array in arrays.items()}
+        recorded = self.recorded
+        recorded[recorded] = rows
+        config = {**self.config, SKIPPED: np.flatnonzero(~recorded).tolist()}
+        return replace(self, ids=tuple(np.array(self.ids)[rows].tolist()), config=config, **chosen)
 
     def save(self, path: Path | str) -> None:
         """Write the file whole or not at all: a broken run leaves what was at `path` before."""
@@ -123,7 +146,7 @@ def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
         if ours != theirs:
             raise ValueError(
                 f"expected the descriptors of {b.sequence} to be made as those of {a.sequence}, with {what} "
-                f"{_short(ours)}, found {_short(theirs)}"
+                f"{json_in_short(ours)}, found {json_in_short(theirs)}"
             )
 
 
@@ -136,11 +159,6 @@ def _made_by(file: DescriptorFile) -> dict[str, Any]:
         "model": json.loads(json.dumps([config["model"], config["grid"]])),  # as a file has them: tuples are lists
         "weights": file.weights_hash,
     }
-
-
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
-    return text if len(text) <= 64 else f"{text[:61]}..."
 
 
 def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:

@@ -12,19 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32, Num
 
-from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, classes_of, rotated, view
+from sglpr_jax.fields import Size, check_value
+from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import DescribeFn, DescribeScanFn, ImageMethod, Method, ScanMethod
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.params import Params
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
 
 OnBadScan = Callable[[str, Exception], None]
 T = TypeVar("T")
@@ -46,7 +47,7 @@ def embed(
     With `rotation_seed` every scan is first rotated about z by its own random angle. A model describes `batch` scans
     at a time. A scan that cannot be read, or shows no place, raises its error, or, given `on_bad_scan(id, error)`, is
     left out. `on_progress` is told how many scans are done. Raises ValueError where the recording has not the points or
-    the labels that the method needs.
+    the labels that the method needs, for ready-made images that cannot be what the model wants, and for no batch.
 
     Example:
       params = sglpr_jax.load("sglpr")
@@ -87,6 +88,7 @@ def embed_images(
     scans are made into, `field` in which cells the method looks (None: in all). With `categories` the labels beside the
     scans are read too, and `describe` gets each scan's map of so many classes. The other options are those of `embed`.
     """
+    check_value(batch, Size, "batch")
     angles = _angles(len(recording), rotation_seed)
     rows, views = [], []
     descriptors = _Descriptors()
@@ -243,6 +245,8 @@ def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], 
     """The descriptors of these rows of a recording; ValueError where there are none."""
     if not rows:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+    if len(rows) < len(recording):  # so that poses of all its scans can be given later
+        about["config"] = {**about["config"], SKIPPED: sorted(set(range(len(recording))) - set(rows))}
     return DescriptorFile(
         sequence=recording.name,
         ids=tuple(recording.ids[row] for row in rows),

@@ -244,7 +244,7 @@ def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The JSON part and the arrays of an index; ValueError where a byte of it is not what was written."""
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected an index, found none")
+        raise FileNotFoundError(f"{path}: expected an index, found {'a folder' if path.is_dir() else 'none'}")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}

@@ -9,6 +9,7 @@ from typing import Any
 from sglpr_jax.data import Recording
 from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION, Corruption
+from sglpr_jax.files import json_in_short
 from sglpr_jax.methods.method import Method
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
@@ -87,12 +88,7 @@ def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
     for name, value in wanted.items():
         if found.get(name) != value:
             raise ValueError(
-                f"{path}: expected descriptors made with {name} {_short(value)}, found {_short(found.get(name))}; "
-                "name another --out, or delete the file"
+                f"{path}: expected descriptors made with {name} {json_in_short(value)}, found "
+                f"{json_in_short(found.get(name))}; name another --out, or delete the file"
             )
     return file
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 80 else f"{text[:80]}..."

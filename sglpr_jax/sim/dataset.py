@@ -4,14 +4,13 @@ import dataclasses
 import functools
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from sglpr_jax.files import read_json, replacing
 from sglpr_jax.sim.choices import RATE_HZ
-from sglpr_jax.sim.drive import name_of_path, read_path, thinned
+from sglpr_jax.sim.drive import check_drawing, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.routes import ROLES
@@ -22,6 +21,8 @@ from sglpr_jax.sim.sessions import plan_sessions
 SETTINGS_FILE = "simulation.json"
 VERSION = 3
 """Of what the simulator makes of a seed; a change in its scans needs a new one."""
+OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}
+"""Of fields of a scenery, as older datasets note them, and those of today."""
 WORKERS = 2
 """Threads that render; the compiled program leaves other threads room."""
 
@@ -51,7 +52,7 @@ def write_dataset(
     Raises ValueError for unknown names, a rate not above 0, a seed below 0, malformed pose files, and where `root`
     holds another dataset or one of other settings; OSError, with the file's name, where something cannot be written.
     """
-    _require_numbers(rate_hz, seed)
+    check_drawing(rate_hz, seed)
     files = {**dict.fromkeys(names), **{name_of_path(file): file for file in along}}
     unknown = [name for name in names if name not in ROLES]
     if unknown or scans < 2:
@@ -89,7 +90,6 @@ def write_sessions(
     Of the arguments and the drives see `plan_sessions`, of files, progress and errors `write_dataset`. Sessions cannot
     be added: with more days the streets are others.
     """
-    _require_numbers(rate_hz, seed)
     what = {"route": route, "scans": scans, "seed": seed, "rate_hz": rate_hz}
     sessions = plan_sessions(dates, sensor=sensor, scenery=scenery, **what)
     _claim(root, {"layout": "nclt", "sessions": dates, **what, **_settings(sensor, scenery)}, {})
@@ -97,13 +97,6 @@ def write_sessions(
         show = functools.partial(progress, date) if progress else lambda done, scans: None
         _write_drive(root, date, simulate, ids=ids, layout=LAYOUTS["nclt"], progress=show)
     return root
-
-
-def _require_numbers(rate_hz: float, seed: int) -> None:
-    if not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise ValueError(f"rate_hz: expected scans per second, more than 0, found {rate_hz}")
-    if seed < 0:
-        raise ValueError(f"seed: expected a whole number, 0 or more, found {seed}")
 
 
 def _settings(sensor: Sensor, scenery: Scenery) -> dict:
@@ -138,11 +131,13 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    """The settings that were noted; datasets of before there were sceneries are towns."""
+    """The settings that were noted, by the names of today; datasets of before there were sceneries are towns."""
     settings = read_json(path)
-    if not isinstance(settings, dict):
+    scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
+    if not isinstance(scenery, dict):
         raise ValueError(f"{path}: expected the settings of a simulated dataset, found {settings!r:.60}")
-    return {**settings, "scenery": settings.get("scenery", json.loads(json.dumps(dataclasses.asdict(TOWN))))}
+    scenery = {OLD_NAMES.get(name, name): value for name, value in scenery.items()}
+    return {**settings, "scenery": json.loads(json.dumps(scenery))}
 
 
 def _write_drive(

@@ -1,6 +1,7 @@
 """Where the vehicle goes and when: along one of the eleven routes, or along a given pose file."""
 
 import hashlib
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -118,6 +119,14 @@ def every_kth(path: PlanarPath, scans: int) -> slice:
 def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
     """How fast the vehicle is at every pose, in metres per second."""
     return np.linalg.norm(np.gradient(path.xy, path.times, axis=0), axis=1)
+
+
+def check_drawing(rate_hz: float, seed: int) -> None:
+    """Raise ValueError for scans per second, or for a seed, that no drive can be drawn with."""
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise ValueError(f"rate_hz: expected scans per second, more than 0, found {rate_hz}")
+    if seed < 0:
+        raise ValueError(f"seed: expected a whole number, 0 or more, found {seed}")
 
 
 def drive_seed(seed: int, name: str) -> tuple[int, int]:

@@ -28,7 +28,7 @@ class Relief(NamedTuple):
 
 def draw_relief(rng: np.random.Generator, scenery: Scenery = TOWN) -> Relief:
     """Draw hills whose slope is nowhere above the scenery's; some drives are nearly flat."""
-    number = 2 * np.pi / rng.uniform(*scenery.wavelength, _WAVES)
+    number = 2 * np.pi / rng.uniform(*scenery.wavelength_m, _WAVES)
     bearing = rng.uniform(0, 2 * np.pi, _WAVES)
     slopes = rng.uniform(0.2, 1.0) * scenery.steepest * rng.dirichlet(np.ones(_WAVES))  # they add up at worst
     wave = number[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)

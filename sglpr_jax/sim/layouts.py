@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.formats.bin_records import NCLT_OFFSET_M, NCLT_RECORD, NCLT_UNIT_M, Z_UP_FROM_Z_DOWN
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
-
-CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""Camera x right, y down, z forward from LiDAR x forward, y left, z up; both at one place."""
 
 
 class Layout(NamedTuple):

@@ -17,6 +17,7 @@ from sglpr_jax.sim.drive import (
     PlanarPath,
     TimedPoses,
     body_tilt,
+    check_drawing,
     drive_seed,
     every_kth,
     name_of_path,
@@ -58,8 +59,10 @@ def simulate_recording(
     Takes some seconds; every scan then takes some hundredths of one. Of a pose file with more than `scans` lines every
     k-th is taken, and `rate_hz` is not used. The scans are those that `write_dataset` writes for the same arguments.
 
-    Raises ValueError for an unknown route; for the errors of a pose file see `read_path`.
+    Raises ValueError for an unknown route, a rate not above 0 and a seed below 0; for the errors of a pose file see
+    `read_path`.
     """
+    check_drawing(rate_hz, seed)
     if along is not None:
         name = name_of_path(along)
         path = read_path(along)

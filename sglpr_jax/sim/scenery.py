@@ -9,15 +9,15 @@ from sglpr_jax.sim.things import Range
 
 @dataclasses.dataclass(frozen=True)
 class Scenery:
-    """What a town is drawn from; pairs are ranges in metres."""
+    """What a town is drawn from; pairs are ranges."""
 
     styles: Mapping[str, float]
     """How often each of `STYLES` begins a new neighbourhood; a highway is where the vehicle drives fast."""
     look_alike: float = 0.12
     """Share of the stretches that are long and all alike."""
-    crossing_every: Range = (60.0, 150.0)
+    crossing_every_m: Range = (60.0, 150.0)
     """From one side street to the next."""
-    wavelength: Range = (150.0, 600.0)
+    wavelength_m: Range = (150.0, 600.0)
     """Of the hills."""
     steepest: float = 0.05
     """No hill has a greater slope."""
@@ -42,8 +42,8 @@ OUTSKIRTS = Scenery(
         "centre": 0.05,
     },
     look_alike=0.3,
-    crossing_every=(100.0, 300.0),
-    wavelength=(60.0, 400.0),
+    crossing_every_m=(100.0, 300.0),
+    wavelength_m=(60.0, 400.0),
     steepest=0.09,
 )
 """Hilly land with long roads between walls, hedges and slopes, where one place looks like the next."""

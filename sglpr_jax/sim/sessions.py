@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from sglpr_jax.sim.choices import RATE_HZ
-from sglpr_jax.sim.drive import PlanarPath, drive_seed, plan_path
+from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, plan_path
 from sglpr_jax.sim.layouts import to_utime
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
 from sglpr_jax.sim.scenery import TOWN, Scenery
@@ -49,8 +49,10 @@ def plan_sessions(
     The first session drives `route`, the others the same streets in another order, partly in the opposite direction.
     Times are seconds since 1970, ids the same in microseconds, as in NCLT.
 
-    Raises ValueError for an unknown route, and for what is no date or is named twice.
+    Raises ValueError for an unknown route, a rate not above 0, a seed below 0, and for what is no date or is named
+    twice.
     """
+    check_drawing(rate_hz, seed)
     starts = [_start_of(date) for date in dates]
     if len(set(dates)) < max(len(dates), 1) or scans < 2:
         raise ValueError(f"expected different dates and 2 scans or more, found {', '.join(dates) or 'none'}; {scans}")

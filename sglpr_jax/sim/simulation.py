@@ -1,6 +1,7 @@
 """Simulated datasets in one call: several towns, one town on several days, and the two that stand in for real ones."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -76,9 +77,9 @@ def simulate(
     density images with label images in place of scans. An interrupted dataset is completed, to the same bytes, and
     recordings can be added.
 
-    `on_start` is told what there is to write, `on_progress` how many of its scans are done, counting `scans` a
-    recording. Raises ValueError for an unknown route or sensor, a malformed pose file, and where `out` holds another
-    dataset; OSError where something cannot be written.
+    `on_start` is told what there is to write, once it is known that it can be, `on_progress` how many of its scans are
+    done, counting `scans` a recording. Raises ValueError for an unknown route or sensor, a malformed pose file, and
+    where `out` holds another dataset; OSError where something cannot be written.
 
     Example:
       print(sglpr_jax.simulate("towns", routes=["08"], scans=400))
@@ -94,9 +95,10 @@ def simulate(
     layout = "nclt" if sessions else "images" if images else "scans"
     out = Path(out)
     dataset = Simulated(out, names, scans, layout, lidar)
-    on_start(dataset)
+    start = functools.cache(lambda: on_start(dataset))
 
     def progress(name: str, done: int, count: int) -> None:
+        start()  # not before: by the first progress all that was asked for has been checked
         on_progress(names.index(name) * scans + done * scans // count)
 
     options = {"scans": scans, "sensor": lidar, "seed": seed, "rate_hz": rate_hz, "scenery": SCENERIES[scenery]}

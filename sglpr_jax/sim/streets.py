@@ -174,7 +174,7 @@ def _branch_starts(
             starts.append((int(at), street.heading[int(at)] + turn))
             if rng.random() < 0.5:
                 starts.append((int(at), starts[-1][1] + np.pi))
-        at += rng.uniform(*scenery.crossing_every)
+        at += rng.uniform(*scenery.crossing_every_m)
     return [(street.middle[index], float(heading)) for index, heading in starts]
 
 

@@ -1,14 +1,64 @@
-"""The settings of a training run, as plain values. Presets in configs/ fill it in."""
+"""The settings of a training run, as plain values: no JAX is needed to read them. Presets in configs/ fill it in."""
 
 import dataclasses
 from typing import Literal
 
-from sglpr_jax.data.sampling.held_out import ValidationConfig
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.fields import Count, CountOrNone, check_fields
+from sglpr_jax.data.sampling.config import TupleConfig, ValidationConfig
+from sglpr_jax.fields import Count, CountOrNone, NotNegative, Positive, Share, check_fields
 from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.training.loss import LossConfig
-from sglpr_jax.training.optimizer import OptimizerConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class LossConfig:
+    """Equations 5 and 8. The paper gives no margin and no distance: docs/decisions/paper.md has ours."""
+
+    margin: NotNegative = 0.3
+    squared: bool = False
+    """Square the descriptor distances of equation 5."""
+    closest_positive: bool = True
+    reduction: Literal["max", "sum"] = "max"
+    """`max` is the lazy triplet loss; `sum` counts every negative inside the margin."""
+    temperature: NotNegative = 0.0
+    """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
+    one_threshold: Share = 0.0
+    """Share of the triplet loss in which every anchor has the negatives of all anchors (`losses.one_threshold`). It is
+    for one threshold on distances that all places share. 0 in the paper."""
+    ce_weight: NotNegative = 0.4
+    dice_weight: NotNegative = 0.6
+    segment_every: Count = 1
+    """Take the segmentation losses on every n-th image of a step only; all are segmented in the paper."""
+    class_balance: NotNegative = 0.0
+    """Exponent a of the cross-entropy's class weights n^-a, n being the class's pixels in the image; 0 in the paper."""
+    ignore_unlabelled: bool = False
+    """Leave cells of class 0 (empty or unlabelled) out of the segmentation losses, as the scores do."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+    @property
+    def segments(self) -> bool:
+        """Whether any term reads the segmentation head. One whose weight is 0 is not computed (table 7).
+
+        A new term of the class logits joins with its weight, for the table in `training/loss.py` needs JAX.
+        """
+        return self.ce_weight != 0 or self.dice_weight != 0
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam with an exponential decay of the learning rate."""
+
+    learning_rate: NotNegative = 1e-5
+    warmup_steps: CountOrNone = 0
+    decay_rate: Positive = 0.99
+    decay_steps: Count = 1000
+    """Steps in which the learning rate falls by `decay_rate`."""
+    staircase: bool = False
+    clip_norm: Positive | None = None
+    weight_decay: NotNegative = 0.0
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)

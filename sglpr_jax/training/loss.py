@@ -2,50 +2,17 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax import losses
 from sglpr_jax.data.sampling.batch import Batch
-from sglpr_jax.fields import Count, NotNegative, Share, check_fields
+from sglpr_jax.training.config import LossConfig
 from sglpr_jax.training.place_order import in_batch_order, in_network_order
 
 Metrics = dict[str, Float[Array, ""]]
-
-
-@dataclasses.dataclass(frozen=True)
-class LossConfig:
-    """Equations 5 and 8. The paper gives no margin and no distance: docs/decisions/paper.md has ours."""
-
-    margin: NotNegative = 0.3
-    squared: bool = False
-    """Square the descriptor distances of equation 5."""
-    closest_positive: bool = True
-    reduction: Literal["max", "sum"] = "max"
-    """`max` is the lazy triplet loss; `sum` counts every negative inside the margin."""
-    temperature: NotNegative = 0.0
-    """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
-    one_threshold: Share = 0.0
-    """Share of the triplet loss in which every anchor has the negatives of all anchors (`losses.one_threshold`). It is
-    for one threshold on distances that all places share. 0 in the paper."""
-    ce_weight: NotNegative = 0.4
-    dice_weight: NotNegative = 0.6
-    segment_every: Count = 1
-    """Take the segmentation losses on every n-th image of a step only; all are segmented in the paper."""
-    class_balance: NotNegative = 0.0
-    """Exponent a of the cross-entropy's class weights n^-a, n being the class's pixels in the image; 0 in the paper."""
-    ignore_unlabelled: bool = False
-    """Leave cells of class 0 (empty or unlabelled) out of the segmentation losses, as the scores do."""
-
-    def __post_init__(self):
-        check_fields(self)
-
-    @property
-    def segments(self) -> bool:
-        """Whether any term reads the segmentation head. One whose weight is 0 is not computed (table 7)."""
-        return any(term.weight(self) != 0 for term in SEGMENTATION_TERMS.values())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,27 +1,8 @@
 """The optimiser: Adam, its learning rate warmed up and then decayed."""
 
-import dataclasses
-
 import optax
 
-from sglpr_jax.fields import Count, CountOrNone, NotNegative, Positive, check_fields
-
-
-@dataclasses.dataclass(frozen=True)
-class OptimizerConfig:
-    """Adam with an exponential decay of the learning rate."""
-
-    learning_rate: NotNegative = 1e-5
-    warmup_steps: CountOrNone = 0
-    decay_rate: Positive = 0.99
-    decay_steps: Count = 1000
-    """Steps in which the learning rate falls by `decay_rate`."""
-    staircase: bool = False
-    clip_norm: Positive | None = None
-    weight_decay: NotNegative = 0.0
-
-    def __post_init__(self):
-        check_fields(self)
+from sglpr_jax.training.config import OptimizerConfig
 
 
 def optimizer(config: OptimizerConfig) -> optax.GradientTransformation:

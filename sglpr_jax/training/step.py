@@ -19,9 +19,9 @@ from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward
-from sglpr_jax.training.config import TrainConfig
+from sglpr_jax.training.config import LossConfig, TrainConfig
 from sglpr_jax.training.devices import keep_replicated, keep_split, on_own_rows
-from sglpr_jax.training.loss import LossConfig, Metrics, Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.loss import Metrics, Summary, joint_loss, segmentation_sums
 from sglpr_jax.training.optimizer import optimizer
 from sglpr_jax.training.place_order import in_network_order
 from sglpr_jax.training.state import TrainState

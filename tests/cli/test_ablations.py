@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.cli import train as train_command
 from sglpr_jax.cli.train import parse
-from sglpr_jax.evaluation import learning_curves
+from sglpr_jax.evaluation import final_test, learning_curves
 from sglpr_jax.training import recipe
 from sglpr_jax.training.metrics_log import read_metrics
 
@@ -47,7 +46,7 @@ def runs(town, preset, tmp_path_factory):
         if name not in made:
             folder = made[name] = tmp_path_factory.mktemp("ablation") / "run"
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(train_command, "final_test", lambda *_, **__: None)
+                patch.setattr(final_test, "final_test", lambda *_, **__: None)
                 patch.setattr(recipe, "training_recall", lambda *_: lambda _: {"score": 0.0})
                 patch.setattr(learning_curves, "draw_learning_curves", lambda _: None)
                 flags = ("--data", town, "--preset", preset, "--out", folder, "--steps", 2, *flags_of(name))

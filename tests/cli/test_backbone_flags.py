@@ -3,8 +3,8 @@
 import pytest
 
 from sglpr_jax.cli import reproduce, train
-from sglpr_jax.models.backbones.rings import RingConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from sglpr_jax.cli import datasets, demo
-from sglpr_jax.cli import train as train_command
+from sglpr_jax.training import recipe
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.recipe import TrainResult
 
@@ -52,7 +52,7 @@ def test_a_demo_that_is_stopped_says_what_it_does_next(command, tiny_demo, rando
     def train(config, recordings, *, out, **_):
         return TrainResult(random_params(config.model), out, 1, config, None)
 
-    monkeypatch.setattr(train_command, "train", train)
+    monkeypatch.setattr(recipe, "train", train)
     ended = command("demo", "--out", tmp_path / "demo", "--steps", 2)
     assert "stopped at step 1 of 2; the demo begins its training anew" in ended.error
     assert "--resume" not in ended.error

@@ -137,6 +137,18 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(embed, town
     assert_one_line_error(embed(*options, out="out")[0], ".npz")
 
 
+@pytest.mark.parametrize("batch", [0, -1])
+def test_a_batch_of_no_image_is_refused(embed, town, batch):
+    ended, out = embed("--method", "thumbnail", "--data", town, "--seq", "08", "--batch", batch)
+    assert_one_line_error(ended, "--batch: expected a number from 1", f"found {batch}")
+    assert not out.exists()
+
+
+def test_weights_beside_a_method_that_has_none_are_refused(embed, town):
+    ended, _ = embed("--method", "solid", "--weights", "sglpr", "--data", town, "--seq", "08")
+    assert_one_line_error(ended, "sglpr: expected no --weights beside --method solid, found some")
+
+
 def test_without_weights_the_network_has_those_of_the_package(embed, town):
     options = ("--data", town, "--seq", "08")
     ended, found = embed(*options)

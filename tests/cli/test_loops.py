@@ -121,7 +121,7 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
         command("loops", town, "--seq", "08", "--out", tmp_path / "found", "--optimize"), "--odometry", "found none"
     )
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found", "--odometry")
-    assert_one_line_error(command(*run, short), "expected odometry of 40 poses", "found 7")
+    assert_one_line_error(command(*run, short), "short.tum: expected 40 poses, one for each scan of 08", "found 7")
     write_kitti(tmp_path / "short.txt", odometry[:7])
     ended = command(*run, tmp_path / "short.txt", "--odometry-format", "kitti")
     assert_one_line_error(ended, "short.txt: expected 40 poses, one for each scan of 08, found 7")
@@ -167,6 +167,16 @@ def test_a_short_recording_without_times_is_told_why_it_has_no_loops(command, to
     ended = command("loops", scans, "--out", tmp_path / "timed", "--odometry", tmp_path / "odometry.tum")
     assert ended.status == 0 and "times: those of odometry.tum" in ended.error and "warning" not in ended.error
     np.testing.assert_allclose(read_tum(tmp_path / "timed" / "trajectory.tum")[1], times, atol=1e-5)
+
+
+def test_a_file_where_the_folder_should_be_is_one_clear_error(command, town, tmp_path):
+    (tmp_path / "found").write_text("notes")
+    for out in (tmp_path / "found", tmp_path / "found" / "more"):
+        ended = command("loops", town, "--seq", "08", "--out", out)
+        assert_one_line_error(ended, f"{tmp_path / 'found'}: expected a folder to write into, found a file")
+    assert (tmp_path / "found").read_text() == "notes"
+    ended = command("loops", town, "--seq", "08", "--out", tmp_path / "other", "--odometry", tmp_path)
+    assert_one_line_error(ended, f"{tmp_path}: expected odometry, found a folder")
 
 
 def test_images_cannot_be_registered(command, images, tmp_path):

@@ -151,6 +151,24 @@ def test_two_processes_do_not_make_one_map(command, town, poses, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["poses.tum"]
 
 
+def test_folders_for_files_and_files_for_folders_are_one_clear_error(command, town, poses, places_file, tmp_path):
+    (tmp_path / "town.safetensors").mkdir()
+    run = ("map", town, "--seq", "08", "--poses")
+    ended = command(*run, poses, "--out", tmp_path / "town.safetensors")
+    assert_one_line_error(ended, "town.safetensors: expected a file to write, found a folder")
+    ended = command(*run, poses, "--out", poses / "town.safetensors")
+    assert_one_line_error(ended, "poses.tum: expected a folder to write into, found a file")
+    out = ("--out", tmp_path / "new.safetensors")
+    assert_one_line_error(command(*run, tmp_path, *out), f"{tmp_path}: expected odometry, found a folder")
+    assert_one_line_error(command(*run, poses, *out, "--add-to", tmp_path), "expected an index, found a folder")
+    scans = town / "sequences/08/velodyne"
+    ended = command("relocalize", scans, "--map", places_file)
+    assert_one_line_error(ended, "velodyne: expected one scan or image, found a folder; name a file in it")
+    ended = command("relocalize", scans / "000020.bin", "--map", tmp_path)
+    assert_one_line_error(ended, "expected an index, found a folder")
+    assert {path.name for path in tmp_path.iterdir()} == {"town.safetensors", "one.safetensors", "poses.tum"}
+
+
 def test_a_scan_without_ground_tells_no_height(command, places_file, tmp_path):
     scan = tmp_path / "sky.bin"
     np.random.default_rng(0).normal(scale=9, size=(200, 4)).astype(np.float32).tofile(scan)

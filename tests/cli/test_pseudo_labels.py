@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.cli import train as train_command
+from sglpr_jax.evaluation import final_test
 from sglpr_jax.training import batches as training_batches
 from sglpr_jax.training.metrics_log import read_metrics
 
@@ -15,7 +15,7 @@ from .conftest import assert_one_line_error
 
 @pytest.fixture(autouse=True)
 def _no_final_test(monkeypatch):
-    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    monkeypatch.setattr(final_test, "final_test", lambda *_, **__: None)
 
 
 @pytest.fixture

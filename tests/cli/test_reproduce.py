@@ -5,10 +5,11 @@ import shutil
 
 import pytest
 
-from sglpr_jax.cli import reproduce as reproduce_command
 from sglpr_jax.evaluation.published import KITTI, TABLES
+from sglpr_jax.reproduce import plan
 from sglpr_jax.reproduce import runs as runs_module
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
+from sglpr_jax.reproduce.plan import make_plan
 from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.reproduce.scores import published_rows
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
@@ -131,7 +132,7 @@ def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
 def test_a_stopped_reproduction_says_how_it_goes_on(town, preset, random_params, tmp_path, command, monkeypatch):
     config = load_preset(str(preset))
     stopped = TrainResult(random_params(config.model), tmp_path / "run", 1, config, None)
-    monkeypatch.setattr(reproduce_command, "time_a_step", lambda *_: 1.0)
+    monkeypatch.setattr(plan, "time_a_step", lambda *_: 1.0)
     monkeypatch.setattr(Runs, "train", lambda *_, **__: stopped)
     ended = command("reproduce", "table5", *OPTIONS, "--data", town, "--preset", preset, "--out", tmp_path / "out")
     assert "stopped at step 1 of 4; the same command goes on" in ended.error
@@ -198,4 +199,27 @@ def test_a_mean_needs_every_column():
     rows = [Row("whole", OURS, {"00": 0.5, "08": 0.75}), Row("part", OURS, {"00": 0.5, "08": None})]
     table = PaperTable("title", rows, ("00", "08"), caption="")
     assert [row["mean"] for row in table.to_json()] == [0.625, None]
-    assert "| part | here | 0.500 |  |  |" in table.markdown()
+    assert "| part | here | 0.500 | no revisits | - |" in table.markdown()
+
+
+def test_no_cell_is_left_blank():
+    """Neither where a recording never comes back nor where nothing was published."""
+    rows = [Row("ours", OURS, {"04": None}), Row("theirs", PUBLISHED, {"08": 0.5, "04": None})]
+    rows.append(Row("turned", OURS, {"04": 0.5, "town": 0.25}, change=-0.125))
+    lines = PaperTable("title", rows, ("04", "town"), caption="").markdown().splitlines()[4:7]
+    assert lines == [
+        "| ours | here | no revisits | no revisits | - | - |",
+        "| theirs | published | - | - | - | - |",
+        "| turned | here | 0.500 | 0.250 | 0.375 | -0.125 |",
+    ]
+
+
+def test_the_plan_tells_the_recordings_that_never_come_back(town, images, preset, tmp_path):
+    def plan(data, names, *seqs):
+        return make_plan(Runs(tmp_path, data, str(preset), load_preset(str(preset))), names, seqs)
+
+    straight = plan(images, ["table1"], "00", "06")
+    assert straight.without_revisits == ("00", "06")
+    assert straight.text(1.0).splitlines()[-2] == "no revisits in 00, 06: no scores there, and no means"
+    assert plan(town, ["table1", "table3"], "08").without_revisits == ()
+    assert plan(images, ["table3"], "00").without_revisits == ()

@@ -1,10 +1,21 @@
 """Commands are called as whoever started one knows them; what is a path stays one."""
 
+import dataclasses
 import sys
 
 import pytest
 
-from sglpr_jax.cli.runtime import own_names
+from sglpr_jax.cli.runtime import own_names, parse_command
+from sglpr_jax.fields import NotNegative, Size
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """A command."""
+
+    batch: Size = 8
+    spacing_m: NotNegative | None = None
+    seed: int = 0
 
 
 @pytest.fixture
@@ -46,3 +57,22 @@ def test_paths_and_other_names_stay(installed, path):
 def test_a_command_of_the_checkout_keeps_its_name(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/home/me/sglpr-jax/bin/evaluate"])
     assert own_names("bin/embed, then bin/evaluate") == "bin/embed, then bin/evaluate"
+
+
+@pytest.mark.parametrize(
+    ("flags", "error"),
+    [
+        (("--batch", "0"), "--batch: expected a number from 1 up to 1048576, found 0"),
+        (("--batch", "-1"), "--batch: expected a number from 1 up to 1048576, found -1"),
+        (("--spacing-m", "-0.5"), "--spacing-m: expected a number from 0, found -0.5"),
+        (("--spacing-m", "nan"), "--spacing-m: expected a finite number, found nan"),
+    ],
+)
+def test_numbers_that_no_flag_can_have_are_told(flags, error):
+    with pytest.raises(ValueError) as raised:
+        parse_command(Example, "example", list(flags))
+    assert str(raised.value) == error
+
+
+def test_all_other_numbers_are_taken():
+    assert parse_command(Example, "example", ["--spacing-m", "0", "--seed", "-3"]) == Example(8, 0.0, -3)

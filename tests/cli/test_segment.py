@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.labels import RAW_NAMES
+from sglpr_jax.categories import RAW_NAMES
 
 from .conftest import assert_one_line_error
 
@@ -75,4 +75,4 @@ def test_what_the_network_is_not_sure_of_is_left_out(segment, trained, images):
     np.testing.assert_array_equal(some, np.where(some > 0, every, 0))
     assert f"30 semantic maps of {(some > 0).sum() / (every > 0).sum():.0%} of the cells with points" in ended.out
     assert not (maps / "segmentation.json").exists()
-    assert_one_line_error(segment(*options, "--min-confidence", 80)[0], "--min-confidence", "0 to 1", "80")
+    assert_one_line_error(segment(*options, "--min-confidence", 80)[0], "--min-confidence: expected", "0 up to 1", "80")

@@ -48,7 +48,9 @@ def test_a_pose_file_and_another_sensor(command, tmp_path):
 
 def test_wrong_input_is_refused_before_anything_is_written(command, tmp_path):
     out = ("--out", tmp_path / "town")
-    assert_one_line_error(command("simulate", *out, "--seq", "11"), "00, 01,", "'11'")
+    unknown = command("simulate", *out, "--seq", "11")
+    assert_one_line_error(unknown, "00, 01,", "'11'")
+    assert "simulating" not in unknown.error
     assert_one_line_error(
         command("simulate", *out, "--sensor", "hdl16"), "hdl64e, hdl32e, hdl32e-nclt, vlp16", "'hdl16'"
     )

@@ -11,10 +11,10 @@ import safetensors.numpy
 from PIL import Image
 
 import sglpr_jax
-from sglpr_jax.cli import train as train_command
 from sglpr_jax.cli.train import TrainCommand, parse
 from sglpr_jax.data.readers.bev_images import open_recording
 from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.evaluation import final_test
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.training import batches as training_batches
 from sglpr_jax.training.metrics_log import read_metrics
@@ -117,7 +117,7 @@ def test_a_loss_that_is_not_finite_names_the_step_and_the_frames(command, images
 def test_event_files_are_written_when_asked_for_and_do_not_hinder_a_resume(
     command, images, preset, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    monkeypatch.setattr(final_test, "final_test", lambda *_, **__: None)
     out = tmp_path / "run"
     options = ("--seq", "06", "--data", images, "--preset", preset, "--out", out)
     assert command("train", *options, "--tensorboard").status == 0
@@ -128,7 +128,7 @@ def test_event_files_are_written_when_asked_for_and_do_not_hinder_a_resume(
 
 @pytest.mark.slow
 def test_a_cache_changes_only_where_scans_are_read(command, trained, town, preset, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    monkeypatch.setattr(final_test, "final_test", lambda *_, **__: None)
     out, cache = tmp_path / "run", tmp_path / "cache"
     options = ("--seq", "08", "--data", town, "--preset", preset, "--out", out, "--cache", cache)
     ended = command("train", *options)
@@ -165,7 +165,7 @@ def test_a_run_is_resumed_with_its_own_settings_only(command, trained, town, pre
 
 @pytest.mark.slow
 def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, town, preset, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    monkeypatch.setattr(final_test, "final_test", lambda *_, **__: None)
     read_batch = training_batches.read_batch
     out = tmp_path / "run"
     options = ("--data", town, "--preset", preset, "--out", out)
@@ -200,7 +200,7 @@ def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, tow
 
 @pytest.mark.slow
 def test_bad_labels_end_a_training_that_can_go_on_once_they_are_right(command, town, preset, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    monkeypatch.setattr(final_test, "final_test", lambda *_, **__: None)
     root = tmp_path / "town"
     shutil.copytree(town, root)
     good = {path: path.read_bytes() for path in (root / "sequences" / "00" / "labels").iterdir()}

@@ -12,7 +12,7 @@ from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.models.whitening import whitened
 from sglpr_jax.training.callbacks import Callback
-from sglpr_jax.training.optimizer import OptimizerConfig
+from sglpr_jax.training.config import OptimizerConfig
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.recipe import train
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from sglpr_jax.cli import train as train_command
+from sglpr_jax.evaluation import final_test
 from sglpr_jax.training import batches as training_batches
 from sglpr_jax.training.metrics_log import read_metrics
 
@@ -23,7 +23,7 @@ LABELLED = ("--tuples", 3, "--also-tuples", 1, "--loss.segment-every", 2)
 
 @pytest.fixture(autouse=True)
 def _no_final_test(monkeypatch):
-    monkeypatch.setattr(train_command, "final_test", lambda *_, **__: None)
+    monkeypatch.setattr(final_test, "final_test", lambda *_, **__: None)
 
 
 def weights_of(folder) -> dict[str, np.ndarray]:
@@ -35,7 +35,7 @@ def mixed(town, images, preset, tmp_path_factory):
     """A run on images without labels, whose semantics come from simulated scans."""
     out = tmp_path_factory.mktemp("runs") / "mixed"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train_command, "final_test", lambda *_, **__: None)
+        patch.setattr(final_test, "final_test", lambda *_, **__: None)
         options = ("--seq", "06", "--data", images, "--also", town, "--preset", preset, "--out", out)
         ended = run_command("train", *options, *RECIPE, *LABELLED)
     assert ended.status == 0, ended.error

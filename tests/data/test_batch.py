@@ -9,12 +9,14 @@ import pytest
 from PIL import Image
 from recordings import of_images, of_scans
 
-from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels
+from sglpr_jax.bev import even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels
 from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.formats.label_images import label_image_pixels
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.batch import read_batch, views
-from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
@@ -226,6 +228,13 @@ def test_scans_become_density_images_of_all_their_points(recordings, pool):
             np.testing.assert_array_equal(labelled.maps[row], density_label_bev(recording.points(number), classes))
     unread = read_batch(recordings, pool, FRAMES, max_points=9, share_negatives=False, categories=0, image="density")
     assert unread.images.shape == (8, 151, 151)
+
+
+def test_images_that_are_none_of_densities_are_refused_where_these_are_wanted(pool):
+    grey = of_images({Path(f"{i}.png"): np.full((20, 22), 255, np.float32) for i in range(2)}, name="06")
+    assert read([grey, grey], pool, FRAMES[:1, :2]).images.max() == 255  # counts of points may be many
+    with pytest.raises(ValueError, match="scan 0 of sequence 06: expected a density image"):
+        read_batch([grey, grey], pool, FRAMES[:1, :2], max_points=9, share_negatives=False, image="density")
 
 
 def test_scans_and_images_do_not_mix(recordings, pool):

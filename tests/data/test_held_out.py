@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.sampling.held_out import ValidationConfig, hold_out
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig, ValidationConfig
+from sglpr_jax.data.sampling.held_out import hold_out
 
 SAMPLING = TupleConfig(revisit_gap=20)
 

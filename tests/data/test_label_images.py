@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sglpr_jax.categories import RAW_NAMES
 from sglpr_jax.data.formats.label_images import label_image_pixels, read_label_image
 from sglpr_jax.data.readers.bev_images import read_image
-from sglpr_jax.labels import RAW_NAMES
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import Grid
 from sglpr_jax.data.sampling.batch import Batch, views
 from sglpr_jax.data.sampling.mixing import mix
+from sglpr_jax.grid import Grid
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 RNG = np.random.default_rng(0)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from recordings import of_images, of_scans
 
 import sglpr_jax
-from sglpr_jax.bev import Grid
 from sglpr_jax.data import mounted as mounted_module
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.density_image import density_bev
@@ -18,9 +17,11 @@ from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.sampling.batch import read_batch
-from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.data.views import view
 from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.grid import Grid
 from sglpr_jax.methods.registry import handcrafted
 from sglpr_jax.models.presets import model_preset
 

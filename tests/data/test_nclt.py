@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sglpr_jax.bev import Grid, rasterize
+from sglpr_jax.bev import rasterize
 from sglpr_jax.data import open_recording, read_scan, recording_names
 from sglpr_jax.data.corruption.corrupted import corrupted
 from sglpr_jax.data.corruption.corruptions import Corruption
@@ -15,6 +15,7 @@ from sglpr_jax.data.formats.bin_records import NCLT_RECORD
 from sglpr_jax.data.formats.timed_poses import nearest_rows
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.readers import nclt
+from sglpr_jax.grid import Grid
 
 DATE = "2012-01-15"
 FIRST = 1326652795280148

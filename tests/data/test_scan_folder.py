@@ -42,7 +42,8 @@ def test_poses_beside_the_scans(tmp_path):
 def test_each_scan_needs_a_pose(tmp_path):
     folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
     write_poses(folder / "poses.txt", np.zeros((3, 3)))
-    with pytest.raises(ValueError, match=r"poses\.txt: expected 2 rows, one per scan, found 3"):
+    message = r"poses\.txt: expected 2 poses, one for each scan of scans, found 3, and the file has no times"
+    with pytest.raises(ValueError, match=message):
         open_recording(folder)
 
 
@@ -99,10 +100,27 @@ def test_poses_of_any_format_beside_the_scans_or_named(tmp_path, name, text, tim
     found = readers.open_recording(folder, **named)
     np.testing.assert_array_equal(found.positions, [[1, 2, 3], [4, 5, 6]])
     assert (None if found.times is None else found.times.tolist()) == ([1.5, 2.5] if timed else None)
-    (folder / "times.txt").write_text("7\n9\n")
-    assert readers.open_recording(folder, **named).times.tolist() == [7, 9]
-    (tmp_path / "other.txt").write_text("8\n8\n")
-    assert readers.open_recording(folder, **named, times=tmp_path / "other.txt").times.tolist() == [8, 8]
+    (folder / "times.txt").write_text("1.75\n2.25\n")
+    found = readers.open_recording(folder, **named)
+    assert found.times.tolist() == [1.75, 2.25]
+    np.testing.assert_array_equal(found.positions[:, 0], [1.75, 3.25] if timed else [1, 4])
+    assert found.pose_source.endswith(", interpolated at the times of the scans") == timed
+    (tmp_path / "other.txt").write_text("2\n2\n")
+    assert readers.open_recording(folder, **named, times=tmp_path / "other.txt").times.tolist() == [2, 2]
+
+
+def test_poses_of_other_times_are_interpolated_or_name_the_scans_without(tmp_path):
+    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin", "3.bin")
+    (folder / "poses.tum").write_text(TUM)
+    (folder / "times.txt").write_text("1.5\n2\n2.5\n")
+    np.testing.assert_array_equal(open_recording(folder).positions[:, 0], [1, 2.5, 4])
+    (folder / "times.txt").write_text("1.5\n2\n9\n")
+    message = r"poses\.tum: expected poses about the times of all 3 scans, found none for 1, the first at 9\.0 s"
+    with pytest.raises(ValueError, match=message):
+        open_recording(folder)
+    (folder / "times.txt").unlink()
+    with pytest.raises(ValueError, match=r"poses\.tum: expected 3 poses, .* found 2, and the scans have no times"):
+        open_recording(folder)
 
 
 def test_poses_that_do_not_fit_are_refused(tmp_path):

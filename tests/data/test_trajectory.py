@@ -122,3 +122,9 @@ def test_heights_that_run_as_far_as_a_road_are_told(write, recwarn):
     assert not recwarn.list
     with pytest.warns(DataWarning, match=r"poses\.txt: expected z up, found heights over 239 m and 3 x 299 m"):
         read_trajectory(path, format="kitti")
+
+
+def test_a_format_that_there_is_not_is_told_with_those_that_there_are(as_installed, write):
+    path = write("poses.txt", KITTI)
+    with pytest.raises(ValueError, match=r"poses\.txt, format: expected one of 'auto', 'kitti', .*, found 'kiti'$"):
+        read_trajectory(path, format="kiti")

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
-from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.sampling.tuples import TuplePool
 
 LAP = 60
 

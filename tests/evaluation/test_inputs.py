@@ -57,10 +57,56 @@ def test_own_files_keep_what_nothing_replaces(tmp_path, make_file, two_laps, pos
 
 def test_own_files_keep_their_times_unless_times_are_given(tmp_path, make_file, two_laps, poses):
     make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
-    bare = dataclasses.replace(poses, times=None)
-    for trajectory, seconds in ((bare, 0.1), (poses, 0.5)):
+    bare, given = dataclasses.replace(poses, times=None), dataclasses.replace(poses, by_row=True)
+    for trajectory, seconds in ((bare, 0.1), (given, 0.5)):
         found = read_input(tmp_path / "own.npz", trajectory, sequence="x")
         np.testing.assert_array_equal(found.times, np.arange(800) * seconds)
+
+
+def test_poses_of_other_times_are_interpolated_at_those_of_an_own_file(tmp_path, make_file, two_laps):
+    times = np.arange(800) * 0.1
+    make_file(two_laps, two_laps, times=times).save(tmp_path / "own.npz")
+    stamps = np.arange(0.25, 60, 0.5)
+    poses = Trajectory(stamps[:, None] * [10.0, 0, 0], stamps, "a.tum (TUM)")
+    found = read_input(tmp_path / "own.npz", poses, sequence="x")
+    assert found.ids[0] == "000002" and len(found) == 597
+    np.testing.assert_allclose(found.positions[:, 0], np.maximum(times[2:599], 0.25).clip(max=59.75) * 10)
+    np.testing.assert_array_equal(found.times, times[2:599])
+    said = "a.tum (TUM), interpolated at the times of the scans; 203 of 800 scans left out, which have no pose"
+    assert found.pose_source == said
+    late = dataclasses.replace(poses, times=stamps + 1e6)
+    message = r"own\.npz: a\.tum \(TUM\): expected 800 poses, one for each frame of own\.npz, at its time"
+    with pytest.raises(ValueError, match=message):
+        read_input(tmp_path / "own.npz", late, sequence="x")
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_poses_of_all_scans_serve_a_file_from_which_some_were_left_out(tmp_path, make_file, two_laps, poses, timed):
+    times = poses.times if timed else None
+    whole = dataclasses.replace(make_file(two_laps, two_laps, times=times), positions=None)
+    kept = ~np.isin(np.arange(800), (3, 700))
+    whole.only(kept).save(tmp_path / "own.npz")
+    found = read_input(tmp_path / "own.npz", poses, sequence="x")
+    np.testing.assert_array_equal(found.positions, two_laps[kept])
+    np.testing.assert_array_equal(found.times, poses.times[kept])
+    assert found.pose_source == "laps.csv (csv)" and "000003" not in found.ids
+    few = dataclasses.replace(poses, positions=two_laps[:790], times=None)
+    with pytest.raises(ValueError, match=r"own\.npz: .*expected 798 poses, one for each frame of own\.npz, found 790"):
+        read_input(tmp_path / "own.npz", few, sequence="x")
+
+
+def test_methods_beside_an_own_file_take_its_positions_and_times(tmp_path, make_file, two_laps):
+    make_file(two_laps, two_laps, times=np.arange(800) * 0.1).save(tmp_path / "own.npz")
+    np.save(tmp_path / "mine.npy", two_laps)
+    (tmp_path / "list.txt").write_text("400: 0\n")
+    found = read_methods([tmp_path / name for name in ("own.npz", "mine.npy", "list.txt")])
+    for name in ("mine", "list"):
+        check_agreement(found["own"], found[name])
+        np.testing.assert_array_equal(found[name].times, found["own"].times)
+        assert found[name].pose_source == "made up"
+    np.save(tmp_path / "mine.npy", two_laps[:700])
+    with pytest.raises(ValueError, match=r"mine\.npy: expected 800 descriptors, as many as made up has.*, found 700"):
+        read_methods([tmp_path / name for name in ("own.npz", "mine.npy")])
 
 
 @pytest.mark.parametrize("names", [("own.npz", "mine.npy", "pairs.txt"), ("mine.npy", "pairs.txt", "own.npz")])

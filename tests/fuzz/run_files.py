@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from sglpr_jax.bev import Grid
 from sglpr_jax.files import read_json
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.config_dict import config_from_dict
 from sglpr_jax.models.weights import by_name, hash_of, weight_shapes

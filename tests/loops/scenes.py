@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from sglpr_jax.bev import Grid, rasterize
+from sglpr_jax.bev import rasterize
+from sglpr_jax.grid import Grid
 
 GRID = Grid(resolution_m=0.4, height=64, width=64)
 

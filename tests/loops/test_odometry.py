@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
-from sglpr_jax.data.readable import only
 from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_tum
 from sglpr_jax.loops.odometry import at_scans, read_odometry
 from sglpr_jax.loops.transforms import transform
@@ -45,13 +44,35 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
         "no pose",
     )
     late = dataclasses.replace(recording, times=times + 3)
-    with pytest.raises(
-        ValueError, match=r"odometry\.tum: expected odometry of 6 poses.* 2\.5 to 9\.0 s, found 5 of 0\.0 to"
-    ):
+    message = r"odometry\.tum: expected 6 poses, one for each scan of 08.* 2\.5 to 9\.0 s, found 5 of 0\.0 to"
+    with pytest.raises(ValueError, match=message):
         at_scans(late, poses, path, format="tum")
-    same = only(recording, range(5))
-    unchanged = at_scans(same, poses, path, format="auto")
-    assert unchanged[0] is same and unchanged[1] is poses
+
+
+@pytest.mark.parametrize(("stamps", "by_row"), [(0.0, True), (5e-4, True), (0.02, False), ("numbers", True)])
+def test_as_many_poses_as_scans_go_row_by_row_only_where_their_times_are_the_same(tmp_path, poses, stamps, by_row):
+    """0, 1, 2, ... are numbers of rows and no times."""
+    times = 7 + 0.9 * np.arange(5)
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(5)}, times=times)
+    path = tmp_path / "odometry.tum"
+    write_tum(path, poses, np.arange(5.0) if stamps == "numbers" else times + stamps)
+    found, given = at_scans(recording, poses, path, format="auto")
+    assert len(found) == 5 and (found is recording and given is poses) == by_row
+    np.testing.assert_allclose(given[1:, 0, 3], poses[1:, 0, 3] - (0 if by_row else 0.02 / 0.9), atol=1e-3)
+
+
+def test_as_many_poses_of_another_clock_are_told_and_of_other_steps_refused(tmp_path, poses):
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(5)}, times=np.arange(5.0))
+    path = tmp_path / "odometry.tum"
+    write_tum(path, poses, 1.6e9 + np.arange(5.0))
+    found, given = at_scans(recording, poses, path, format="auto")
+    assert given is poses and len(found) == 5
+    said = "row by row: their steps are those of the scans, -1600000000.0 s later"
+    assert found.found == (f"odometry: 5 poses of odometry.tum, {said}",)
+    write_tum(path, poses, 1.6e9 + 1.1 * np.arange(5.0))
+    message = r"odometry\.tum: expected 5 poses.*0\.0 to 4\.0 s, found 5 of 1600000000\.0 to .*write 12 numbers a line"
+    with pytest.raises(ValueError, match=message):
+        at_scans(recording, poses, path, format="auto")
 
 
 def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"

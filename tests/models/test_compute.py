@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.grid import Grid
 from sglpr_jax.models import sglpr
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from sglpr_jax.bev import Grid, rotate_image
+from sglpr_jax.bev import rotate_image
+from sglpr_jax.grid import Grid
 from sglpr_jax.models.polar import from_polar, to_polar
 
 GRID = Grid(resolution_m=1.0, height=32, width=40)

@@ -110,3 +110,9 @@ def test_a_conversion_that_fails_says_why_and_what_it_needs(random_params, tmp_p
     with pytest.raises(RuntimeError, match="pip install 'sglpr-jax"):
         save_program(random_params(TINY), tmp_path / "out", format="onnx")
     assert not list(tmp_path.iterdir())
+
+
+def test_another_format_is_refused_and_nothing_written(as_installed, random_params, tmp_path):
+    with pytest.raises(ValueError, match="format: expected one of 'stablehlo', 'onnx', found 'stablehl0'"):
+        save_program(random_params(TINY), tmp_path / "program", format="stablehl0")
+    assert not (tmp_path / "program").exists()

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.backbones.rings import RingConfig, RingDecoder, RingNet
+from sglpr_jax.models.backbones.rings import RingDecoder, RingNet
+from sglpr_jax.models.backbones.rings_config import RingConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
 from sglpr_jax.models.presets import model_preset

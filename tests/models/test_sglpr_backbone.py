@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from sglpr_jax.models.backbones.rings import RingConfig
-from sglpr_jax.models.backbones.sglpr import RingSwin, SglprConfig
+from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.sglpr import RingSwin
+from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.place import PlaceHead
 from sglpr_jax.models.presets import model_preset

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from sglpr_jax.bev import Grid
+from sglpr_jax.grid import Grid
 from sglpr_jax.models import shipped
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.backbones.stem import Stem, StemDecoder
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, forward, segment

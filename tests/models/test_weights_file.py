@@ -12,7 +12,7 @@ import safetensors.numpy
 
 import sglpr_jax
 from sglpr_jax.models import weights_file
-from sglpr_jax.models.backbones.rings import RingConfig
+from sglpr_jax.models.backbones.rings_config import RingConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset

@@ -202,3 +202,15 @@ def test_descriptors_of_another_method_or_model_cannot_be_compared(file, change,
     check_same_method(file, dataclasses.replace(file, sequence="05", config={**file.config, "data": "05"}))
     with pytest.raises(ValueError, match=rf"of 05 to be made as those of .*, with {what} .*, found "):
         check_same_method(file, dataclasses.replace(file, sequence="05", **change))
+
+
+def test_scans_that_are_left_out_are_remembered_by_their_rows(file):
+    assert file.recorded.tolist() == [True, True, True]
+    fewer = file.only(np.array([True, False, True]))
+    assert fewer.ids == ("000000", "ÄÖ-9") and fewer.recorded.tolist() == [True, False, True]
+    np.testing.assert_array_equal(fewer.descriptors, file.descriptors[[0, 2]])
+    last = dataclasses.replace(fewer, positions=None).only(np.array([False, True]))
+    assert last.recorded.tolist() == [False, False, True] and last.times.tolist() == [0.2] and last.positions is None
+    for skipped in ("3", [1, 1], [5], [-1], [0.5], {"0": 1}):
+        with pytest.raises(ValueError, match="expected the rows that were skipped, found"):
+            _ = dataclasses.replace(file, config={"skipped": skipped}).recorded

@@ -9,17 +9,19 @@ import pytest
 from PIL import Image
 from recordings import of_images, of_scans, with_points
 
-from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
+from sglpr_jax.bev import even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.formats.label_images import label_image_pixels
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
+from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed_images, embed_scans
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 SCANS = 7
+PICTURES = tuple(Path(f"{i:06d}.png") for i in range(SCANS))
 
 
 def flatten(images):
@@ -42,7 +44,7 @@ def scans() -> Recording:
 @pytest.fixture
 def pictures() -> Recording:
     values = np.random.default_rng(0).uniform(0, 10, (SCANS, 20, 24)).astype(np.float32)
-    by_path = {Path(f"{i:06d}.png"): picture for i, picture in enumerate(values)}
+    by_path = dict(zip(PICTURES, values, strict=True))
     return of_images(by_path, name="06", positions=np.zeros((SCANS, 3)), pose_source="06/pose.txt")
 
 
@@ -130,6 +132,30 @@ def test_ready_made_images_are_taken_as_they_are_by_any_model(pictures):
     kinds = ("points", "density")
     as_points, as_density = (embed_images(flatten, pictures, GRID, config={}, image=kind) for kind in kinds)
     np.testing.assert_array_equal(as_points.descriptors, as_density.descriptors)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(25.5, 0.0), (1.0, -9.0), (np.nan, 0.0)])
+def test_ready_made_images_that_are_none_of_densities_are_refused_where_these_are_wanted(pictures, scale, shift):
+    """Grey values, say, or counts of points: float values from 0 to 10 and hardly beyond are counts of voxels."""
+    values = {path: pictures.image(row) * np.float32(scale) + np.float32(shift) for row, path in enumerate(PICTURES)}
+    others = of_images(values, name="06")
+    with pytest.raises(ValueError, match=r"scan 000000 of sequence 06: expected a density image, floats from 0 to 10"):
+        embed_images(flatten, others, GRID, config={}, image="density")
+    reported = []
+    with pytest.raises(ValueError, match="at least one readable scan"):
+        embed_images(flatten, others, GRID, config={}, image="density", on_bad_scan=lambda *bad: reported.append(bad))
+    assert len(reported) == SCANS
+
+
+def test_a_little_beyond_the_counts_is_what_resizing_makes(pictures):
+    resized = of_images({path: pictures.image(row) * np.float32(1.1) for row, path in enumerate(PICTURES)}, name="06")
+    assert len(embed_images(flatten, resized, GRID, config={}, image="density")) == SCANS
+
+
+@pytest.mark.parametrize("batch", [0, -1])
+def test_a_batch_has_at_least_one_image(pictures, batch):
+    with pytest.raises(ValueError, match=f"batch: expected a number from 1 .*found {batch}"):
+        embed_images(flatten, pictures, GRID, config={}, batch=batch)
 
 
 def test_only_cells_of_density_images_make_density_images(scans):

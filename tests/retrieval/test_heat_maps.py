@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import Grid
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.presets import MODELS, model_preset
 from sglpr_jax.models.sglpr import forward, init

@@ -8,11 +8,12 @@ import pytest
 from PIL import Image
 from recordings import of_images
 
-from sglpr_jax.bev import Grid, even_cells, rasterize, rasterize_labels
+from sglpr_jax.bev import even_cells, rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_bev, density_label_bev
 from sglpr_jax.data.formats.label_images import label_image_pixels
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_raw
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params

@@ -13,10 +13,20 @@ from sglpr_jax.data import open_recording
 from sglpr_jax.data.density_image import density_bev, density_image, density_label_image
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.data.sampling.batch import read_batch
-from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.labels import to_classes
 from sglpr_jax.poses import positions_from_camera
-from sglpr_jax.sim import SENSORS, Sensor, recording, scan, simulate_recording, write_dataset, write_sessions
+from sglpr_jax.sim import (
+    SENSORS,
+    Sensor,
+    plan_sessions,
+    recording,
+    scan,
+    simulate_recording,
+    write_dataset,
+    write_sessions,
+)
 from sglpr_jax.sim.scenery import OUTSKIRTS
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
@@ -234,6 +244,21 @@ def test_a_dataset_of_before_there_were_sceneries_is_a_town(dataset, tmp_path):
         write(old, scenery=OUTSKIRTS)
 
 
+def test_a_dataset_that_notes_older_names_of_a_scenery_is_completed(tmp_path):
+    new = write(tmp_path / "new", names=("00",), scenery=OUTSKIRTS)
+    old = shutil.copytree(new, tmp_path / "old")
+    settings = json.loads((old / "simulation.json").read_text())
+    for name in ("crossing_every", "wavelength"):
+        settings["scenery"][name] = settings["scenery"].pop(f"{name}_m")
+    (old / "simulation.json").write_text(json.dumps(settings))
+    poses = "sequences/00/poses.txt"
+    (old / poses).unlink()
+    write(old, names=("00",), scenery=OUTSKIRTS)
+    assert content(old)[poses] == content(new)[poses]
+    with pytest.raises(ValueError, match="another simulated dataset"):
+        write(old)
+
+
 def test_files_that_were_not_simulated_are_never_written_among(tmp_path):
     (tmp_path / "sequences" / "00").mkdir(parents=True)
     with pytest.raises(ValueError, match="not simulated"):
@@ -269,6 +294,10 @@ def test_a_strange_rate_or_seed_is_refused_before_anything_is_written(tmp_path, 
         write(tmp_path / "none", **changes)
     with pytest.raises(ValueError, match=said):
         write_sessions(tmp_path / "none", dates=("2012-01-15",), scans=SCANS, sensor=TINY, **changes)
+    with pytest.raises(ValueError, match=said):
+        simulate_recording("08", scans=SCANS, sensor=TINY, **changes)
+    with pytest.raises(ValueError, match=said):
+        plan_sessions(("2012-01-15",), scans=SCANS, sensor=TINY, **changes)
     assert not (tmp_path / "none").exists()
 
 

@@ -37,6 +37,23 @@ def test_what_does_not_go_together_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"routes": ["99"]}, "found \\['99'\\]"),
+        ({"routes": ["99"], "sessions": ["2012-01-15"]}, "found '99'"),
+        ({"seed": -1}, "seed: expected"),
+        ({"rate_hz": 0.0}, "rate_hz: expected"),
+        ({"scans": 1}, "2 scans or more"),
+    ],
+)
+def test_nothing_is_told_of_a_dataset_that_cannot_be(tmp_path, changes, error):
+    told = []
+    with pytest.raises(ValueError, match=error):
+        simulate(tmp_path / "town", **(THIN | changes), on_start=told.append)
+    assert not told and not (tmp_path / "town").exists()
+
+
 def test_the_datasets_that_stand_in_for_real_ones_have_their_folders():
     (towns, options), (days, more) = default_dataset(Path("cache")), default_sessions(Path("cache"))
     assert towns.parent == days.parent == Path("cache") and towns != days

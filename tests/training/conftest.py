@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sglpr_jax.bev import Grid
 from sglpr_jax.data.sampling.batch import Batch
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.models.backbones.swin import SwinConfig
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset

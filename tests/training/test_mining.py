@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.sampling.batch import Batch
-from sglpr_jax.data.sampling.tuples import TupleConfig
+from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.training.batch_queue import BatchQueue

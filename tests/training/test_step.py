@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.sglpr import forward
-from sglpr_jax.training.config import without_untrained_head
-from sglpr_jax.training.loss import LossConfig, Summary, joint_loss, triplet, violations
+from sglpr_jax.training.config import LossConfig, without_untrained_head
+from sglpr_jax.training.loss import Summary, joint_loss, triplet, violations
 from sglpr_jax.training.state import new_state
 from sglpr_jax.training.step import _chunks, gradients, summarize, train_step
 

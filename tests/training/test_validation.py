@@ -7,7 +7,8 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.data import Recording
-from sglpr_jax.data.sampling.tuples import TupleConfig, TuplePool
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.training import validation

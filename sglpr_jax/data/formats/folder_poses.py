@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat
 from sglpr_jax.data.formats.pose_files import read_times
-from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.formats.scan_poses import poses_at_scans, unturned
+from sglpr_jax.data.formats.trajectory import Trajectory, read_trajectory
 
 POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
 TIMES_FILE = "times.txt"
@@ -20,25 +21,38 @@ def folder_trajectory(
 
     Positions are those of the file `poses`, or of the one of `POSE_FILES` beside the scans, where 12 numbers a line are
     poses of the LiDAR, z up. Times are those of the file `times`, else of `TIMES_FILE` beside the scans, else of the
-    poses. Raises ValueError where there are two pose files, or one is malformed or has another number of rows than
-    there are scans.
+    poses. Poses of more, fewer or other times are interpolated. Raises ValueError where there are two pose files, one
+    is malformed, or the poses are not those of all scans.
     """
     beside = [root / name for name in POSE_FILES if (root / name).is_file()]
     if poses is None and len(beside) > 1:
         raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
     path = poses or next(iter(beside), None)
-    found = None
-    if path is not None:
-        found = read_trajectory(path, format=pose_format, twelve_numbers="lidar" if poses is None else None)
-        _check_rows(path, len(found.positions), scans)
     clock = times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
-    seconds = None if found is None else found.times
+    seconds = None
     if clock is not None:
         seconds = read_times(clock)
         _check_rows(clock, len(seconds), scans)
-    if found is None or path is None:
+    if path is None:
         return None, seconds, None
-    return found.positions, seconds, found.source if poses is not None else path.name
+    found = read_trajectory(path, format=pose_format, twelve_numbers="lidar" if poses is None else None)
+    positions, said = _at_scans(path, found, seconds, scans, of=f"scan of {root.resolve().name}")
+    source = found.source if poses is not None else path.name
+    return positions, found.times if seconds is None else seconds, f"{source}{said}"
+
+
+def _at_scans(
+    path: Path, trajectory: Trajectory, times: Float[np.ndarray, " n"] | None, scans: int, *, of: str
+) -> tuple[Float[np.ndarray, "n 3"], str]:
+    """The positions of all scans, and how they were found if not row by row; ValueError where one has none."""
+    found = poses_at_scans(str(path), unturned(trajectory.positions), trajectory.times, times, scans=scans, of=of)
+    if times is not None and not found.kept.all():
+        late = times[~found.kept]
+        raise ValueError(
+            f"{path}: expected poses about the times of all {scans} scans, found none for {len(late)}, the first at "
+            f"{late[0]:.1f} s; leave these scans out, or name the poses to bin/evaluate alone, which leaves them out"
+        )
+    return found.poses[:, :3, 3], f", {found.said}" if found.said else ""
 
 
 def _check_rows(path: Path, rows: int, scans: int) -> None:

@@ -8,6 +8,8 @@ from jaxtyping import Float
 
 from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
 
+CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""Camera x right, y down, z forward from LiDAR x forward, y left, z up; both at one place."""
 FARTHEST_M = 1e8
 LATEST_S = 1e11
 """Times beyond the year 5000 are milli-, micro- or nanoseconds."""

@@ -12,6 +12,7 @@ from sglpr_jax.data.formats.bin_records import is_record, read_records
 from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.formats.pcd import read_pcd
 from sglpr_jax.data.formats.ply import read_ply
+from sglpr_jax.fields import check_value
 
 READERS: dict[ScanFormat, Callable[[Path], Float32[np.ndarray, "n 3"]]] = {
     "pcd": read_pcd,
@@ -64,7 +65,7 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 
     "auto" goes by the name, and takes a .bin that says nothing for kitti; `find_record` looks into the files. Points
     that are not finite are kept, so that labels still fit; the rasteriser drops them. Raises FileNotFoundError, and
-    ValueError where the file is empty or its size is no whole number of points.
+    ValueError for another format, and where the file is empty or its size is no whole number of points.
     """
     return read_points_and_lasers(Path(path), format=format)[0]
 
@@ -79,6 +80,7 @@ def read_points_and_lasers(
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    check_value(format, ScanFormat, f"{path}, format")
     known = guess_format(path, records=records) if format == "auto" else format
     if is_record(known):
         return read_records(path, known)

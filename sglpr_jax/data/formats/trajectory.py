@@ -25,6 +25,7 @@ from sglpr_jax.data.formats.pose_files import (
     read_times,
 )
 from sglpr_jax.data.warning import warn
+from sglpr_jax.fields import check_value
 from sglpr_jax.poses import positions_from_camera
 
 MOST_HEIGHT_M = 100.0
@@ -44,6 +45,8 @@ class Trajectory:
     """(n,) float64 seconds, or None."""
     source: str
     """Which poses these are, in words."""
+    by_row: bool = False
+    """Whether row i is frame i whatever the times, which were given for the frames."""
 
 
 TIME_COLUMNS = ("t", "time", "timestamp")
@@ -65,6 +68,7 @@ def read_trajectory(
     for horizontal distances depend on it, but may be told (`twelve_numbers`). Raises FileNotFoundError, and ValueError
     naming the file, what was expected and what was found.
     """
+    check_value(format, PoseFormat, f"{path}, format")
     trajectory = READERS[_format_of(path, twelve_numbers) if format == "auto" else format](path)
     if len(trajectory.positions) == 0:
         raise ValueError(f"{path}: expected at least one pose, found none")
@@ -74,7 +78,7 @@ def read_trajectory(
     clock = read_times(times)
     if len(clock) != len(trajectory.positions):
         raise ValueError(f"{times}: expected {len(trajectory.positions)} times, as many as poses, found {len(clock)}")
-    return replace(trajectory, times=clock)
+    return replace(trajectory, times=clock, by_row=True)
 
 
 def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.bev import Grid, ImageKind
 from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.tuples import TuplePool
-from sglpr_jax.data.views import View, cloud_view, image_view, picture
+from sglpr_jax.data.views import View, check_ready_made, cloud_view, image_view, picture
+from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.labels import UNLABELLED
 
 Place = tuple[Any, Any]
@@ -78,6 +78,7 @@ def read_batch(
 
     def read(recording: Recording, frame: int) -> Place:
         record = _read(recording, frame, images=images, labels=has_labels)
+        check_ready_made(record, image)
         classes = record.classes(categories) if has_labels else None
         return picture(record, classes) if pictures else (record.upright_points, classes)
 

@@ -1,26 +1,13 @@
 """A part of the training recordings that nothing is learnt from: on it a training is judged before the test."""
 
 import dataclasses
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from sglpr_jax.data.sampling.tuples import TupleConfig
-from sglpr_jax.fields import Bounds, check_fields
+from sglpr_jax.data.sampling.config import TupleConfig, ValidationConfig
 from sglpr_jax.revisits import close_pairs
-
-
-@dataclasses.dataclass(frozen=True)
-class ValidationConfig:
-    """What is held out of every training recording."""
-
-    share: Annotated[float, Bounds(0, 0.5)] = 0.0
-    """The length of a stretch of frames in a row, as a share of the recording; 0: nothing, as in the paper."""
-
-    def __post_init__(self):
-        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ def as_trajectory(
     """Return positions (metres, z up) and times (seconds) as a pose file would give them; None without positions."""
     if positions is None:
         return None
-    return Trajectory(np.asarray(positions, np.float64), times, "positions given as an array")
+    return Trajectory(np.asarray(positions, np.float64), times, "positions given as an array", by_row=True)
 
 
 def as_descriptors(

@@ -10,8 +10,8 @@ from sglpr_jax.evaluation.protocols.pairs_f1max import GAP
 from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import ScoredPairs, check_frames
-from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 
 def score_listed_pairs(

@@ -1,6 +1,6 @@
 """Pairs of frames, each positive or negative: drawn from a sequence, or listed with scores."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,9 @@ PAIR_BLOCK = 1 << 10
 """Pairs compared at a time: so few that their descriptors stay in the cache."""
 PARTNERS = 64
 """Partners of a frame are compared a multiple of so many at a time."""
+
+Keep = Callable[[Float[np.ndarray, "i j"], Int[np.ndarray, "i j"]], Bool[np.ndarray, "i j"]]
+"""Which pairs of frames (i, j) are meant: from their distance in metres and i - j, how many frames i is the later."""
 
 
 def score_pairs(
@@ -50,20 +53,33 @@ def score_pairs(
     return replace(result, score=curve.f1_max, curve=curve, interval=interval)
 
 
-def frame_pairs(
-    positions: Float[np.ndarray, "n d"], keep: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> Int[np.ndarray, " pairs"]:
-    """Return every ordered pair (i, j) that `keep(apart, gap)` keeps, as i * n + j.
+def frame_pairs(positions: Float[np.ndarray, "n d"], keep: Keep) -> Int[np.ndarray, " pairs"]:
+    """Return every ordered pair (i, j) that `keep` keeps, as i * n + j, rising."""
+    return np.concatenate([first + np.flatnonzero(kept) for first, kept in _kept_in_blocks(positions, keep)])
 
-    `apart` is their distance in metres and `gap` i - j, how many frames i is the later.
+
+def drawn_frame_pairs(
+    positions: Float[np.ndarray, "n d"], keep: Keep, *, most: int, rng: np.random.Generator
+) -> Int[np.ndarray, " pairs"]:
+    """Return `most` of `frame_pairs`, or all where there are fewer, drawn without replacement; rising.
+
+    They are those that `rng.choice` takes from a list of all, which is never made.
     """
+    ends = np.cumsum([np.count_nonzero(kept) for _, kept in _kept_in_blocks(positions, keep)])
+    ranks = np.sort(rng.choice(ends[-1], min(most, ends[-1]), replace=False))
+    of_blocks = np.split(ranks, np.searchsorted(ranks, ends[:-1]))
+    blocks = zip(_kept_in_blocks(positions, keep), of_blocks, [0, *ends[:-1]], strict=True)
+    return np.concatenate([first + np.flatnonzero(kept)[ranks - before] for (first, kept), ranks, before in blocks])
+
+
+def _kept_in_blocks(
+    positions: Float[np.ndarray, "n d"], keep: Keep
+) -> Iterator[tuple[int, Bool[np.ndarray, "block n"]]]:
+    """Yield for blocks of frames i the number of the first pair (i, j), and which pairs `keep` keeps."""
     n = len(positions)
-    found = []
     for start in range(0, n, BLOCK):
         gap = np.arange(start, min(start + BLOCK, n))[:, None] - np.arange(n)[None, :]
-        apart = distances(positions[start : start + BLOCK], positions)
-        found.append(start * n + np.flatnonzero(keep(apart, gap)))
-    return np.concatenate(found)
+        yield start * n, keep(distances(positions[start : start + BLOCK], positions), gap)
 
 
 def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:

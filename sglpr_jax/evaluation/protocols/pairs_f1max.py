@@ -3,14 +3,14 @@
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.evaluation.protocols.pairs import frame_pairs, score_drawn_pairs
+from sglpr_jax.evaluation.protocols.pairs import drawn_frame_pairs, frame_pairs, score_drawn_pairs
 from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import positions_of
-from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 GAP = 50
 """Frames no farther apart than so many are neighbours, not a revisit."""
@@ -27,11 +27,11 @@ def pairs_f1max(file: DescriptorFile, *, negatives_per_positive: int | None = 10
     """
     positions = positions_of(file, 2)
     positive = positive_pairs(positions)
-    negative = frame_pairs(positions, lambda apart, gap: (apart > NEGATIVE_M) & (gap > 0))
-    each = "all negatives"
-    if negatives_per_positive is not None:
-        rng = np.random.default_rng(seed)
-        negative = rng.choice(negative, min(negatives_per_positive * len(positive), len(negative)), replace=False)
+    if negatives_per_positive is None:
+        negative, each = frame_pairs(positions, are_negative), "all negatives"
+    else:
+        most, rng = negatives_per_positive * len(positive), np.random.default_rng(seed)
+        negative = drawn_frame_pairs(positions, are_negative, most=most, rng=rng)
         each = f"{negatives_per_positive} negatives per positive, seed {seed}"
     result = Result(
         name="pairs F1max" if negatives_per_positive == 100 else f"pairs F1max 1:{negatives_per_positive or 'all'}",
@@ -41,6 +41,11 @@ def pairs_f1max(file: DescriptorFile, *, negatives_per_positive: int | None = 10
         published_on="KITTI's own poses",
     )
     return score_drawn_pairs(file, result, positive, negative, seed=seed)
+
+
+def are_negative(apart: Float[np.ndarray, "i j"], gap: Int[np.ndarray, "i j"]) -> Bool[np.ndarray, "i j"]:
+    """Which pairs show two places, each pair once."""
+    return (apart > NEGATIVE_M) & (gap > 0)
 
 
 def positive_pairs(positions: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " pairs"]:

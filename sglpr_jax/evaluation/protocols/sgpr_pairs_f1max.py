@@ -6,8 +6,8 @@ from sglpr_jax.evaluation.protocols.pairs import frame_pairs, score_drawn_pairs
 from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import positions_of
-from sglpr_jax.poses import NEGATIVE_M, POSITIVE_M
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 NEGATIVE_SHARE = 0.005
 """The part of the negative pairs that is kept."""

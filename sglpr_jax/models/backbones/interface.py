@@ -1,7 +1,8 @@
-"""What a backbone is: a configuration that builds it, and two calls, from an image to features and back to pixels.
+"""What a backbone is: a configuration, and two calls, from an image to features and back to pixels.
 
-A backbone is one file of this folder: a frozen configuration with what `BackboneConfig` lists, and a class with the two
-calls of `Backbone`. `models/config.py` names the configuration in its union, and nothing else has to know of it.
+A backbone is two files of this folder: NAME_config.py has a frozen configuration with what `BackboneConfig` lists, and
+imports no JAX, so that a command line can name its fields at once; NAME.py a class with the two calls of `Backbone`.
+`models/config.py` names the configuration in its union, `build.py` the class, and nothing else has to know of them.
 """
 
 from collections.abc import Mapping
@@ -66,8 +67,4 @@ class BackboneConfig(Protocol):
     @property
     def pictures(self) -> Mapping[str, str]:
         """Of which maps heat maps are drawn: what a picture is called, and the map's name in `Seen.named`."""
-        ...
-
-    def build(self, *, circular: bool) -> Backbone:
-        """The layers; in a `circular` image the first column is the last one's neighbour."""
         ...

@@ -6,77 +6,14 @@ coarsest map is a shift of the tokens; other rotations are learnt.
 """
 
 import dataclasses
-from typing import Literal
 
 import flax.linen as nn
 from jaxtyping import Array, Float
 
-from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
 from sglpr_jax.models.backbones.interface import Seen
-from sglpr_jax.models.backbones.rings import RingConfig, RingDecoder, RingNet
-from sglpr_jax.models.backbones.swin_layers import check_stages
+from sglpr_jax.models.backbones.rings import RingDecoder, RingNet
+from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.backbones.swin_unet import SwinUnet
-
-
-@dataclasses.dataclass(frozen=True)
-class SglprConfig:
-    """A Swin-Unet whose tokens come from convolutions that go around the polar image."""
-
-    kind: Literal["sglpr"] = "sglpr"
-    stem: RingConfig = RingConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
-    """Its last map has a pixel for each token."""
-    embed_dim: Size = 64
-    depths: Depths = (2, 2)
-    """Blocks of each stage."""
-    heads: Sizes = (2, 4)
-    """Attention heads of each stage."""
-    window: Size = 4
-    """Edge of an attention window, in tokens."""
-    mlp_ratio: Size = 2
-    """Of the hidden layer of a block's MLP to its channels; 4 in the paper."""
-    drop_path: Share = 0.0
-    """Stochastic depth: the share of samples for which training leaves the last block out; 0 for the first block."""
-
-    def __post_init__(self):
-        check_fields(self)
-        check_stages(self.embed_dim, self.depths, self.heads)
-
-    @property
-    def token(self) -> tuple[int, int]:
-        """Rows and columns of the polar image that one token stands for."""
-        return self.stem.token
-
-    @property
-    def width(self) -> int:
-        """Channels of the tokens."""
-        return self.embed_dim
-
-    @property
-    def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this: one token of the coarsest stage."""
-        rows, columns = self.token
-        coarsest = 2 ** (len(self.depths) - 1)
-        return rows * coarsest, columns * coarsest
-
-    @property
-    def needs_polar(self) -> bool:
-        """Its convolutions and windows go around."""
-        return True
-
-    @property
-    def pictures(self) -> dict[str, str]:
-        """Which maps are drawn: of the stem, the first and last stage of the encoder, and the decoder."""
-        stem, last = len(self.stem.widths) - 1, len(self.depths) - 1
-        return {
-            "stem": f"ring_block{stem}",
-            "encoder, first": "enc0_out",
-            "encoder, last": f"enc{last}_out",
-            "decoder": f"dec{last}_out",
-        }
-
-    def build(self, *, circular: bool) -> "SglprBackbone":
-        """The layers."""
-        return SglprBackbone(self)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,84 +1,14 @@
 """The paper's backbone: a Swin-Unet (section 4.1.1), if asked for with convolutions in front."""
 
 import dataclasses
-from typing import Literal
 
 from jaxtyping import Array, Float
 
-from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
 from sglpr_jax.models.backbones.interface import Seen
 from sglpr_jax.models.backbones.stem import Stem, StemDecoder
-from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand, check_stages
+from sglpr_jax.models.backbones.swin_config import SwinConfig
+from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand
 from sglpr_jax.models.backbones.swin_unet import SwinUnet
-
-
-@dataclasses.dataclass(frozen=True)
-class SwinConfig:
-    """A Swin-Unet. The default is the paper's; stage i has `embed_dim` * 2**i channels."""
-
-    kind: Literal["swin"] = "swin"
-    patch: Size = 4
-    """Edge of a token's patch, in pixels of the image."""
-    stem: Sizes = ()
-    """Widths of convolutions before the patch embedding, the second and later ones at half the resolution of the one
-    before; the segmentation head sees each of them again. (): none, as in the paper."""
-    embed_dim: Size = 96
-    depths: Depths = (2, 2, 2, 2)
-    """Blocks of each stage."""
-    heads: Sizes = (3, 6, 12, 24)
-    """Attention heads of each stage."""
-    window: Size = 7
-    """Edge of an attention window, in tokens."""
-    drop_path: Share = 0.2
-    """Stochastic depth: the share of samples for which training leaves the last block out; 0 for the first block."""
-
-    def __post_init__(self):
-        check_fields(self)
-        check_stages(self.embed_dim, self.depths, self.heads)
-        if self.patch % self._stem_pixel:
-            raise ValueError(
-                f"expected a patch made of the stem's pixels of {self._stem_pixel} cells ({len(self.stem)} widths), "
-                f"found patch {self.patch}"
-            )
-
-    @property
-    def token(self) -> tuple[int, int]:
-        """Rows and columns of the image that one token stands for."""
-        return self.patch, self.patch
-
-    @property
-    def width(self) -> int:
-        """Channels of the tokens."""
-        return self.embed_dim
-
-    @property
-    def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this: one token of the coarsest stage."""
-        return (self.patch * 2 ** (len(self.depths) - 1),) * 2
-
-    @property
-    def needs_polar(self) -> bool:
-        """Windows fit any image."""
-        return False
-
-    @property
-    def pictures(self) -> dict[str, str]:
-        """Which maps are drawn; a normalised one would be as strong everywhere."""
-        last = len(self.depths) - 1
-        return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
-
-    @property
-    def stem_patch(self) -> int:
-        """Edge of a token's patch in pixels of the map that it is cut from: the image, or the stem's last map."""
-        return self.patch // self._stem_pixel
-
-    @property
-    def _stem_pixel(self) -> int:
-        return 2 ** max(len(self.stem) - 1, 0)
-
-    def build(self, *, circular: bool) -> "SwinBackbone":
-        """The layers."""
-        return SwinBackbone(self, circular)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,22 +14,6 @@ MLP_RATIO = 4
 """Of the hidden layer of a block's MLP to its channels, in the paper."""
 
 
-def check_stages(embed_dim: int, depths: tuple[int, ...], heads: tuple[int, ...]) -> None:
-    """Raise ValueError unless there are as many numbers of heads as of blocks, and heads that share a stage's channels.
-
-    Stage i has `embed_dim` * 2**i channels.
-    """
-    if not depths or len(depths) != len(heads):
-        raise ValueError(
-            f"expected a stage at least, and a number of heads for each, found depths {depths}, heads {heads}"
-        )
-    for i, number in enumerate(heads):
-        if embed_dim * 2**i % number:
-            raise ValueError(
-                f"heads: expected a divisor of the {embed_dim * 2**i} channels of stage {i}, found {number}"
-            )
-
-
 class PatchEmbed(nn.Module):
     """One token for each patch of the image: a convolution whose stride is its kernel, then layer norm."""
 

@@ -1,0 +1,96 @@
+"""Poses of other times or of more scans serve bin/embed and bin/evaluate as they do bin/loops and bin/map."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.data import open_recording
+from sglpr_jax.loops.graph_files import write_tum
+
+from .conftest import SCANS, assert_one_line_error
+
+load = sglpr_jax.DescriptorFile.load
+METHOD = ("--method", "thumbnail")
+PROTOCOL = ("--protocol", "top1-f1max")
+
+
+@pytest.fixture
+def scans(town, tmp_path):
+    """The scans of 08 as a plain folder without times, and where and when they were taken."""
+    shutil.copytree(town / "sequences" / "08" / "velodyne", tmp_path / "scans")
+    recording = open_recording(town, "08")
+    return tmp_path / "scans", recording.positions, recording.times
+
+
+def write(path, positions, times):
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    write_tum(path, poses, times)
+    return path
+
+
+def between(positions, times, *, step=0.03):
+    """Poses and times far more often than the scans."""
+    stamps = np.arange(times[0], times[-1] + step, step)
+    return np.stack([np.interp(stamps, times, axis) for axis in positions.T], axis=1), stamps
+
+
+def test_poses_of_other_times_serve_embedding_and_scoring_alike(command, scans, tmp_path):
+    folder, positions, times = scans
+    poses = write(tmp_path / "odometry.tum", *between(positions, times))
+    np.savetxt(tmp_path / "times.txt", times)
+    given = ("--data", folder, "--times", tmp_path / "times.txt", *METHOD)
+    ended = command("embed", *given, "--poses", poses, "--out", tmp_path / "placed.npz")
+    assert ended.status == 0, ended.error
+    placed = load(tmp_path / "placed.npz")
+    np.testing.assert_allclose(placed.positions, positions, atol=0.3)
+    assert "odometry.tum (TUM), interpolated at the times of the scans" in placed.pose_source
+    assert placed.pose_source in ended.error
+
+    assert command("embed", *given, "--out", tmp_path / "bare.npz").status == 0
+    ended = command("evaluate", tmp_path / "bare.npz", "--poses", poses, *PROTOCOL)
+    assert ended.status == 0, ended.error
+    report = json.loads((tmp_path / "bare" / "results.json").read_text())["results"][0]
+    same = sglpr_jax.evaluate(placed, PROTOCOL[1:]).results[0]
+    assert (report["score"], report["counts"]) == (same.score, same.counts) and report["poses"] == same.pose_source
+    late = write(tmp_path / "late.tum", positions, 1.1 * times + 1e6)
+    for run in (("embed", *given, "--out", tmp_path / "late.npz"), ("evaluate", tmp_path / "bare.npz")):
+        assert_one_line_error(
+            command(*run, "--poses", late), "late.tum", "expected 40 poses, one for each", "found 40 of"
+        )
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_poses_of_all_scans_can_be_named_after_bad_ones_were_skipped(command, scans, tmp_path, timed):
+    folder, positions, times = scans
+    poses = write(tmp_path / "poses.tum", positions, times)
+    if timed:
+        np.savetxt(folder / "times.txt", times)
+    for row in (0, 7, 39):
+        (folder / f"{row:06d}.bin").write_bytes(b"half")
+    ended = command("embed", "--data", folder, *METHOD, "--skip-bad", "--out", tmp_path / "mine.npz")
+    assert ended.status == 0 and "3 scans skipped" in ended.out, ended.error
+    ended = command("evaluate", tmp_path / "mine.npz", "--poses", poses, *PROTOCOL)
+    assert ended.status == 0, ended.error
+    report = json.loads((tmp_path / "mine" / "results.json").read_text())
+    assert report["results"][0]["poses"].endswith("poses.tum (TUM)")
+    file = load(tmp_path / "mine.npz")
+    assert file.config["skipped"] == [0, 7, 39] and file.positions is None and len(file) == SCANS - 3
+
+
+def test_a_matrix_is_compared_on_the_positions_and_times_of_the_file(command, town, tmp_path):
+    assert command("embed", "--data", town, "--seq", "08", *METHOD, "--out", tmp_path / "08.npz").status == 0
+    np.save(tmp_path / "own.npy", load(tmp_path / "08.npz").descriptors)
+    ended = command("evaluate", tmp_path / "08.npz", "--compare", tmp_path / "own.npy", *PROTOCOL)
+    assert ended.status == 0, ended.error
+    report = json.loads((tmp_path / "08" / "results.json").read_text())
+    ours = [{key: one[key] for key in ("protocol", "counts")} for one in report["results"]]
+    assert [{key: one[key] for key in ("protocol", "counts")} for one in report["compared"]["own"]] == ours
+    np.save(tmp_path / "own.npy", np.ones((39, 3)))
+    ended = command("evaluate", tmp_path / "08.npz", "--compare", tmp_path / "own.npy", *PROTOCOL)
+    assert_one_line_error(
+        ended, "own.npy: expected 40 descriptors, as many as sequences/08/poses.txt has poses, found 39"
+    )

@@ -1,0 +1,94 @@
+"""Odometry that most loops contradict is told, drift is not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import of_scans
+
+import sglpr_jax
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops import find
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, Seen
+from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.graph_files import CAMERA_FROM_LIDAR
+from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.upright import check_level
+from sglpr_jax.loops.verification import Alignment
+
+N = 40
+ALWAYS = LoopModel({"distance": 0.0}, {"distance": 0.0}, {"distance": 1.0}, 10.0, "everything")
+CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=0))
+
+
+@pytest.fixture(scope="module")
+def params():
+    return sglpr_jax.load("rings")
+
+
+@pytest.fixture(scope="module")
+def there_and_back() -> np.ndarray:
+    """Poses along a bend, 2 m apart, and back, now nearer to the first lane, now farther from it."""
+    there = np.stack([transform(20 * np.sin(a), 20 - 20 * np.cos(a), a) for a in np.arange(N) / 10])
+    aside = np.stack([transform(0.0, 3 + 2 * np.sin(i), np.pi) for i in np.arange(N)])
+    return np.concatenate([there, (there @ aside)[::-1]])
+
+
+def searched(params, poses: np.ndarray, odometry: np.ndarray) -> LoopDetector:
+    """The detector after a drive of which each frame of the way back has its true loop."""
+    detector = LoopDetector(params, model=ALWAYS, config=CONFIG)
+    seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
+    for query, pose in enumerate(odometry):
+        match, pairs = 2 * N - 1 - query, []
+        if match < query:
+            true = inverse(poses[match]) @ poses[query]
+            alignment = Alignment(*true[:2, 3], yaw_of(true), np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
+            pairs = [Candidate(query, match, alignment, Evidence.of(1.0, 0.0, 0.8, 0.3))]
+        detector.add_seen(seen, odometry=pose, candidates=pairs)
+    return detector
+
+
+@pytest.fixture
+def found(params, there_and_back, monkeypatch):
+    """What `find_loops` makes of the drive with this odometry; nothing is described, the detector has seen it all."""
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
+
+    def found(odometry):
+        detector = searched(params, there_and_back, odometry)
+        monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
+        return find.find_loops(recording, params, odometry=odometry, config=CONFIG)
+
+    return found
+
+
+@pytest.mark.parametrize("share", [1.0, 1.01])
+def test_odometry_in_the_lidars_axes_agrees_with_the_loops_drifting_as_it_may(found, there_and_back, share):
+    odometry = there_and_back.copy()
+    odometry[:, :3, 3] *= share  # a warning is an error
+    assert len(found(odometry).loops) >= N - 1
+
+
+def test_odometry_in_other_axes_is_told(found, there_and_back):
+    forward_is_y = there_and_back @ transform(0.0, 0.0, np.pi / 2)
+    words = r"08: expected odometry that most loops agree with, found \d\d of \d\d loops .* check the frame and the"
+    with pytest.warns(DataWarning, match=words):
+        assert len(found(forward_is_y).loops) < N / 2
+
+
+def test_odometry_in_the_cameras_axes_is_told_by_its_way_too(there_and_back):
+    check_level(there_and_back, None, name="08")
+    camera = CAMERA_FROM_LIDAR @ there_and_back @ CAMERA_FROM_LIDAR.T
+    check_level(camera[:5], None, name="08")
+    words = r"08: expected poses of a LiDAR that goes along the ground .*, found \d+ of \d+ m of way up or down"
+    with pytest.warns(DataWarning, match=words):
+        check_level(camera, None, name="08")
+    forward = Mounting(1.0, (1.0, 0.0, 0.0))
+    with pytest.warns(DataWarning, match=words):
+        check_level(there_and_back, forward, name="08")
+
+
+def test_a_few_loops_tell_nothing():
+    find._check_odometry("08", {1, 2, 3, 4}, [], [])
+    find._check_odometry("08", set(), [], [])
