@@ -9,6 +9,7 @@ import tyro
 
 from sglpr_jax.cli.recording import RecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
@@ -41,7 +42,7 @@ class MapCommand:
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
     add_to: Path | None = None
     """A map in the same world frame, of the same weights, whose places the new one has too."""
-    spacing_m: float = SPACING_M
+    spacing_m: NotNegative = SPACING_M
     """Scans nearer than this to the last place are left out."""
     weights: str = DEFAULT_WEIGHTS
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""

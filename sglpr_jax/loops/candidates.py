@@ -15,7 +15,7 @@ from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.views import image_view, picture, view
+from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
@@ -132,6 +132,7 @@ class CandidateFinder:
     def seen(self, record: Record) -> Seen:
         """The descriptor of a scan or image, and its density image as 8 bits; nothing is remembered."""
         model = self.params.config
+        check_ready_made(record, model.image)
         whole, _ = picture(record, None)
         if record.points is None or model.image == "density":
             bev = image_view(whole, None, model.grid).image

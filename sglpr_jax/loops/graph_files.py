@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import check_times, numbers_of, read_poses, read_rows
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, check_times, numbers_of, read_poses, read_rows
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
@@ -24,8 +24,6 @@ UPPER = np.triu_indices(6)
 """The 21 numbers of an information matrix, row by row: translation first, then rotation."""
 ODOMETRY_M, ODOMETRY_DEG = 0.05, 0.1
 """Standard deviations of a step of the odometry in a graph, where none are given."""
-CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""KITTI's axes of poses: x right, y down, z forward."""
 COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
 
 

@@ -10,6 +10,7 @@ from sglpr_jax.data.formats.pose_files import columns_of
 from sglpr_jax.data.formats.scan_poses import poses_at_scans
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.fields import check_value
 from sglpr_jax.loops.choices import OdometryFormat
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
 from sglpr_jax.poses import are_rotations
@@ -24,6 +25,7 @@ def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float
     FileNotFoundError, and ValueError naming the file, what was expected and what was found.
     """
     path = Path(path)
+    check_value(format, OdometryFormat, f"{path}, format")
     format = _format_of(path) if format == "auto" else format
     poses = _READERS[format](path)
     if not len(poses):

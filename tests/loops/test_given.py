@@ -15,7 +15,7 @@ from sglpr_jax.loops.candidates import CandidateFinder, Seen
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.given import check_is, given_pose, given_poses, given_record, given_time
-from sglpr_jax.loops.graph_files import CAMERA_FROM_LIDAR
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.loops.places import PlaceMap, map_recording
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.models.params import Params
@@ -82,6 +82,8 @@ def test_the_functions_ask_so(recording, params):
         PlaceMap.of(recording, params, POSES[:1])
     with pytest.raises(TypeError, match=r"found the path 0\.bin: sglpr_jax\.read_scan reads it"):
         LoopDetector(params).add("0.bin")
+    with pytest.raises(ValueError, match=r"expected a density image, floats from 0 to 10, found floats from 0 to 255"):
+        LoopDetector(params).add(255.0 * np.eye(151))
 
 
 @pytest.mark.parametrize("function", [find_loops, map_recording])
