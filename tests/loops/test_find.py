@@ -7,12 +7,12 @@ import pytest
 from recordings import of_scans
 
 import sglpr_jax
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import check_level
