@@ -40,7 +40,7 @@ def reliability(
     for low, high in itertools.pairwise(edges):
         chosen = (probability >= low) & ((probability < high) | (high == edges[-1]))
         if chosen.any():
-            said = float(probability[chosen].mean())
+            said = float(probability[chosen].mean().clip(low, high))  # the mean of equal numbers may be rounded out
             found.append(Bin(low, high, int(chosen.sum()), int(is_loop[chosen].sum()), said))
     return tuple(found)
 

@@ -8,6 +8,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.loops.calibration import calibrated, certain_pairs
 from sglpr_jax.loops.probability import default_model
+from sglpr_jax.models.weights import weights_hash
 
 FRAMES = 50
 
@@ -44,7 +45,7 @@ def test_the_model_fits_them(short, params, odometry):
     evidence, is_loop = certain_pairs(params, short, odometry, pairs=20, seed=2)
     probability = model.probability(evidence)
     assert probability[is_loop].mean() > 0.8 and probability[~is_loop].mean() < 0.2
-    assert "others of 08" in model.made_with and default_model("").made_with in model.made_with
+    assert "others of 08" in model.made_with and default_model(weights_hash(params)).made_with in model.made_with
 
 
 def test_odometry_of_another_length_is_refused(short, params, odometry):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sglpr_jax.loops.candidates import Candidate
@@ -24,6 +24,7 @@ def test_bins_are_counted():
 
 
 @given(st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=60))
+@example(3 * [(0.99, False)])  # the mean of which is rounded to less
 def test_every_pair_is_in_one_bin(pairs):
     probability, is_loop = np.array([p for p, _ in pairs]), np.array([loop for _, loop in pairs], bool)
     found = reliability(probability, is_loop)
