@@ -104,6 +104,9 @@ def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: 
             yield Placed((Part("cylinder", POLE, (0.18, 0.18, rng.uniform(5, 8))),), s, d, zone=zone)
         for s in _steps(rng, start, stop, (40.0, 120.0)):
             yield Placed(bin_or_bench(rng), s, d + 0.3, zone=zone)
+    if side.post_spacing:
+        for s in _steps(rng, start, stop, (side.post_spacing, side.post_spacing + 0.2)):
+            yield Placed((Part("cylinder", POLE, (0.15, 0.15, 1.4)),), s, d, zone=zone)
     for s in _poisson(rng, side.style.signs, start, stop):
         size, low = rng.uniform(0.5, 0.9), rng.uniform(1.3, 2.1)
         post = Part("cylinder", POLE, (0.08, 0.08, low + size))
@@ -130,6 +133,7 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
 _BORDERS: dict[str, tuple[float, Range, float]] = {
     # thickness, range of heights, share of the line that is closed
     "hedge": (1.0, (0.9, 2.6), 0.9),
+    "hedgerow": (0.3, (1.2, 3.0), 0.95),
     "fence": (0.06, (0.9, 1.8), 0.85),
     "wall": (0.25, (0.7, 2.2), 0.9),
     "screen": (0.2, (1.6, 3.5), 1.0),
@@ -137,9 +141,11 @@ _BORDERS: dict[str, tuple[float, Range, float]] = {
 }
 
 
-def _piece(border: str, length: float, thickness: float, height: float) -> Thing:
+def _piece(rng: np.random.Generator, border: str, length: float, thickness: float, height: float) -> Thing:
     if border == "hedge":
         return plants.hedge(length, thickness, height)
+    if border == "hedgerow":
+        return plants.hedgerow(rng, length, height)
     if border == "rail":
         return (
             Part("box", FENCE, (length, thickness, 0.35), bottom=height - 0.35),
@@ -158,7 +164,7 @@ def _in_pieces(
     count = int((stop - start) / 5) + 1
     edges = np.linspace(start, stop, count + 1).tolist()
     for low, high in itertools.pairwise(edges):
-        yield Placed(_piece(border, high - low + 0.1, thickness, height), (low + high) / 2, d, zone=zone)
+        yield Placed(_piece(rng, border, high - low + 0.1, thickness, height), (low + high) / 2, d, zone=zone)
 
 
 def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
@@ -204,7 +210,7 @@ def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, 
     elif what == "hedge":
         yield Placed(plants.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
     elif what == "wall":
-        yield Placed(_piece("wall", 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
+        yield Placed(_piece(rng, "wall", 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
 
 
 def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:

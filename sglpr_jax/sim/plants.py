@@ -53,6 +53,22 @@ def hedge(length: float, thickness: float, height: float) -> Thing:
     return (Part("box", VEGETATION, (length, thickness, height + 0.3), bottom=-0.3, roughness=0.3, porosity=0.25),)
 
 
+def hedgerow(rng: np.random.Generator, length: float, height: float) -> Thing:
+    """A piece of an overgrown hedge along x: a dense face, and thinner and thinner leaves behind it (y > 0)."""
+    parts = [
+        Part(
+            "box", VEGETATION, (length, 0.3, height + 0.3), bottom=-0.3, roughness=0.12, porosity=rng.uniform(0.2, 0.5)
+        )
+    ]
+    behind = 0.15
+    for porosity in (0.55, 0.7, 0.8)[: int(rng.integers(0, 4))]:
+        depth, top = rng.uniform(0.5, 1.3), height * rng.uniform(0.9, 1.7)
+        size, y = (length, depth, top + 0.3), behind + depth / 2
+        parts.append(Part("box", VEGETATION, size, y=y, bottom=-0.3, roughness=0.6, porosity=porosity))
+        behind += depth
+    return tuple(parts)
+
+
 def thicket(rng: np.random.Generator) -> Thing:
     """A piece of a wood's edge: undergrowth, and trunks that show through it."""
     parts = [*bush(rng, rng.uniform(1.2, 2.4))]

@@ -47,5 +47,13 @@ OUTSKIRTS = Scenery(
     steepest=0.09,
 )
 """Hilly land with long roads between walls, hedges and slopes, where one place looks like the next."""
-SCENERIES = {"town": TOWN, "outskirts": OUTSKIRTS}
+LANES = Scenery(
+    {"hedged": 0.45, "hillside": 0.2, "country": 0.1, "suburb": 0.15, "walled": 0.1},
+    look_alike=0.3,
+    crossing_every_m=(80.0, 250.0),
+    wavelength_m=(80.0, 500.0),
+    steepest=0.07,
+)
+"""Roads between overgrown hedges, whose face is seen from one lane and whose depth from the other."""
+SCENERIES = {"town": TOWN, "outskirts": OUTSKIRTS, "lanes": LANES}
 """By the names that the command line knows."""

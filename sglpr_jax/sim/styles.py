@@ -38,6 +38,7 @@ class Style:
     trees: float = 0.0  # trees and bushes per metre of side, on the plots
     wood: float = 0.0  # share of the sides where a wood comes down to the road
     banks: float = 0.0  # share of the sides where the ground rises beside the road
+    posts: float = 0.0  # share of the sides with a row of posts along the road
     slopes: float = 0.0  # share of the sides that are the foot of a hill
     bystanders: float = 0.0  # people, bicycles, bins and the like per metre of side
     signs: float = 0.02  # per metre of side
@@ -200,6 +201,22 @@ STYLES = {
         slopes=0.6,
         bystanders=0.01,
     ),
+    "hedged": Style(
+        road=(3.0, 4.6),
+        walk=(0.0, 2.5),
+        garden=TERRAIN,
+        houses=0.4,
+        gap=(8.0, 40.0),
+        set_back=(6.0, 16.0),
+        border=("hedgerow", "hedgerow", "hedgerow", "screen"),
+        closed=(40.0, 400.0),
+        bays=0.1,
+        verge=0.5,
+        trees=0.6,
+        banks=0.1,
+        posts=0.3,
+        bystanders=0.01,
+    ),
     "highway": Style(
         road=(6.0, 7.5),
         walk=(0.0, 0.0),
@@ -238,6 +255,7 @@ class Side:
     bank: bool
     slope: bool
     tree_spacing: float  # of the row of street trees; 0 where there is none
+    post_spacing: float  # of the row of posts; 0 where there is none
     row: House | None  # the house that stands again and again along a look-alike street
 
     @property
@@ -272,6 +290,7 @@ def draw_side(rng: np.random.Generator, style: Style, *, median: bool, look_alik
         slope=style.slopes > 0 and rng.random() < style.slopes,
         tree_spacing=rng.uniform(7, 16) if median or rng.random() < style.street_trees else 0.0,
         row=draw_house(rng, style) if look_alike else None,
+        post_spacing=rng.uniform(6, 14) if style.posts and rng.random() < style.posts else 0.0,
     )
 
 

@@ -138,6 +138,19 @@ def test_the_outskirts_have_neighbourhoods_of_their_own_and_fewer_crossings():
     assert alike["outskirts"] > alike["town"] and sides["outskirts"] < sides["town"]
 
 
+def test_lanes_run_between_hedgerows_and_some_have_posts():
+    path = resample(*drive(((0, 0), (1500, 0))))
+    sides = {}
+    for name, scenery in SCENERIES.items():
+        towns = [draw_streets(np.random.default_rng(seed), path, scenery) for seed in range(16)]
+        stretches = [stretch for town in towns for stretch in town[0].stretches]
+        sides[name] = [side for stretch in stretches for side in (stretch.left, stretch.right)]
+    grown = {name: np.mean([side.border == "hedgerow" for side in found]) for name, found in sides.items()}
+    assert grown["lanes"] > 0.2 and grown["town"] == grown["outskirts"] == 0
+    spacing = np.array([side.post_spacing for side in sides["lanes"]])
+    assert 0 < np.mean(spacing > 0) < 0.5 and np.all((spacing == 0) | ((spacing > 6) & (spacing < 14)))
+
+
 def test_what_a_scenery_asks_for_must_be_there():
     with pytest.raises(ValueError, match=r"styles: expected shares of centre, .*, found \{'harbour': 1.0\}"):
         Scenery({"harbour": 1.0})

@@ -8,7 +8,7 @@ from town import LOOP, THERE_AND_BACK, drive
 from sglpr_jax.labels import CATEGORIES, to_classes
 from sglpr_jax.sim import World, build_world
 from sglpr_jax.sim.ground import is_raised, label_at, surface_height
-from sglpr_jax.sim.raw_ids import BUILDING, CAR, FENCE, LANE_MARKING, MOVING, POLE, ROAD, TERRAIN, TRUNK
+from sglpr_jax.sim.raw_ids import BUILDING, CAR, FENCE, LANE_MARKING, MOVING, POLE, ROAD, TERRAIN, TRUNK, VEGETATION
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.shapes import Shapes
 
@@ -133,6 +133,27 @@ def test_the_outskirts_have_walls_to_their_length_and_hills_beside_the_road():
             assert np.all(top > surface_height(world.ground, shapes.centre[each, :2]) + 0.4)
     assert longest["outskirts"] > 1.5 * longest["town"] > 0
     assert hills["outskirts"] > 50 > hills["town"]
+
+
+def test_behind_the_face_of_a_hedgerow_leaves_thin_out_away_from_the_road():
+    layers = []
+    for seed in range(6):
+        boxes = world_of(((0, 0), (600, 0)), seed, "lanes").scene.boxes
+        # Beside the straight road, not along a side street.
+        along = (boxes.label == VEGETATION) & (np.abs(np.sin(boxes.yaw)) < 0.02) & (boxes.roughness != 0.3)
+        hedge = select(boxes, along)
+        across = np.abs(hedge.centre[:, 1])
+        faces = np.flatnonzero(hedge.roughness < 0.2)
+        for i in faces.tolist():
+            piece = np.flatnonzero(
+                (np.abs(hedge.centre[:, 0] - hedge.centre[i, 0]) < 0.3)
+                & (np.sign(hedge.centre[:, 1]) == np.sign(hedge.centre[i, 1]))
+                & (np.abs(across - across[i]) < 4)
+            )
+            order = piece[np.argsort(across[piece])]
+            assert order[0] == i and np.all(np.diff(hedge.porosity[order]) > 0)
+            layers.append(len(order) - 1)
+    assert len(layers) > 100 and set(layers) == {0, 1, 2, 3}
 
 
 def _longest_run(along: np.ndarray, side: np.ndarray) -> float:
