@@ -39,7 +39,7 @@ class EmbedCommand:
     skip_bad: bool = False
     """Report scans that cannot be read and go on without them."""
     batch: Size = 8
-    """Images described at a time."""
+    """Images described at a time, where there are so many scans."""
 
 
 def embed_recording(command: EmbedCommand) -> Path:

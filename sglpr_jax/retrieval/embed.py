@@ -89,6 +89,7 @@ def embed_images(
     scans are read too, and `describe` gets each scan's map of so many classes. The other options are those of `embed`.
     """
     check_value(batch, Size, "batch")
+    batch = _batch_for(len(recording), batch)
     angles = _angles(len(recording), rotation_seed)
     rows, views = [], []
     descriptors = _Descriptors()
@@ -110,7 +111,7 @@ def embed_images(
             views = []
             on_progress(row + 1)
     if views:
-        descriptors.add(_describe_padded(describe, views, batch)[: len(views)])
+        descriptors.add(_describe_padded(describe, views, batch))
     on_progress(len(recording))
     config = {**config, "rotation_seed": rotation_seed}
     return _file(recording, rows, descriptors.all(), config=config, weights_hash=weights_hash)
@@ -129,7 +130,7 @@ class _Descriptors:
         self._computing = [batch]
 
     def all(self) -> list[Float32[np.ndarray, "b d"]]:
-        """The descriptors, after the last batch has ended."""
+        """The descriptors, after the last batch has ended, and behind them those of its padding."""
         return [*self._done, *(np.asarray(one, np.float32) for one in self._computing)]
 
 
@@ -242,7 +243,7 @@ def _begun(threads: ThreadPoolExecutor, read: Callable[[int], tuple], then: Call
 
 
 def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], **about: Any) -> DescriptorFile:
-    """The descriptors of these rows of a recording; ValueError where there are none."""
+    """The descriptors of these rows of a recording, the first ones given; ValueError where there are none."""
     if not rows:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
     if len(rows) < len(recording):  # so that poses of all its scans can be given later
@@ -252,7 +253,7 @@ def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], 
         ids=tuple(recording.ids[row] for row in rows),
         positions=None if recording.positions is None else recording.positions[rows],
         times=None if recording.times is None else recording.times[rows],
-        descriptors=np.concatenate(descriptors),
+        descriptors=np.concatenate(descriptors)[: len(rows)],
         pose_source=recording.pose_source,
         **{"weights_hash": "", **about},
     )
@@ -266,6 +267,11 @@ def _finite_points(
     check_cloud(record.points, name=record.name)
     finite = np.isfinite(record.points).all(axis=1)
     return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
+
+
+def _batch_for(scans: int, batch: int) -> int:
+    """`batch`, or for fewer scans the next power of two: few sizes to compile, and little is described in vain."""
+    return min(batch, 2 ** max(scans - 1, 0).bit_length())
 
 
 def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Num[Array | np.ndarray, "b d"]:
