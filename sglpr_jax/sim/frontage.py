@@ -145,7 +145,7 @@ def _piece(rng: np.random.Generator, border: str, length: float, thickness: floa
     if border == "hedge":
         return plants.hedge(length, thickness, height)
     if border == "hedgerow":
-        return plants.hedgerow(rng, length, height)
+        return plants.hedgerow(rng, length, thickness, height)
     if border == "rail":
         return (
             Part("box", FENCE, (length, thickness, 0.35), bottom=height - 0.35),

@@ -53,14 +53,11 @@ def hedge(length: float, thickness: float, height: float) -> Thing:
     return (Part("box", VEGETATION, (length, thickness, height + 0.3), bottom=-0.3, roughness=0.3, porosity=0.25),)
 
 
-def hedgerow(rng: np.random.Generator, length: float, height: float) -> Thing:
+def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
     """A piece of an overgrown hedge along x: a dense face, and thinner and thinner leaves behind it (y > 0)."""
-    parts = [
-        Part(
-            "box", VEGETATION, (length, 0.3, height + 0.3), bottom=-0.3, roughness=0.12, porosity=rng.uniform(0.2, 0.5)
-        )
-    ]
-    behind = 0.15
+    face, porosity = (length, thickness, height + 0.3), rng.uniform(0.2, 0.5)
+    parts = [Part("box", VEGETATION, face, bottom=-0.3, roughness=0.12, porosity=porosity)]
+    behind = thickness / 2
     for porosity in (0.55, 0.7, 0.8)[: int(rng.integers(0, 4))]:
         depth, top = rng.uniform(0.5, 1.3), height * rng.uniform(0.9, 1.7)
         size, y = (length, depth, top + 0.3), behind + depth / 2
