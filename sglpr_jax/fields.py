@@ -39,6 +39,7 @@ CountOrNone = Annotated[int, Bounds(0, 2**53)]
 Positive = Annotated[float, Bounds(above=0)]
 NotNegative = Annotated[float, Bounds(0)]
 Share = Annotated[float, Bounds(0, 1)]
+Degrees = Annotated[float, Bounds(0, 360)]
 
 
 def check_fields(config: Any) -> None:

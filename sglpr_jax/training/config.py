@@ -4,7 +4,7 @@ import dataclasses
 from typing import Literal
 
 from sglpr_jax.data.sampling.config import TupleConfig, ValidationConfig
-from sglpr_jax.fields import Count, CountOrNone, NotNegative, Positive, Share, check_fields
+from sglpr_jax.fields import Count, CountOrNone, Degrees, NotNegative, Positive, Share, check_fields
 from sglpr_jax.models.config import ModelConfig
 
 
@@ -62,6 +62,19 @@ class OptimizerConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class OcclusionConfig:
+    """Sectors without points, hidden from images in training; none in the paper."""
+
+    share: Share = 0.0
+    """Of the images of a step."""
+    widest_deg: Degrees = 180.0
+    """How wide the widest sector may be; all widths up to it are as likely."""
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """One training run."""
 
@@ -86,6 +99,7 @@ class TrainConfig:
     the results only which branches stochastic depth drops."""
     rotate: bool = True
     """Rotate every place about z by its own random angle at every step."""
+    occlusion: OcclusionConfig = OcclusionConfig()
     max_points: Count = 131072
     """Clouds are padded to this many points; larger ones are thinned evenly."""
     seed: CountOrNone = 0

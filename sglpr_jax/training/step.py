@@ -22,6 +22,7 @@ from sglpr_jax.models.sglpr import forward
 from sglpr_jax.training.config import LossConfig, TrainConfig
 from sglpr_jax.training.devices import keep_replicated, keep_split, on_own_rows
 from sglpr_jax.training.loss import Metrics, Summary, joint_loss, segmentation_sums
+from sglpr_jax.training.occlusion import visible
 from sglpr_jax.training.optimizer import optimizer
 from sglpr_jax.training.place_order import in_network_order
 from sglpr_jax.training.state import TrainState
@@ -94,7 +95,12 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) if config.rotate else None
     see = functools.partial(views, grid=config.model.grid)
     images, maps = (see if batch.also is not None else on_own_rows(see))(batch, angles)  # a mixed one is on one device
-    maps = None if maps is None else jnp.where(field_of_view(config.model), maps, UNLABELLED)
+    seen = field_of_view(config.model)
+    if config.occlusion.share:
+        key = jax.random.fold_in(angle_key, 1)
+        shown = visible(key, config.images, config.model.grid, config.occlusion)
+        seen, images = seen & shown, jnp.where(shown, images, 0)
+    maps = None if maps is None else jnp.where(seen, maps, UNLABELLED)
     keys = jax.random.split(model_key, config.images // config.images_at_once)
     whole = (images, maps, jnp.asarray(batch.labelled))
     whole = jax.tree.map(lambda x: in_network_order(x, batch, every=config.loss.segment_every), whole)
