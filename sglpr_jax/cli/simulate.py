@@ -40,6 +40,8 @@ class SimulateCommand:
     overgrown hedges."""
     images: bool = False
     """Write BEV density images with label images (NN/imgs, NN/labels, NN/pose.txt) in place of scans and labels."""
+    vary: bool = False
+    """With --images: rotate every scan about z, and take points from most, before it becomes an image. For training."""
     seed: int = 0
 
 

@@ -45,9 +45,9 @@ def write_dataset(
     """Write the routes `names`, and the drives along the pose files `along`, into the folder `root`; return `root`.
 
     Every drive has a town of its own, drawn from `seed` and the drive's name, and `scans` scans (along a pose file: at
-    most so many, see `simulate_recording`). `layout` is "scans" or "images", see `LAYOUTS`. Files that are there
-    are kept, so a run that was cut off goes on where it stopped, to the same bytes; every file is whole or not there.
-    `progress(name, done, scans)` is called as scans are done.
+    most so many, see `simulate_recording`). `layout` is "scans", "images" or "varied", see `LAYOUTS`. Files that are
+    there are kept, so a run that was cut off goes on where it stopped, to the same bytes; every file is whole or not
+    there. `progress(name, done, scans)` is called as scans are done.
 
     Raises ValueError for unknown names, a rate not above 0, a seed below 0, malformed pose files, and where `root`
     holds another dataset or one of other settings; OSError, with the file's name, where something cannot be written.
@@ -57,9 +57,10 @@ def write_dataset(
     unknown = [name for name in names if name not in ROLES]
     if unknown or scans < 2:
         raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")
-    if len(files) < len(names) + len(along) or layout not in ("scans", "images"):
+    if len(files) < len(names) + len(along) or layout not in ("scans", "images", "varied"):
         drives = [*names, *map(name_of_path, along)]
-        raise ValueError(f"expected different names and layout scans or images, found {', '.join(drives)} and {layout}")
+        expected = "different names and layout scans, images or varied"
+        raise ValueError(f"expected {expected}, found {', '.join(drives)} and {layout}")
     what = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     ways = {f"drive {name}": _fingerprint(file) for name, file in files.items()}
     _claim(root, {"layout": layout, **what, **_settings(sensor, scenery)}, ways)

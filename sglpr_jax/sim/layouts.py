@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt
+from jaxtyping import Float, Float32, Int, UInt
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +16,7 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
+from sglpr_jax.sim.variety import vary
 
 
 class Layout(NamedTuple):
@@ -59,7 +60,17 @@ def _image_and_labels(
     Images are those of a sensor at the height that models know, as those made of the drive's scans are.
     """
     xyz = points[:, :3].astype(np.float32)
-    xyz = xyz if mounting is None else mounting.level(xyz)
+    return _pngs(xyz if mounting is None else mounting.level(xyz), labels)
+
+
+def _varied_image_and_labels(
+    points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None
+) -> tuple[bytes, ...]:
+    """The same of a varied scan."""
+    return _pngs(*vary(points[:, :3].astype(np.float32), labels, mounting))
+
+
+def _pngs(xyz: Float32[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"]) -> tuple[bytes, ...]:
     image = density_image(xyz)
     shown = np.where(image > 0, density_label_image(xyz, labels), 0)
     return _png(image), _png(shown.astype(np.uint16))
@@ -137,6 +148,13 @@ LAYOUTS = {
         folder="{name}",
         scan_files=("imgs/{id}.png", "labels/{id}.png"),
         scan_contents=_image_and_labels,
+        drive_contents=_bevplace_files,
+        last_file="pose.txt",
+    ),
+    "varied": Layout(
+        folder="{name}",
+        scan_files=("imgs/{id}.png", "labels/{id}.png"),
+        scan_contents=_varied_image_and_labels,
         drive_contents=_bevplace_files,
         last_file="pose.txt",
     ),

@@ -45,7 +45,7 @@ class Simulated:
     def missing_bytes(self) -> int:
         """About how much there is to write."""
         rays = len(self.sensor.elevations_deg) * self.sensor.azimuth_steps
-        each = BYTES_PER_IMAGE if self.layout == "images" else BYTES_PER_RAY[self.layout] * rays
+        each = BYTES_PER_IMAGE if self.layout in ("images", "varied") else BYTES_PER_RAY[self.layout] * rays
         return each * self.scans * len(self.missing)
 
     def __str__(self) -> str:
@@ -65,6 +65,7 @@ def simulate(
     rate_hz: float = RATE_HZ,
     scenery: str = "town",
     images: bool = False,
+    vary: bool = False,
     on_start: Callable[[Simulated], None] = lambda dataset: None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Simulated:
@@ -74,8 +75,9 @@ def simulate(
     KITTI pose files to drive along. With `sessions`, dates, one town is driven through on so many days, along one
     route, in NCLT's layout. `sensor` is one of `SENSORS` (None: hdl64e, or hdl32e-nclt for sessions), `azimuth_steps`
     its firings per turn. `rate_hz` is scans per second of a route, `scenery` one of `SCENERIES`. `images` writes
-    density images with label images in place of scans. An interrupted dataset is completed, to the same bytes, and
-    recordings can be added.
+    density images with label images in place of scans; with `vary` these are of scans rotated about z, some of them
+    with points lost (`sim/variety.py`). An interrupted dataset is completed, to the same bytes, and recordings can be
+    added.
 
     `on_start` is told what there is to write, once it is known that it can be, `on_progress` how many of its scans are
     done, counting `scans` a recording. Raises ValueError for an unknown route or sensor, a malformed pose file, and
@@ -92,7 +94,9 @@ def simulate(
         raise ValueError(f"expected a scenery among {', '.join(SCENERIES)}, found {scenery!r}")
     chosen = routes if routes is not None else () if along or sessions else ROUTES
     names = tuple(sessions) or (*chosen, *map(name_of_path, along))
-    layout = "nclt" if sessions else "images" if images else "scans"
+    if vary and not images:
+        raise ValueError("vary changes scans before they become images: expected images with it, found scans")
+    layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
     out = Path(out)
     dataset = Simulated(out, names, scans, layout, lidar)
     start = functools.cache(lambda: on_start(dataset))

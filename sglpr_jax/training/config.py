@@ -99,6 +99,8 @@ class TrainConfig:
     the results only which branches stochastic depth drops."""
     rotate: bool = True
     """Rotate every place about z by its own random angle at every step."""
+    quarter_turns: Share = 0.0
+    """Of the places, this share is rotated by a multiple of 90 degrees, which blurs no cell; the rest by any angle."""
     occlusion: OcclusionConfig = OcclusionConfig()
     max_points: Count = 131072
     """Clouds are padded to this many points; larger ones are thinned evenly."""

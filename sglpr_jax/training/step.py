@@ -92,7 +92,7 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
 
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
     """The batch as the network will see it, cut into chunks along a new leading axis."""
-    angles = jax.random.uniform(angle_key, (config.images,), maxval=2 * jnp.pi) if config.rotate else None
+    angles = _angles(angle_key, config) if config.rotate else None
     see = functools.partial(views, grid=config.model.grid)
     images, maps = (see if batch.also is not None else on_own_rows(see))(batch, angles)  # a mixed one is on one device
     seen = field_of_view(config.model)
@@ -106,6 +106,15 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     whole = jax.tree.map(lambda x: in_network_order(x, batch, every=config.loss.segment_every), whole)
     cut = jax.tree.map(lambda x: x.reshape(-1, config.images_at_once, *x.shape[1:]), whole)
     return Chunk(*keep_split(cut, axis=1), key=keys)  # or each chunk would lie on one device
+
+
+def _angles(key: Array, config: TrainConfig) -> Array:
+    """How far each place is rotated, radians."""
+    angles = jax.random.uniform(key, (config.images,), maxval=2 * jnp.pi)
+    if not config.quarter_turns:
+        return angles
+    by_quarters = jax.random.bernoulli(jax.random.fold_in(key, 3), config.quarter_turns, angles.shape)
+    return jnp.where(by_quarters, jnp.floor(angles / (jnp.pi / 2)) * (jnp.pi / 2), angles)
 
 
 def _merge(summaries: Summary) -> Summary:
