@@ -7,11 +7,20 @@ import numpy as np
 import pytest
 
 import sglpr_jax
+from sglpr_jax.sim import write_dataset
 
-from .conftest import SCANS, Ended
+from .conftest import SENSOR, Ended
 
 pytestmark = pytest.mark.slow
 MODELS = (*sglpr_jax.MODELS, *sglpr_jax.shipped_weights())
+SCANS = 24
+"""Few, for the paper's network takes a second for each; so many come back to a place."""
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory) -> Path:
+    """A recording of fewer scans than other tests have; it comes back to places."""
+    return write_dataset(tmp_path_factory.mktemp("data") / "short", names=("08",), scans=SCANS, sensor=SENSOR)
 
 
 @pytest.fixture(scope="module", params=MODELS)
