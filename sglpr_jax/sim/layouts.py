@@ -136,6 +136,13 @@ def to_utime(seconds: float) -> int:
     return round(seconds * 1e6)
 
 
+_IMAGES = Layout(
+    folder="{name}",
+    scan_files=("imgs/{id}.png", "labels/{id}.png"),
+    scan_contents=_image_and_labels,
+    drive_contents=_bevplace_files,
+    last_file="pose.txt",
+)
 LAYOUTS = {
     "scans": Layout(
         folder="sequences/{name}",
@@ -144,20 +151,8 @@ LAYOUTS = {
         drive_contents=_kitti_files,
         last_file="poses.txt",
     ),
-    "images": Layout(
-        folder="{name}",
-        scan_files=("imgs/{id}.png", "labels/{id}.png"),
-        scan_contents=_image_and_labels,
-        drive_contents=_bevplace_files,
-        last_file="pose.txt",
-    ),
-    "varied": Layout(
-        folder="{name}",
-        scan_files=("imgs/{id}.png", "labels/{id}.png"),
-        scan_contents=_varied_image_and_labels,
-        drive_contents=_bevplace_files,
-        last_file="pose.txt",
-    ),
+    "images": _IMAGES,
+    "varied": _IMAGES._replace(scan_contents=_varied_image_and_labels),
     "nclt": Layout(
         folder="{name}",
         scan_files=("velodyne_sync/{id}.bin",),

@@ -1,4 +1,4 @@
-"""Scans as other sensors, weather and headings would have them, for training: turned, and some with points lost.
+"""Scans as other sensors, weather and headings would have them, for training: rotated, and some with points lost.
 
 A scan alone decides what happens to it, so that whoever writes a dataset, and in how many goes, writes the same bytes.
 """
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float32, Int
 
 from sglpr_jax.data.corruption.corruptions import Corruption, corrupt
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.views import rotated
 
 THINNED, FEWER_BEAMS = 0.4, 0.3
 """The share of the scans that lose points at random, and of those that lose whole rings; the rest stays whole."""
@@ -30,7 +31,7 @@ def vary(
     left = _left(points, np.random.default_rng(seed))
     points, labels = points[left], labels[left]
     points = points if mounting is None else mounting.level(points)
-    return _turned(points, 2 * np.pi * seed / 2**32), labels
+    return rotated(points, 2 * np.pi * seed / 2**32), labels
 
 
 def _left(points: Float32[np.ndarray, "n 3"], rng: np.random.Generator) -> Bool[np.ndarray, " n"]:
@@ -42,8 +43,3 @@ def _left(points: Float32[np.ndarray, "n 3"], rng: np.random.Generator) -> Bool[
     else:
         corruption = Corruption("clean")
     return corrupt(points, corruption, rng=rng)[1]
-
-
-def _turned(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndarray, "n 3"]:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return (points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])).astype(np.float32)
