@@ -49,7 +49,6 @@ MODELS: dict[str, ModelConfig] = {
         image="density",
         backbone=SglprConfig(),
         head=HeadConfig(tap="tokens", channels=(96, 128, 160), strides=(2, 1, 1), means=(1, 2, 1)),
-        detail=0,
     ),
     # For tests: every part of the model, next to no arithmetic.
     "tiny": ModelConfig(

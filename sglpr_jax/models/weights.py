@@ -53,7 +53,8 @@ def _may_become(wanted: tuple[int, ...], found: tuple[int, ...]) -> bool:
     """Whether the shapes are equal, or kernels' that differ in how many channels they see: the last axis but one."""
     if wanted == found:
         return True
-    return len(wanted) == len(found) == 4 and wanted[2] > found[2] and wanted[:2] + wanted[3:] == found[:2] + found[3:]
+    same = wanted[:-2] + wanted[-1:] == found[:-2] + found[-1:]
+    return same and len(wanted) == len(found) in (2, 4) and wanted[-2] > found[-2]
 
 
 def _with_zeros(value: Any, shape: tuple[int, ...]) -> Any:
@@ -68,6 +69,14 @@ def for_places(params: Params) -> Params:
     config = dataclasses.replace(params.config, categories=0)
     values = by_name(params.weights)
     return Params(as_tree({name: values[name] for name in weight_shapes(config)}), config)
+
+
+def learning_segmentation_alone(params: Params) -> Params:
+    """The same model, of whose weights those alone have a gradient that `describe` does without."""
+    described = weight_shapes(dataclasses.replace(params.config, categories=0))
+    values = by_name(params.weights)
+    values |= {name: jax.lax.stop_gradient(values[name]) for name in described}
+    return dataclasses.replace(params, weights=as_tree(values))
 
 
 def weights_hash(params: Params) -> str:

@@ -31,9 +31,14 @@ class LossConfig:
     """Exponent a of the cross-entropy's class weights n^-a, n being the class's pixels in the image; 0 in the paper."""
     ignore_unlabelled: bool = False
     """Leave cells of class 0 (empty or unlabelled) out of the segmentation losses, as the scores do."""
+    segmentation_alone: bool = False
+    """Teach nothing but the layers that make the semantic map: descriptors stay as they are, bit for bit. Not in the
+    paper, where both are learnt at once."""
 
     def __post_init__(self):
         check_fields(self)
+        if self.segmentation_alone and not self.segments:
+            raise ValueError("loss.segmentation_alone leaves no loss where ce_weight and dice_weight are 0")
 
     @property
     def segments(self) -> bool:
@@ -114,6 +119,11 @@ class TrainConfig:
         if not 0 <= self.also_tuples < self.tuples:
             raise ValueError(
                 f"also_tuples must be fewer than the {self.tuples} tuples of a step, found {self.also_tuples}"
+            )
+        if self.loss.segmentation_alone and self.optimizer.weight_decay:
+            raise ValueError(
+                "loss.segmentation_alone keeps all other weights as they are: expected optimizer.weight_decay 0, "
+                f"found {self.optimizer.weight_decay}"
             )
         if self.select == "best" and not self.validation.share:
             raise ValueError("select best needs places held out to choose by: expected a validation.share, found 0")

@@ -79,7 +79,7 @@ def _dice(sums: Float[Array, "3 k"], images: Int[Array, ""]) -> Float[Array, ""]
     return jnp.where(images > 0, losses.dice_from_sums(sums), 0.0)
 
 
-DESCRIPTOR_TERMS = {"triplet": DescriptorTerm(lambda config: 1.0, triplet)}
+DESCRIPTOR_TERMS = {"triplet": DescriptorTerm(lambda config: 0.0 if config.segmentation_alone else 1.0, triplet)}
 SEGMENTATION_TERMS = {
     "cross_entropy": SegmentationTerm(lambda config: config.ce_weight, _cross_entropy_sum, _cross_entropy),
     "dice": SegmentationTerm(lambda config: config.dice_weight, _dice_sums, _dice),

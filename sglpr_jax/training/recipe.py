@@ -113,6 +113,10 @@ def train(
     folder = Path(out)
     config = without_untrained_head(config)
     _require_usable(config, recordings, also, test)
+    if config.loss.segmentation_alone and weights is None and not resume:
+        raise ValueError(
+            "loss.segmentation_alone keeps what describes places: expected weights to begin with, found none"
+        )
     settings = _names(recordings, also, test) if settings is None else settings
     with contextlib.ExitStack() as opened:
         followed = opened.enter_context(
@@ -181,6 +185,11 @@ def _require_usable(
     tested = [] if test is None else [test]
     if any(recording.name == test.name for test in tested for recording in recordings):
         raise ValueError(f"expected recordings to train on other than the one tested, found {tested[0].name} in both")
+    if config.loss.segmentation_alone and not any(any(recording.labelled) for recording in (*recordings, *also)):
+        raise ValueError(
+            "loss.segmentation_alone learns from labels alone: expected labels beside some scans, "
+            f"found none in {len(recordings) + len(also)} recording(s)"
+        )
     if config.model.categories_read:
         for recording in (*recordings, *also, *tested):
             _require_labels(recording)

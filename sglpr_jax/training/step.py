@@ -19,6 +19,7 @@ from sglpr_jax.labels import UNLABELLED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import forward
+from sglpr_jax.models.weights import learning_segmentation_alone
 from sglpr_jax.training.config import LossConfig, TrainConfig
 from sglpr_jax.training.devices import keep_replicated, keep_split, on_own_rows
 from sglpr_jax.training.loss import Metrics, Summary, joint_loss, segmentation_sums
@@ -81,6 +82,7 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
 
 def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
     """One chunk through the network; the segmentation head only where there are labels, on every n-th image."""
+    params = learning_segmentation_alone(params) if config.segmentation_alone else params
     labels = chunk.maps if params.config.head.reads_labels else None
     if chunk.maps is None or not (params.config.segments and config.segments):
         return Summary(forward(params, chunk.images, labels, key=chunk.key, segment=0).descriptor, {})

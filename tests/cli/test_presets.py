@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import sglpr_jax
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset, preset_names
@@ -38,6 +39,13 @@ def test_the_paper_on_ready_made_images_has_the_tokens_of_the_paper():
     tokens = [config.grid.height // config.backbone.patch for config in (paper, other)]
     assert tokens == [56, 56] and other.grid.resolution_m * other.grid.width == pytest.approx(44.8)
     assert dataclasses.replace(other.backbone, patch=4) == paper.backbone
+
+
+def test_the_semantic_map_is_learnt_in_the_network_that_the_places_were():
+    places, semantics = load_preset("sglpr"), load_preset("sglpr-segmentation")
+    assert dataclasses.replace(semantics.model, head=places.model.head) == places.model
+    assert semantics.model.head == sglpr_jax.load("sglpr").config.head
+    assert semantics.loss.segmentation_alone and not places.loss.segmentation_alone
 
 
 def test_a_file_of_ones_own_is_a_preset(preset):

@@ -15,7 +15,7 @@ import pytest
 from sglpr_jax.training.metrics_log import read_metrics
 
 pytestmark = pytest.mark.slow
-KILLS = 21
+KILLS = 15
 STEPS = 60
 SCORE_EVERY = 3
 TIMES = {"steps_per_second", "data_wait"}

@@ -4,9 +4,11 @@ import dataclasses
 import json
 
 import chex
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sglpr_jax
 from sglpr_jax.data import open_recording
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
@@ -59,7 +61,7 @@ def test_a_run_begins_without_the_whitening_layer_of_the_weights_it_is_given(ima
     chex.assert_trees_all_close(begun.params.weights["place_head"], plain.weights["place_head"], atol=1e-6)
 
 
-def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images, preset, tmp_path):
+def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images, labelled_images, preset, tmp_path):
     config, recording = load_preset(str(preset)), open_recording(images, "00")
     with pytest.raises(ValueError, match="other than the one tested, found 00 in both"):
         train(config, [recording], out=tmp_path / "run", test=recording)
@@ -69,7 +71,24 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images,
     reads = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
     with pytest.raises(ValueError, match="expected labels beside every scan of sequence 00, found 0 of 30"):
         train(reads, [recording], out=tmp_path / "run")
+    alone = dataclasses.replace(config, loss=dataclasses.replace(config.loss, segmentation_alone=True))
+    with pytest.raises(ValueError, match="expected labels beside some scans, found none in 1 recording"):
+        train(alone, [recording], out=tmp_path / "run")
+    labelled = open_recording(labelled_images, "00")
+    with pytest.raises(ValueError, match="expected weights to begin with, found none"):
+        train(alone, [labelled], out=tmp_path / "run")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_semantic_map_learnt_alone_leaves_descriptors_to_the_bit(labelled_images, random_params, preset, tmp_path):
+    config = load_preset(str(preset))
+    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, segmentation_alone=True))
+    begun = random_params(config.model)
+    learnt = train(config, [open_recording(labelled_images, "00")], out=tmp_path / "run", weights=begun).params
+    grid = config.model.grid
+    image = jnp.asarray(np.random.default_rng(0).poisson(0.7, (grid.height, grid.width)), jnp.float32)
+    np.testing.assert_array_equal(sglpr_jax.describe(learnt, image), sglpr_jax.describe(begun, image))
+    assert np.abs(sglpr_jax.segment(learnt, image) - sglpr_jax.segment(begun, image)).max() > 1e-4
 
 
 def test_nothing_to_train_on_is_refused(images, preset, tmp_path):

@@ -64,6 +64,16 @@ def test_a_network_grown_by_fine_blocks_begins_as_the_smaller_one():
         graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks()))
 
 
+def test_a_segmentation_head_that_sees_more_channels_begins_with_those_it_had(params):
+    fresh = sglpr_jax.init(jax.random.key(1), config=dataclasses.replace(params.config, detail=40))
+    kernel = graft(params, fresh).weights["segmentation_head"]["kernel"]
+    was = params.weights["segmentation_head"]["kernel"]
+    np.testing.assert_array_equal(kernel, np.pad(was, [(0, 40 - len(was)), (0, 0)]))
+    narrower = sglpr_jax.init(jax.random.key(1), config=dataclasses.replace(params.config, detail=len(was) - 1))
+    with pytest.raises(ValueError, match="segmentation_head/kernel has shape"):
+        graft(params, narrower)
+
+
 def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_what_was_there(params, tmp_path, small_files):
     folder = save(params, tmp_path / "weights")
     small_files(10_000)

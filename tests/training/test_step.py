@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.sglpr import forward
+from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.training.config import LossConfig, without_untrained_head
 from sglpr_jax.training.loss import Summary, joint_loss, triplet, violations
 from sglpr_jax.training.state import new_state
@@ -168,6 +169,37 @@ def test_a_term_without_weight_is_not_computed(config, params, make_batch, whole
     np.testing.assert_allclose(metrics[kept], whole[1][kept], rtol=1e-5)
     share = {"cross_entropy": 0.4, "dice": 0.6}[kept]
     np.testing.assert_allclose(metrics["loss"], metrics["triplet"] + share * metrics[kept], rtol=1e-6)
+
+
+@pytest.mark.parametrize("tap", ["tokens", "pixels"])
+def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(config, random_params, make_batch, tap):
+    head = dataclasses.replace(config.model.head, tap=tap)
+    loss = dataclasses.replace(config.loss, segmentation_alone=True)
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head, detail=4), loss=loss)
+    params, batch = random_params(config.model), make_batch(0)
+    found, metrics = gradients_of(params, batch, config)
+    joint = dataclasses.replace(config, loss=dataclasses.replace(loss, segmentation_alone=False))
+    expected, of_all = gradients_of(params, batch, joint)
+    assert "triplet" not in metrics
+    np.testing.assert_allclose(metrics["loss"], 0.4 * of_all["cross_entropy"] + 0.6 * of_all["dice"], rtol=1e-5)
+    described = by_name(for_places(params).weights)
+    for name, gradient in by_name(found).items():
+        assert_same(gradient, np.zeros_like(gradient) if name in described else by_name(expected)[name])
+    assert {"segmentation_head/kernel", "narrow/kernel"} <= set(by_name(found)) - set(described)
+
+    state = new_state(config, params=jax.tree.map(jnp.copy, params))
+    learnt = by_name(train_step(state, batch, config=config)[0].params.weights)
+    moved = {name for name, value in by_name(params.weights).items() if not np.array_equal(value, learnt[name])}
+    assert moved == set(learnt) - set(described)
+
+
+def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_nothing_else(config):
+    with pytest.raises(ValueError, match="leaves no loss where ce_weight and dice_weight are 0"):
+        LossConfig(segmentation_alone=True, ce_weight=0.0, dice_weight=0.0)
+    loss = dataclasses.replace(config.loss, segmentation_alone=True)
+    decaying = dataclasses.replace(config.optimizer, weight_decay=0.1)
+    with pytest.raises(ValueError, match=r"expected optimizer.weight_decay 0, found 0.1"):
+        dataclasses.replace(config, loss=loss, optimizer=decaying)
 
 
 def test_where_nothing_reads_labels_there_are_no_categories(config):
