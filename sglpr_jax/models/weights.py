@@ -14,6 +14,10 @@ from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 
+SEGMENTATION_LAYERS = ("segmentation_head", "narrow", "detail")
+PIXEL_LAYERS = ("expand", "decoder")
+"""For the segmentation head, and for a place head that is told to look there (`head.tap`)."""
+
 
 def by_name(weights: Any) -> dict[str, Any]:
     """A flat dictionary of weights, named like `backbone/encoder_0/block_1/mlp_in/kernel`."""
@@ -62,26 +66,30 @@ def _with_zeros(value: Any, shape: tuple[int, ...]) -> Any:
     return np.pad(np.asarray(value), missing) if np.any(missing) else value
 
 
+def describing(params: Params) -> Any:
+    """The layers that `describe` computes with: no segmentation head and nothing that feeds it alone."""
+    left_out = SEGMENTATION_LAYERS if params.config.head.tap == "pixels" else SEGMENTATION_LAYERS + PIXEL_LAYERS
+    return {name: layer for name, layer in params.weights.items() if name not in left_out}
+
+
 def for_places(params: Params) -> Params:
-    """The part that `describe` computes with, to hand out: no segmentation head and nothing that feeds it alone."""
+    """The part that `describe` computes with, to hand out."""
     if not params.config.segments:
         return params
-    config = dataclasses.replace(params.config, categories=0)
-    values = by_name(params.weights)
-    return Params(as_tree({name: values[name] for name in weight_shapes(config)}), config)
+    return Params(describing(params), dataclasses.replace(params.config, categories=0))
 
 
 def learning_segmentation_alone(params: Params) -> Params:
     """The same model, of whose weights those alone have a gradient that `describe` does without."""
-    described = weight_shapes(dataclasses.replace(params.config, categories=0))
-    values = by_name(params.weights)
-    values |= {name: jax.lax.stop_gradient(values[name]) for name in described}
-    return dataclasses.replace(params, weights=as_tree(values))
+    return dataclasses.replace(params, weights=params.weights | jax.lax.stop_gradient(describing(params)))
 
 
 def weights_hash(params: Params) -> str:
-    """SHA-256 over names, shapes and values of all weights, so that a result can say which weights made it."""
-    return hash_of(by_name(params.weights))
+    """SHA-256 over names, shapes and values of what `describe` computes with: it says which weights made a descriptor.
+
+    Weights that differ in the segmentation head alone, or have none, make the same descriptors and have the same hash.
+    """
+    return hash_of(by_name(describing(params)))
 
 
 def hash_of(named: Mapping[str, Any]) -> str:

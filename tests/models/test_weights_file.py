@@ -16,7 +16,7 @@ from sglpr_jax.models.backbones.rings_config import RingConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.weights import graft, weight_shapes, weights_hash
+from sglpr_jax.models.weights import as_tree, by_name, describing, for_places, graft, weight_shapes, weights_hash
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 
@@ -200,17 +200,33 @@ def test_a_weight_too_many_or_too_few_is_named(params, tmp_path):
 
 
 def test_the_hash_changes_with_one_value_and_one_name(params):
-    def changed(kernel, name="segmentation_head"):
-        rest = {key: value for key, value in params.weights.items() if key != "segmentation_head"}
-        return weights_hash(Params({**rest, name: {"kernel": kernel}}, params.config))
+    def changed(kernel, name="kernel"):
+        head = params.weights["place_head"]
+        layer = {"bias": head["convolution_0"]["bias"], name: kernel}
+        return weights_hash(Params(params.weights | {"place_head": head | {"convolution_0": layer}}, params.config))
 
-    kernel = params.weights["segmentation_head"]["kernel"]
+    kernel = params.weights["place_head"]["convolution_0"]["kernel"]
     nudged = kernel.copy()
-    nudged[0, 0] = np.nextafter(nudged[0, 0], np.float32(9))
+    nudged.flat[0] = np.nextafter(nudged.flat[0], np.float32(9))
     hashes = [weights_hash(params), changed(nudged), changed(kernel, "other"), changed(kernel.reshape(4, -1))]
     assert len(set(hashes)) == 4
     assert changed(jnp.asarray(kernel)) == weights_hash(params)
     assert len(hashes[0]) == 64
+
+
+def test_the_hash_is_that_of_what_describes(params):
+    other_map = jax.tree.map(lambda x: x + 1, params.weights["segmentation_head"])
+    other = dataclasses.replace(params, weights=params.weights | {"segmentation_head": other_map})
+    assert weights_hash(other) == weights_hash(for_places(params)) == weights_hash(params)
+
+
+@pytest.mark.parametrize("tap", ["tokens", "pixels"])
+@pytest.mark.parametrize("name", ["paper", "small", "small-stem", "rings", "sglpr"])
+def test_what_describes_is_what_a_model_without_a_segmentation_head_has(name, tap):
+    config = model_preset(name)
+    config = dataclasses.replace(config, head=dataclasses.replace(config.head, tap=tap))
+    whole = Params(as_tree(dict(weight_shapes(config))), config)
+    assert set(by_name(describing(whole))) == set(weight_shapes(dataclasses.replace(config, categories=0)))
 
 
 def test_weights_that_are_not_finite_are_refused_on_load_and_on_export(params, tmp_path):
