@@ -120,6 +120,8 @@ class TrainConfig:
             raise ValueError(
                 f"also_tuples must be fewer than the {self.tuples} tuples of a step, found {self.also_tuples}"
             )
+        if self.loss.segmentation_alone and not self.model.segments:
+            raise ValueError("loss.segmentation_alone expected a model with a segmentation head, found one without")
         if self.loss.segmentation_alone and self.optimizer.weight_decay:
             raise ValueError(
                 "loss.segmentation_alone keeps all other weights as they are: expected optimizer.weight_decay 0, "

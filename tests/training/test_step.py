@@ -200,6 +200,8 @@ def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_noth
     decaying = dataclasses.replace(config.optimizer, weight_decay=0.1)
     with pytest.raises(ValueError, match=r"expected optimizer.weight_decay 0, found 0.1"):
         dataclasses.replace(config, loss=loss, optimizer=decaying)
+    with pytest.raises(ValueError, match="expected a model with a segmentation head, found one without"):
+        dataclasses.replace(config, loss=loss, model=dataclasses.replace(config.model, categories=0))
 
 
 def test_where_nothing_reads_labels_there_are_no_categories(config):
