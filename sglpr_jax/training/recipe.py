@@ -237,5 +237,10 @@ def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfi
 def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
     """These weights, with fresh ones where they have none, and without a whitening layer where the model has none."""
     given = weights if isinstance(weights, Params) else load(weights)
+    if config.loss.segmentation_alone and given.config.head.whiten and not config.model.head.whiten:
+        raise ValueError(
+            "loss.segmentation_alone keeps what describes places, found weights with a whitening layer: "
+            "expected model.head.whiten True"
+        )
     given = given if config.model.head.whiten else unwhitened(given)
     return graft(given, init(jax.random.key(config.seed), config=config.model))

@@ -61,7 +61,9 @@ def test_a_run_begins_without_the_whitening_layer_of_the_weights_it_is_given(ima
     chex.assert_trees_all_close(begun.params.weights["place_head"], plain.weights["place_head"], atol=1e-6)
 
 
-def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images, labelled_images, preset, tmp_path):
+def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
+    images, labelled_images, random_params, preset, tmp_path
+):
     config, recording = load_preset(str(preset)), open_recording(images, "00")
     with pytest.raises(ValueError, match="other than the one tested, found 00 in both"):
         train(config, [recording], out=tmp_path / "run", test=recording)
@@ -77,6 +79,9 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(images,
     labelled = open_recording(labelled_images, "00")
     with pytest.raises(ValueError, match="expected weights to begin with, found none"):
         train(alone, [labelled], out=tmp_path / "run")
+    given = whitened(random_params(config.model), np.random.default_rng(0).normal(size=(600, 256)).astype(np.float32))
+    with pytest.raises(ValueError, match=r"found weights with a whitening layer: expected model\.head\.whiten True"):
+        train(alone, [labelled], out=tmp_path / "run", weights=given)
     assert not list(tmp_path.iterdir())
 
 
