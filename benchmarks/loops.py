@@ -71,7 +71,7 @@ class Simulated:
             poses = drive.poses.world_from_lidar
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(drive, params, odometry, f"town {town}")
-            kept, refused = settled(drive, detector.loops, odometry, DetectorConfig(), registered=self.registered)
+            kept, refused = settled(drive, detector.supported, odometry, DetectorConfig(), registered=self.registered)
             sure[f"town {town}"] = report(f"town {town}", drive, poses, detector, kept, refused, seconds)
             if self.optimized and odometry is not None:
                 found = optimized(odometry, tuple(kept))
@@ -101,7 +101,7 @@ class Images:
             poses[:, :3] = read_poses(self.data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(recording, params, odometry, name)
-            kept, refused = settled(recording, detector.loops, odometry, DetectorConfig(), registered=False)
+            kept, refused = settled(recording, detector.supported, odometry, DetectorConfig(), registered=False)
             sure[name] = report(name, recording, poses, detector, kept, refused, seconds)
             log_odds = detector.model.log_odds(Evidence.stack([one.evidence for one in detector.candidates]))
             agreed = {(loop.query, loop.match) for loop in kept}

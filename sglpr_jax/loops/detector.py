@@ -27,7 +27,7 @@ class DetectorConfig:
     min_neighbour_probability: float = 0.5
     """Of those beside it that speak for it; `min_probability` where that is less."""
     near_m: float = 200.0
-    """With odometry, a loop has to agree with most of those that lie within so many metres of way."""
+    """With odometry, a loop has to agree with half of those, returned or not, within so many metres of way."""
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
@@ -62,6 +62,8 @@ class LoopDetector:
         """All pairs that were looked at."""
         self.loops: list[Loop] = []
         """All that were returned."""
+        self.supported: list[Loop] = []
+        """All that the frames beside them speak for: those returned, and those that other loops contradict."""
         self.by_scans: set[int] = set()
         """The frames that would have a loop by the scans alone: odometry that most of them contradict is none."""
         self._waiting: list[Loop] = []
@@ -120,6 +122,8 @@ class LoopDetector:
         self.by_scans |= {loop.query for loop in found}
         if odometry is not None:
             found = self._supported(agree(self._waiting, odometry, mounting=self.finder.mounting, config=rules))
+        known = {loop.query for loop in self.supported[-rules.neighbours :]}
+        self.supported += [loop for loop in found if loop.query not in known]
         done = {loop.query for loop in self.loops[-rules.neighbours :]}
         return [loop for loop in found if loop.query not in done and (odometry is None or self._agrees(loop, odometry))]
 
@@ -130,12 +134,16 @@ class LoopDetector:
         return [loop for loop, fits in zip(self._waiting, enough & probable, strict=True) if fits]
 
     def _agrees(self, loop: Loop, odometry: Float[np.ndarray, "n 4 4"]) -> bool:
-        """Whether it agrees with most of the loops about it."""
+        """Whether it agrees with half of the loops about it or more.
+
+        Those that were held back count, too: else a few wrong loops, found first, would keep out all true ones.
+        """
         way = travelled(odometry)
         about = [
             other
-            for other in self.loops
-            if abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
+            for other in self.supported
+            if other.query != loop.query
+            and abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
         ]
         rules = {"mounting": self.finder.mounting, "config": self.config.consistency}
         return not about or bool(agree([loop], odometry, about, **rules).mean() >= 0.5)

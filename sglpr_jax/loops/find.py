@@ -131,7 +131,7 @@ def find_loops(
     if all(detector.finder.empty) and len(detector) == len(recording):
         raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
     loops, refused = settled(
-        recording, detector.loops, odometry, config, registered=registered, should_stop=should_stop
+        recording, detector.supported, odometry, config, registered=registered, should_stop=should_stop
     )
     if odometry is not None:
         _check_odometry(recording.name, detector.by_scans, loops, refused)
@@ -165,8 +165,8 @@ def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i:
 def _check_odometry(name: str, by_scans: set[int], loops: list[Loop], refused: list[Loop]) -> None:
     """Warn where most frames that have a loop by the scans alone have none that agrees with the odometry.
 
-    Drift does not do that, other axes do: the loops left are then few, and `refused` has not those that the detector
-    did not return.
+    Drift does not do that, other axes do: the loops left are then few, and `refused` has not those that contradict the
+    odometry from one frame to the next.
     """
     agreeing = {loop.query for loop in loops} | {loop.query for loop in refused if loop.overlap is not None}
     against = by_scans - agreeing

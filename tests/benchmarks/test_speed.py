@@ -80,6 +80,18 @@ def test_throughput_is_a_share_of_the_peak(tmp_path):
     assert 0 < low <= row["share_of_peak"] <= high
 
 
+def test_segmented_steps_are_timed_against_one_without_labels(tmp_path):
+    out = tmp_path / "segmented.json"
+    options = ("--preset", TINY, "--every", 2, 1, "--detail", 0, "--repeats", 2, "--out", out)
+    shown = table(printed("segmented_step.py", *options))
+    rows = json.loads(out.read_text())["rows"]
+    assert [(row["preset"], row["every"], row["detail"]) for row in rows] == [("tiny", 2, 0), ("tiny", 1, 0)]
+    assert [row[1:3] for row in shown] == [["2", "0"], ["1", "0"]]
+    for row in rows:
+        low, high = row["spread"]
+        assert 0 < low <= row["ratio"] <= high
+
+
 def test_the_time_of_a_step_is_told_by_parts():
     rows = table(printed("profile_step.py", "--preset", TINY, "--steps", 1))
     parts = {row[0] for row in rows}

@@ -1,6 +1,8 @@
 """Odometry that most loops contradict is told, drift is not."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -36,14 +38,19 @@ def there_and_back() -> np.ndarray:
     return np.concatenate([there, (there @ aside)[::-1]])
 
 
-def searched(params, poses: np.ndarray, odometry: np.ndarray) -> LoopDetector:
-    """The detector after a drive of which each frame of the way back has its true loop."""
+def searched(
+    params, poses: np.ndarray, odometry: np.ndarray, *, wrong: Mapping[int, int] = MappingProxyType({})
+) -> LoopDetector:
+    """The detector after a drive of which each frame of the way back has its true loop.
+
+    `wrong` has frames before that, each with a match that looks as if it was the same place.
+    """
     detector = LoopDetector(params, model=ALWAYS, config=CONFIG)
     seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
     for query, pose in enumerate(odometry):
-        match, pairs = 2 * N - 1 - query, []
+        match, pairs = wrong.get(query, 2 * N - 1 - query), []
         if match < query:
-            true = inverse(poses[match]) @ poses[query]
+            true = np.eye(4) if query in wrong else inverse(poses[match]) @ poses[query]
             alignment = Alignment(*true[:2, 3], yaw_of(true), np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
             pairs = [Candidate(query, match, alignment, Evidence.of(1.0, 0.0, 0.8, 0.3))]
         detector.add_seen(seen, odometry=pose, candidates=pairs)
@@ -92,3 +99,16 @@ def test_odometry_in_the_cameras_axes_is_told_by_its_way_too(there_and_back):
 def test_a_few_loops_tell_nothing():
     find._check_odometry("08", {1, 2, 3, 4}, [], [])
     find._check_odometry("08", set(), [], [])
+
+
+def test_wrong_loops_found_first_do_not_keep_the_true_ones_out(params, there_and_back, monkeypatch):
+    """A few frames before the first revisit look like ten frames further on, again and again."""
+    alike = range(N - 8, N)
+    detector = searched(params, there_and_back, there_and_back, wrong={i: i - 30 for i in alike})
+    wrong = {loop.query for loop in detector.loops} & set(alike)
+    true = {loop.query for loop in detector.loops} - wrong
+    assert len(wrong) >= 7 and len(true) >= N - len(wrong) - 1
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
+    monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
+    whole = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG)
+    assert {loop.query for loop in whole.refused} == wrong and len(whole.loops) >= N - 1
