@@ -36,8 +36,8 @@ class SimulateCommand:
     azimuth_steps: int | None = None
     """Firings per turn; fewer make smaller files. None: as many as the real sensor's."""
     scenery: str = "town"
-    """The land: `town`; `outskirts`, hilly, with long roads between walls, hedges and slopes; or `lanes`, roads between
-    overgrown hedges."""
+    """The land: `town`; `outskirts`, hilly, with long roads between walls, hedges and slopes; `lanes`, roads between
+    overgrown hedges; or `gardens`, streets with front gardens, low fences and old trees."""
     images: bool = False
     """Write BEV density images with label images (NN/imgs, NN/labels, NN/pose.txt) in place of scans and labels."""
     vary: bool = False

@@ -35,6 +35,7 @@ def frontage(
     for s in _poisson(rng, side.style.bystanders, start, stop):
         d = side.verge - rng.uniform(0.3, max(side.strips[-1].width, 0.6) if side.strips else 0.6)
         make = next(bystanders)
+        make = vehicles.people if side.style.groups and make is vehicles.person else make
         yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.65)
     if side.wood:
         yield from _wood(rng, side, start, stop)
@@ -127,14 +128,20 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
     for d in rows:
         for s in _steps(rng, start + 2, stop - 2, (side.tree_spacing, side.tree_spacing + 1)):
             spread = (2.0, 4.0) if side.median or side.strips else (3.0, 7.0)
-            yield Placed(plants.tree(rng, spread), s, d, zone="verge" if side.strips else "plot")
+            yield Placed(_tree(rng, side, spread), s, d, zone="verge" if side.strips else "plot")
+
+
+def _tree(rng: np.random.Generator, side: Side, spread: Range) -> Thing:
+    return plants.limbed_tree(rng, spread) if side.style.old_trees else plants.tree(rng, spread)
 
 
 _BORDERS: dict[str, tuple[float, Range, float]] = {
     # thickness, range of heights, share of the line that is closed
     "hedge": (1.0, (0.9, 2.6), 0.9),
+    "trimmed": (0.8, (0.9, 2.2), 0.9),
     "hedgerow": (0.3, (1.2, 3.0), 0.95),
     "fence": (0.06, (0.9, 1.8), 0.85),
+    "lattice": (0.08, (0.8, 1.5), 0.9),
     "wall": (0.25, (0.7, 2.2), 0.9),
     "screen": (0.2, (1.6, 3.5), 1.0),
     "rail": (0.15, (0.75, 0.8), 1.0),
@@ -144,6 +151,10 @@ _BORDERS: dict[str, tuple[float, Range, float]] = {
 def _piece(rng: np.random.Generator, border: str, length: float, thickness: float, height: float) -> Thing:
     if border == "hedge":
         return plants.hedge(length, thickness, height)
+    if border == "trimmed":
+        return plants.trimmed_hedge(rng, length, thickness, height)
+    if border == "lattice":
+        return _lattice(rng, length, thickness, height)
     if border == "hedgerow":
         return plants.hedgerow(rng, length, thickness, height)
     if border == "rail":
@@ -153,6 +164,19 @@ def _piece(rng: np.random.Generator, border: str, length: float, thickness: floa
         )
     porosity = 0.45 if border == "fence" else 0.0
     return (Part("box", FENCE, (length, thickness, height + 0.3), bottom=-0.3, porosity=porosity),)
+
+
+def _lattice(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
+    """A low fence that one sees through, on posts, with a bush behind it here and there."""
+    size, porosity = (length, thickness, height + 0.3), rng.uniform(0.4, 0.8)
+    parts = [
+        Part("box", FENCE, size, bottom=-0.3, porosity=porosity),
+        Part("box", FENCE, (0.15, 0.15, height + 0.1)),
+    ]
+    if rng.random() < 0.3:
+        x, y = rng.uniform(-0.4, 0.4) * length, rng.uniform(0.7, 1.5)
+        parts += [part._replace(x=part.x + x, y=part.y + y) for part in plants.bush(rng, 0.6)]
+    return tuple(parts)
 
 
 def _in_pieces(
@@ -218,7 +242,7 @@ def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, c
     for s in _poisson(rng, side.style.trees, start, stop):
         d, kind = side.verge + 1.0 + 14 * rng.random() ** 2, rng.random()
         if kind < 0.28:
-            yield Placed(plants.tree(rng, (3.0, 7.0)), s, d)
+            yield Placed(_tree(rng, side, (3.0, 7.0)), s, d)
         elif kind < 0.35:
             yield Placed(plants.conifer(rng), s, d)
         elif rng.random() < CHANGING_BUSHES:

@@ -27,6 +27,20 @@ def tree(rng: np.random.Generator, spread: Range) -> Thing:
     return tuple(parts)
 
 
+def limbed_tree(rng: np.random.Generator, spread: Range) -> Thing:
+    """A thick trunk and bare limbs under a crown that begins above most lasers, as of an old street tree."""
+    crown, fork = rng.uniform(*spread), rng.uniform(1.2, 2.2)
+    thick = rng.uniform(0.25, 0.7)
+    parts = [Part("cylinder", TRUNK, (thick, thick, fork + 1.5), roughness=0.05)]
+    for _ in range(int(rng.integers(1, 4))):
+        wide, high = rng.uniform((0.6, 0.7), (2.2, 1.8)).tolist()
+        x, y = rng.uniform(-0.4, 0.4, 2).tolist()
+        parts.append(Part("ellipsoid", TRUNK, (wide, wide, high), x, y, fork - 0.2, roughness=0.4, porosity=0.8))
+    low, porosity = fork + rng.uniform(-0.3, 1.6), rng.uniform(0.55, 0.85)
+    parts.append(_leaves((crown, crown, crown), 0.0, 0.0, low, roughness=0.9, porosity=porosity))
+    return tuple(parts)
+
+
 def conifer(rng: np.random.Generator) -> Thing:
     """A crown that reaches down to the ground."""
     spread = rng.uniform(1.5, 4)
@@ -51,6 +65,12 @@ def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
 def hedge(length: float, thickness: float, height: float) -> Thing:
     """A trimmed hedge along x."""
     return (Part("box", VEGETATION, (length, thickness, height + 0.3), bottom=-0.3, roughness=0.3, porosity=0.25),)
+
+
+def trimmed_hedge(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
+    """A hedge along x that is cut so straight and grows so dense that it could be a wall."""
+    size, roughness, porosity = (length, thickness, height + 0.3), rng.uniform(0.05, 0.2), rng.uniform(0.05, 0.25)
+    return (Part("box", VEGETATION, size, bottom=-0.3, roughness=roughness, porosity=porosity),)
 
 
 def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:

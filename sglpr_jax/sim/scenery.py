@@ -55,5 +55,7 @@ LANES = Scenery(
     steepest=0.07,
 )
 """Roads between overgrown hedges, whose face is seen from one lane and whose depth from the other."""
-SCENERIES = {"town": TOWN, "outskirts": OUTSKIRTS, "lanes": LANES}
+GARDENS = Scenery({"gardens": 0.6, "centre": 0.15, "suburb": 0.1, "estate": 0.05, "park": 0.05, "country": 0.05})
+"""Streets of houses with front gardens: low fences that one sees through, hedges cut like walls, old trees."""
+SCENERIES = {"town": TOWN, "outskirts": OUTSKIRTS, "lanes": LANES, "gardens": GARDENS}
 """By the names that the command line knows."""

@@ -40,6 +40,8 @@ class Style:
     banks: float = 0.0  # share of the sides where the ground rises beside the road
     posts: float = 0.0  # share of the sides with a row of posts along the road
     slopes: float = 0.0  # share of the sides that are the foot of a hill
+    old_trees: bool = False  # whether trees show thick trunks and bare limbs under their crowns
+    groups: bool = False  # whether people stand together
     bystanders: float = 0.0  # people, bicycles, bins and the like per metre of side
     signs: float = 0.02  # per metre of side
     lamps: bool = True
@@ -216,6 +218,26 @@ STYLES = {
         banks=0.1,
         posts=0.3,
         bystanders=0.01,
+    ),
+    "gardens": Style(
+        road=(2.9, 3.8),
+        walk=(1.2, 2.4),
+        garden=TERRAIN,
+        houses=0.95,
+        width=(8.0, 16.0),
+        height=(5.0, 9.0),
+        gap=(1.0, 8.0),
+        set_back=(1.5, 6.0),
+        border=("trimmed", "lattice", "lattice", "hedge", "hedge", "wall", "none"),
+        closed=(4.0, 16.0),
+        bays=0.55,
+        verge=0.3,
+        street_trees=0.4,
+        trees=1.5,
+        bystanders=0.02,
+        signs=0.03,
+        old_trees=True,
+        groups=True,
     ),
     "highway": Style(
         road=(6.0, 7.5),

@@ -73,6 +73,16 @@ def person(rng: np.random.Generator) -> Thing:
     return (Part("cylinder", PERSON, (rng.uniform(0.3, 0.5), rng.uniform(0.4, 0.6), rng.uniform(1.5, 1.9))),)
 
 
+def people(rng: np.random.Generator) -> Thing:
+    """One to three people side by side, their arms and bags included."""
+    parts = []
+    for place in range(int(rng.integers(1, 4))):
+        deep, wide, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
+        x, y = rng.uniform(-0.15, 0.15, 2).tolist()
+        parts.append(Part("cylinder", PERSON, (deep, wide, height), x, y + 0.75 * place, roughness=0.12))
+    return tuple(parts)
+
+
 def moving(thing: Thing) -> Thing:
     """The same with the labels of things that move."""
     return tuple(part._replace(label=MOVING[part.label]) for part in thing)

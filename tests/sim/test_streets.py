@@ -166,3 +166,14 @@ def test_going_around_a_roundabout_makes_an_island():
     np.testing.assert_allclose(island.centre, 0, atol=1.5)
     assert 3 < island.radius < 7
     assert roundabouts(resample(*drive(LOOP))) == ()  # crossings are none
+
+
+def test_gardens_have_low_fences_and_hedges_cut_straight_and_other_land_has_none():
+    path = resample(*drive(((0, 0), (1500, 0))))
+    borders = {}
+    for name, scenery in SCENERIES.items():
+        towns = [draw_streets(np.random.default_rng(seed), path, scenery) for seed in range(8)]
+        stretches = [stretch for town in towns for stretch in town[0].stretches]
+        borders[name] = [side.border for stretch in stretches for side in (stretch.left, stretch.right)]
+    share = {name: np.mean(np.isin(found, ("lattice", "trimmed"))) for name, found in borders.items()}
+    assert share.pop("gardens") > 0.15 and set(share.values()) == {0}

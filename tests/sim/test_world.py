@@ -6,11 +6,24 @@ import pytest
 from town import LOOP, THERE_AND_BACK, drive
 
 from sglpr_jax.labels import CATEGORIES, to_classes
-from sglpr_jax.sim import World, build_world
+from sglpr_jax.sim import World, build_world, vehicles
 from sglpr_jax.sim.ground import is_raised, label_at, surface_height
-from sglpr_jax.sim.raw_ids import BUILDING, CAR, FENCE, LANE_MARKING, MOVING, POLE, ROAD, TERRAIN, TRUNK, VEGETATION
+from sglpr_jax.sim.raw_ids import (
+    BUILDING,
+    CAR,
+    FENCE,
+    LANE_MARKING,
+    MOVING,
+    PERSON,
+    POLE,
+    ROAD,
+    TERRAIN,
+    TRUNK,
+    VEGETATION,
+)
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.shapes import Shapes
+from sglpr_jax.sim.styles import STYLES
 
 SEEDS = range(4)
 _worlds: dict[tuple, World] = {}
@@ -102,7 +115,7 @@ def test_shapes_stand_on_the_ground(seed, scenery):
         time = np.where(moves, shapes.since.clip(-1e6, 1e6) + shapes.until.clip(-1e6, 1e6), 0) / 2
         where = shapes.centre[:, :2] + shapes.velocity * time[:, None]
         above = shapes.centre[:, 2] - shapes.half[:, 2] - surface_height(world.ground, where)
-        upright = np.isin(shapes.label, [TRUNK, POLE]) & (shapes.half[:, 2] > 0.4)
+        upright = np.isin(shapes.label, [TRUNK, POLE]) & (shapes.half[:, 2] > 0.4) & (shapes.porosity == 0)  # no limbs
         assert np.mean(np.abs(above[upright]) < 0.15) > 0.97 if upright.any() else True
         built = shapes.label == BUILDING
         assert above[built].max(initial=0) < 12.5 and np.all(above + 2 * shapes.half[:, 2] > 0.2)
@@ -154,6 +167,33 @@ def test_behind_the_face_of_a_hedgerow_leaves_thin_out_away_from_the_road():
             assert order[0] == i and np.all(np.diff(hedge.porosity[order]) > 0)
             layers.append(len(order) - 1)
     assert len(layers) > 100 and set(layers) == {0, 1, 2, 3}
+
+
+def test_gardens_show_limbs_and_low_fences_that_one_sees_through():
+    """Trunks branch out below their crowns, and many a fence lets half of the rays through; in town none does."""
+    limbs, trunks, sparse = {}, {}, {}
+    for scenery in ("town", "gardens"):
+        scenes = [world_of(((0, 0), (600, 0)), seed, scenery).scene for seed in range(6)]
+        limbs[scenery] = sum(int(np.sum(scene.ellipsoids.label == TRUNK)) for scene in scenes)
+        round_ = [select(scene.cylinders, scene.cylinders.label == TRUNK) for scene in scenes]
+        trunks[scenery] = np.median(np.concatenate([2 * found.half[:, 0] for found in round_]))
+        fences = [select(scene.boxes, (scene.boxes.label == FENCE) & (scene.boxes.porosity > 0)) for scene in scenes]
+        sparse[scenery] = np.concatenate([found.porosity for found in fences])
+        assert all(np.all(found.half[:, 2] < 1.1) for found in fences)
+    assert limbs["gardens"] > 100 and limbs["town"] == 0
+    assert trunks["gardens"] > 1.1 * trunks["town"]
+    assert np.all(sparse["town"] == 0.45) and np.quantile(sparse["gardens"], 0.75) > 0.6
+
+
+def test_people_stand_side_by_side_in_gardens_alone():
+    rng = np.random.default_rng(0)
+    groups = [vehicles.people(rng) for _ in range(60)]
+    assert {len(group) for group in groups} == {1, 2, 3}
+    for group in groups:
+        assert np.all(np.diff([part.y for part in group]) > 0.4)
+        assert all(part.label == PERSON and 1.5 <= part.size[2] <= 1.9 for part in group)
+    grouping = [name for name, style in STYLES.items() if style.groups]
+    assert grouping == ["gardens"]
 
 
 def _longest_run(along: np.ndarray, side: np.ndarray) -> float:
