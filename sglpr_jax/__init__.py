@@ -11,7 +11,7 @@
   that: `evaluate`
 - close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans; `read_odometry`,
   `optimize_trajectory`; `PlaceMap` for scans of another day
-- train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `save_program`
+- train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `average`, `save_program`
 - recordings without a dataset: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
 - what a model is: `ModelConfig`, its backbones `SwinConfig`, `RingConfig`, `SglprConfig`, its `HeadConfig`
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from sglpr_jax.loops.odometry import read_odometry
     from sglpr_jax.loops.optimization import optimize_trajectory
     from sglpr_jax.loops.places import PlaceMap
+    from sglpr_jax.models.average import average
     from sglpr_jax.models.backbones.rings_config import RingConfig
     from sglpr_jax.models.backbones.sglpr_config import SglprConfig
     from sglpr_jax.models.backbones.swin_config import SwinConfig
@@ -70,6 +71,7 @@ _HOMES = {
     "loops.odometry": ("read_odometry",),
     "loops.optimization": ("optimize_trajectory",),
     "loops.places": ("PlaceMap",),
+    "models.average": ("average",),
     "models.backbones.rings_config": ("RingConfig",),
     "models.backbones.sglpr_config": ("SglprConfig",),
     "models.backbones.swin_config": ("SwinConfig",),
@@ -131,6 +133,7 @@ __all__ = [
     "SglprConfig",
     "SwinConfig",
     "TrainResult",
+    "average",
     "count_outside",
     "density_bev",
     "describe",

@@ -41,7 +41,8 @@ def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0)
     """Predict the class of every cell of a scan, or of a ready-made image, that holds a point.
 
     An image is cut to the model's grid, and its pixels above 0 are the cells that hold a point. Labels of the record
-    become the true map. Cells whose likeliest class is less probable than `min_confidence` are left unlabelled.
+    become the true map. A class is as probable as in the mean over the scan and its mirror image. Cells whose likeliest
+    class is less probable than `min_confidence` are left unlabelled.
 
     Example:
       found = semantic_map(params, recording.record(0))
@@ -87,7 +88,17 @@ def _maps(
     params: Params, counts: Float[Array, "h w"], truth: Int[Array, "h w"], min_confidence: Float[Array, ""]
 ) -> tuple[Int[Array, "h w"], Int[Array, "h w"]]:
     seen = (counts > 0) & field_of_view(params.config)[0]
-    known = segment(params, counts)[..., UNLABELLED + 1 :]  # a cell with points in it is not "unlabelled"
-    predicted = known.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
-    sure = jax.nn.softmax(known).max(-1) >= min_confidence
+    probability = _class_probabilities(params, counts)
+    predicted = probability.argmax(-1).astype(jnp.int32) + UNLABELLED + 1
+    sure = probability.max(-1) >= min_confidence
     return jnp.where(seen & sure, predicted, UNLABELLED), jnp.where(seen, truth, UNLABELLED)
+
+
+def _class_probabilities(params: Params, counts: Float[Array, "h w"]) -> Float[Array, "h w known"]:
+    """The mean over the image and its mirror image, of the classes that a cell with points in it can have.
+
+    The network turns with the scan, so a turn would tell nothing new, but it does not mirror: two views for one.
+    """
+    logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
+    as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])
+    return (as_it_is + mirrored[:, ::-1]) / 2

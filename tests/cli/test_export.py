@@ -3,6 +3,8 @@
 import dataclasses
 from pathlib import Path
 
+import chex
+import jax
 import numpy as np
 import pytest
 
@@ -103,4 +105,25 @@ def test_a_program_is_written_in_place_of_weights(command, weights, tmp_path):
 def test_flags_of_weights_are_refused_beside_a_program(command, weights, tmp_path):
     ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--format", "onnx", "--half")
     assert_one_line_error(ended, "expected --half with --format weights alone, found it with onnx")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_average_is_that_of_the_weights_named_with_and_without_the_head(command, weights, tmp_path):
+    params = sglpr_jax.load(weights)
+    doubled = dataclasses.replace(params, weights=jax.tree.map(lambda leaf: 2 * leaf, params.weights))
+    other = sglpr_jax.save(doubled, tmp_path / "other")
+    options = ("export", "--weights", weights, "--average", other, "--shares", "3", "1")
+    for keep in ((), ("--keep-segmentation",)):
+        out = tmp_path / f"out{len(keep)}"
+        ended = command(*options, *keep, "--out", out)
+        assert ended.status == 0, ended.error
+        expected = params if keep else sglpr_jax.for_places(params)
+        found = sglpr_jax.load(out)
+        assert found.config == expected.config
+        chex.assert_trees_all_close(found.weights, jax.tree.map(lambda leaf: 1.25 * leaf, expected.weights), rtol=1e-6)
+
+
+def test_shares_without_an_average_are_refused(command, weights, tmp_path):
+    ended = command("export", "--weights", weights, "--shares", "1", "--out", tmp_path / "out")
+    assert_one_line_error(ended, "expected --shares with --average alone, found it without")
     assert not (tmp_path / "out").exists()

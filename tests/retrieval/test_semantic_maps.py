@@ -27,6 +27,24 @@ def params() -> Params:
     return init(jax.random.key(0), preset="tiny")
 
 
+def probabilities(params: Params, counts: np.ndarray) -> np.ndarray:
+    """The reference: the softmax over the known classes, of the image and of its mirror image, one by one."""
+    views = []
+    for step in (1, -1):
+        logits = np.asarray(segment(params, jnp.asarray(counts[:, ::step])), np.float64)[:, ::step, 1:]
+        exponentials = np.exp(logits - logits.max(-1, keepdims=True))
+        views.append(exponentials / exponentials.sum(-1, keepdims=True))
+    return np.mean(views, axis=0)
+
+
+def test_the_map_of_a_mirrored_image_is_the_mirrored_map(params):
+    grid = params.config.grid
+    image = np.random.default_rng(1).poisson(0.3, (grid.height, grid.width)).astype(np.float32)
+    one, other = (semantic_map(params, Record(image=each)) for each in (image, np.fliplr(image)))
+    assert one.seen.any() and np.any(one.predicted != np.fliplr(one.predicted))
+    np.testing.assert_array_equal(other.predicted, np.fliplr(one.predicted))
+
+
 def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 9, (700, 3)).astype(np.float32)
@@ -35,10 +53,10 @@ def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     grid = params.config.grid
     counts = np.asarray(rasterize(points, grid=grid))
     seen = (counts > 0) & field_of_view(params.config)[0]
-    logits = np.asarray(segment(params, jnp.asarray(counts)))
+    likeliest = probabilities(params, counts).argmax(-1) + 1
     np.testing.assert_array_equal(found.counts, counts)
     np.testing.assert_array_equal(found.seen, seen)
-    np.testing.assert_array_equal(found.predicted, np.where(seen, logits[..., 1:].argmax(-1) + 1, 0))
+    np.testing.assert_array_equal(found.predicted, np.where(seen, likeliest, 0))
     np.testing.assert_array_equal(found.truth, np.where(seen, rasterize_labels(points, classes, grid=grid), 0))
     unlabelled = semantic_map(params, Record(points=points))
     np.testing.assert_array_equal(unlabelled.predicted, found.predicted)
@@ -57,9 +75,9 @@ def test_the_map_of_an_image_is_that_of_its_middle_where_it_is_not_empty(params,
     found = semantic_map(params, image_sequence(image, tmp_path / "0.png").record(0))
     middle = np.asarray(even_cells(jnp.asarray(image)))[2 : 2 + grid.height, 3 : 3 + grid.width]
     seen = (middle > 0) & field_of_view(params.config)[0]
-    logits = np.asarray(segment(params, jnp.asarray(middle)))[..., 1:]
+    likeliest = probabilities(params, middle).argmax(-1) + 1
     np.testing.assert_array_equal(found.counts, middle)
-    np.testing.assert_array_equal(found.predicted, np.where(seen, logits.argmax(-1) + 1, 0))
+    np.testing.assert_array_equal(found.predicted, np.where(seen, likeliest, 0))
     np.testing.assert_array_equal(found.truth, np.where(seen, 13, 0))  # building
     assert not semantic_map(params, image_sequence(image, None).record(0)).truth.any()
 
@@ -67,9 +85,7 @@ def test_the_map_of_an_image_is_that_of_its_middle_where_it_is_not_empty(params,
 def test_cells_the_network_is_not_sure_of_are_left_unlabelled(params):
     points = np.random.default_rng(0).normal(0, 9, (700, 3)).astype(np.float32)
     every = semantic_map(params, Record(points=points))
-    logits = np.asarray(segment(params, jnp.asarray(every.counts)), np.float64)[..., 1:]
-    exponentials = np.exp(logits - logits.max(-1, keepdims=True))
-    confidence = 1 / exponentials.sum(-1)
+    confidence = probabilities(params, every.counts).max(-1)
     least = np.quantile(confidence[every.seen], 0.5) + 1e-6
     found = semantic_map(params, Record(points=points), min_confidence=least)
     clear = np.abs(confidence - least) > 1e-5
@@ -90,5 +106,5 @@ def test_the_map_of_a_model_for_density_images_lies_on_such_an_image(random_para
     np.testing.assert_array_equal(found.counts, counts)
     np.testing.assert_array_equal(found.seen, counts > 0)
     np.testing.assert_array_equal(found.truth, np.where(counts > 0, truth, 0))
-    likeliest = np.asarray(segment(params, jnp.asarray(counts)))[..., 1:].argmax(-1) + 1
+    likeliest = probabilities(params, counts).argmax(-1) + 1
     np.testing.assert_array_equal(found.predicted, np.where(counts > 0, likeliest, 0))

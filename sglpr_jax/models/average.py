@@ -1,0 +1,45 @@
+"""The average of the weights of several trainings, one begun with another's: often better than each of them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.weights import by_name
+from sglpr_jax.models.whitening import unwhitened
+
+
+def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) -> Params:
+    """Every parameter as the mean of what it is in `models`, which count in proportion to `shares`, or alike.
+
+    Only good for trainings of which one began with another's weights: in others the same channel means other things.
+    Whitening layers are left out, for each was fitted to descriptors that are no more; fit one anew. Raises ValueError
+    for models that differ in more than that, or shares that are not one of 0 or more for each, one of them above 0.
+
+    Example:
+      average([load("runs/before"), load("runs/after")], shares=[0.3, 0.7])
+    """
+    shares = [1.0] * len(models) if shares is None else list(shares)
+    if len(shares) != len(models) or min(shares, default=0) < 0 or sum(shares) == 0:
+        raise ValueError(f"expected {len(models)} shares of 0 or more, not all 0, found {shares}")
+    parts = [unwhitened(model) for model in models]
+    for part in parts[1:]:
+        _require_same_model(parts[0], part)
+    weighted = [_times(part.weights, share / sum(shares)) for share, part in zip(shares, parts, strict=True)]
+    return Params(jax.tree.map(lambda *values: sum(values), *weighted), parts[0].config)
+
+
+def _times(weights: Any, factor: float) -> Any:
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) * factor, weights)
+
+
+def _require_same_model(one: Params, other: Params) -> None:
+    a, b = (by_name(dataclasses.asdict(params.config)) for params in (one, other))
+    different = sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
+    if different:
+        name = different[0]
+        found = f"{name.replace('/', '.')} {a.get(name)} and {b.get(name)}"
+        raise ValueError(f"expected weights of one model to average, found two, with {found}")
