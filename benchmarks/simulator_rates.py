@@ -61,7 +61,7 @@ def measurements(config: RateConfig) -> Iterator[tuple[Row, Callable[[], Row]]]:
 
 def _whole_scans(drive: Along, repeats: int) -> Row:
     """Scans from the town to the host's memory: stages, and the rate in one and two threads."""
-    drive.scan(0), drive.stages(0)  # compile
+    drive.stages(0)  # compiles
     seconds = [drive.stages(i) for _ in range(repeats) for i in range(len(drive.poses))]
     rates = {threads: float(np.median([drive.rate(threads) for _ in range(repeats)])) for threads in (1, 2)}
     stages = {f"{name}_s": float(np.median([each[name] for each in seconds])) for name in seconds[0]}
