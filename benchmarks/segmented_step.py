@@ -11,7 +11,7 @@ from inputs import random_batch
 from ratio import SPREAD
 from rich.console import Console
 from rich.table import Table
-from throughput import about, step_job
+from throughput import StepJob, about
 
 from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.files import write_json
@@ -52,9 +52,9 @@ def main(
 
 def measure(config: TrainConfig, variants: list[tuple[int, int]], repeats: int) -> np.ndarray:
     """Seconds of each step, (repeats, 1 + variants), the first of them without labels; the order changes in turn."""
-    unlabelled = step_job(config, _batch(config, labels=False), 1)
+    unlabelled = StepJob(config, _batch(config, labels=False), 1)
     segmented = [segmenting(config, every, detail) for every, detail in variants]
-    jobs = [unlabelled, *(step_job(one, _batch(one, labels=True), 1) for one in segmented)]
+    jobs = [unlabelled, *(StepJob(one, _batch(one, labels=True), 1) for one in segmented)]
     for job in jobs:
         job()  # compiles
     seconds = np.zeros((repeats, len(jobs)))

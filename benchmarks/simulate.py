@@ -13,7 +13,6 @@ from typing import TypeVar
 
 import jax
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -115,4 +114,6 @@ def _print_scene(drive: Along) -> None:
 
 
 if __name__ == "__main__":
+    import tyro  # here, for gpu.py uses the rest of this file where there is no tyro
+
     tyro.cli(main)

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from flops import count_flops
 from inputs import random_batch
 from ratio import SPREAD
@@ -63,7 +62,7 @@ def main(
     """
     on_cpu = jax.devices()[0].platform == "cpu"
     compute = compute or (("float32",) if on_cpu else ("float32", "bfloat16"))
-    size = size or (2048 if on_cpu else 8192)
+    size = size or matrix_size()
     rows = []
     for name in preset:
         for type_ in compute:
@@ -98,32 +97,49 @@ def step_flops(config: TrainConfig, batch: Batch) -> int:
 def measure(
     config: TrainConfig, batch: Batch, flops: int, *, repeats: int, steps: int, size: int, products: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Operations a second of the training step and of matrix products, (repeats,) each; the order changes in turn."""
-    jobs = step_job(config, batch, steps), product_job(config.model.compute, size, products)
-    work = steps * flops, products * 2 * size**3
-    for job in jobs:
+    """Operations a second of the training step and of matrix products, (repeats,) each."""
+    product = product_job(config.model.compute, size, products)
+    job = StepJob(config, batch, steps)
+    return rates_in_turn((job, steps * flops), (product, products * 2 * size**3), repeats=repeats)
+
+
+def rates_in_turn(ours: tuple[Job, float], other: tuple[Job, float], *, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+    """Operations a second of two jobs with their operations, (repeats,) each; the order changes in turn."""
+    pair = ours, other
+    for job, _ in pair:
         job()  # compiles
     rates = np.zeros((2, repeats))
     for repeat in range(repeats):
         for i in (0, 1) if repeat % 2 else (1, 0):
+            job, work = pair[i]
             start = time.perf_counter()
-            jobs[i]()
-            rates[i, repeat] = work[i] / (time.perf_counter() - start)
+            job()
+            rates[i, repeat] = work / (time.perf_counter() - start)
     return rates[0], rates[1]
 
 
-def step_job(config: TrainConfig, batch: Batch, steps: int) -> Job:
-    """Training steps, one after another."""
-    state = new_state(config)
+class StepJob:
+    """A job: training steps, one after another."""
 
-    def job() -> None:
-        nonlocal state
-        for _ in range(steps):
-            state, metrics = train_step(state, batch, config=config)
+    def __init__(self, config: TrainConfig, batch: Batch, steps: int):
+        self._config, self._batch, self._steps = config, batch, steps
+        self._state = new_state(config)
+
+    def __call__(self) -> None:
+        """Make the steps. Raises FloatingPointError where the loss is no longer finite."""
+        for _ in range(self._steps):
+            self._state, metrics = train_step(self._state, self._batch, config=self._config)
         if not np.isfinite(metrics["loss"]):
-            raise SystemExit(f"the loss is {metrics['loss']}: what was timed is no training")
+            raise FloatingPointError(f"the loss is {metrics['loss']}: what was timed is no training")
 
-    return job
+    def program(self) -> jax.stages.Compiled:
+        """The compiled step; after the first call nothing is compiled for it."""
+        return train_step.lower(self._state, self._batch, config=self._config).compile()
+
+
+def matrix_size() -> int:
+    """Rows and columns of matrices that are large for this device."""
+    return 2048 if jax.devices()[0].platform == "cpu" else 8192
 
 
 def product_job(type_: str, size: int, products: int) -> Job:
@@ -195,4 +211,6 @@ def table(rows: list[dict[str, Any]], *, title: str) -> Table:
 
 
 if __name__ == "__main__":
+    import tyro  # here, for gpu.py uses the rest of this file where there is no tyro
+
     tyro.cli(main)
