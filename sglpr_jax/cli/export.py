@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.fields import NotNegative
+from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ class ExportCommand:
     whiten: tuple[Path, ...] = ()
     """Datasets or folders of scans; to their descriptors a last layer is fitted that evens out the spread over the
     directions (models/whitening.py), in place of one that is there."""
-    whiten_power: NotNegative = 0.5
+    whiten_power: NotNegative = WHITENING_POWER
     """By which power of its spread a principal component is divided: 1 evens out all."""
 
 

@@ -18,6 +18,9 @@ from sglpr_jax.models.backbones.swin_config import SwinConfig
 BackboneConfig = SwinConfig | RingConfig | SglprConfig
 """The backbones there are; `models/backbones/interface.py` says what each one has."""
 
+WHITENING_POWER = 0.4
+"""By which power of its spread the last layer divides a principal component, where none is named."""
+
 
 @dataclasses.dataclass(frozen=True)
 class HeadConfig:

@@ -6,6 +6,7 @@ import numpy as np
 
 from sglpr_jax.data import Recording
 from sglpr_jax.data.warning import warn
+from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.whitening import unwhitened, whitened
 from sglpr_jax.retrieval.embed import embed
@@ -15,7 +16,7 @@ def whiten(
     params: Params,
     recordings: Iterable[Recording],
     *,
-    power: float = 0.5,
+    power: float = WHITENING_POWER,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Params:
     """`params` with a last layer fitted to the descriptors of all scans, in place of one that is there.
