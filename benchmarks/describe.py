@@ -1,76 +1,83 @@
-"""Describing images: ours, jitted, against PyTorch's eager modules of the same shape and weights."""
-
-from typing import Literal
+"""Describing images: ours, jitted, against PyTorch's modules of the same shape and weights."""
 
 import jax
 import numpy as np
 import tyro
-from inputs import comparable_model, random_params, random_scans
-from ratio import Contender, Job, alternate, check_equal, report, report_resources, require_torch, warn_if_busy
+from beside_torch import Preset, compare, prepare_to_compare, torch_contenders
+from inputs import comparable_model, random_images, random_params
+from ratio import Contender, Job
 
-from sglpr_jax.bev import rasterize
-from sglpr_jax.models.input_image import prepare
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 
 
 def main(
     *,
-    preset: Literal["small", "paper"] = "small",
+    preset: Preset = "small",
     batch: int = 1,
     repeats: int = 20,
+    calls: int = 1,
     chunk: tuple[int, ...] = (0,),
     torch_chunk: int = 0,
+    compiled: bool = False,
     threads: int = 2,
 ) -> None:
-    """Time descriptors on the CPU against PyTorch.
+    """Time descriptors on the CPU against PyTorch: the whole way from images of counts.
 
     Args:
-        preset: the model; a polar one is timed without its resampling.
+        preset: the model.
         batch: images in one call.
         repeats: how often both are timed against each other.
+        calls: of one run; the first of a run finds the caches as the other program left them.
         chunk: images that ours takes at a time inside one jit (0: all at once); several are compared in turn.
         torch_chunk: the same for PyTorch's loop.
+        compiled: time PyTorch through `torch.compile` too.
         threads: threads that each program may use.
     """
-    require_torch()
-    warn_if_busy(threads)
+    prepare_to_compare(threads, compiled=compiled)
     params = random_params(comparable_model(preset))
-    grid = params.config.grid
-    bev = np.asarray(rasterize(random_scans(batch, 120_000, grid=grid)[0], grid=grid))
-
-    other = Contender(
-        "PyTorch", torch_job, params, np.asarray(prepare(bev, params.config)), torch_chunk, threads=threads
+    images, _ = random_images(batch, params.config.grid, image="points")
+    theirs = torch_contenders(torch_job, params, images, torch_chunk, calls, compiled=compiled, threads=threads)
+    ours = [Contender(f"JAX, chunk {size}", jax_job, params, images, size, calls, threads=threads) for size in chunk]
+    compare(
+        f"describe, {preset}, {batch} image(s)",
+        theirs,
+        ours,
+        first=lambda contender: contender.run()[0],
+        what="descriptors",
+        tolerance=1e-4,
+        repeats=repeats,
+        threads=threads,
+        calls=calls,
     )
-    ours = [Contender(f"JAX, chunk {size}", jax_job, params, bev, size, threads=threads) for size in chunk]
-    expected = other.run()[0]
-    for contender in ours:
-        check_equal(f"descriptors, {contender.name}", contender.run()[0], expected, tolerance=1e-4)
-    for contender in (other, *ours):
-        contender.forget_peak()
-    seconds = alternate([other, *ours], repeats=repeats)
-    rows = [(contender.name, seconds[:, i], seconds[:, 0]) for i, contender in enumerate(ours, start=1)]
-    report(f"describe, {preset}, {batch} image(s)", rows, other="PyTorch", packages=("jax", "torch"), threads=threads)
-    report_resources([other, *ours])
 
 
-def jax_job(params: Params, bev: np.ndarray, chunk: int) -> Job:
+def jax_job(params: Params, images: np.ndarray, chunk: int, calls: int) -> Job:
     """Our `describe`, over chunks of the images inside one jit."""
-    size = chunk or len(bev)
+    size = chunk or len(images)
 
     @jax.jit
-    def in_chunks(params: Params, bev: jax.Array) -> jax.Array:
-        return jax.lax.map(lambda part: describe(params, part), bev.reshape(-1, size, *bev.shape[1:]))
+    def in_chunks(params: Params, images: jax.Array) -> jax.Array:
+        return jax.lax.map(lambda part: describe(params, part), images.reshape(-1, size, *images.shape[1:]))
 
-    arguments = jax.device_put((params, bev))
-    return lambda: np.asarray(in_chunks(*arguments)).reshape(len(bev), -1)
+    arguments = jax.device_put((params, images))
+
+    def once() -> np.ndarray:
+        return np.asarray(in_chunks(*arguments)).reshape(len(images), -1)
+
+    return again(once, calls)
 
 
-def torch_job(params: Params, images: np.ndarray, chunk: int) -> Job:
-    """PyTorch's, on images whose counts are rescaled already; only this process imports PyTorch."""
+def torch_job(params: Params, images: np.ndarray, chunk: int, calls: int, compiled: bool) -> Job:
+    """PyTorch's; only this process imports PyTorch."""
     import torch_reference
 
-    return torch_reference.describe_job(params, images, chunk)
+    return again(torch_reference.describe_job(params, images, chunk, compiled), calls)
+
+
+def again(job: Job, calls: int) -> Job:
+    """The job so many times; the last value."""
+    return lambda: [job() for _ in range(calls)][-1]
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ import numpy as np
 from sglpr_jax.data.density_grid import SIZE
 from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.grid import Grid, ImageKind
-from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
@@ -25,20 +24,18 @@ WEIGHT_NOISE = 0.01
 """Added to initial weights, of which many are 0 or 1 and would hide that one stands in another's place."""
 
 
-def comparable_model(preset: str) -> ModelConfig:
-    """The preset's model, less what is not the same arithmetic in both frameworks.
+def comparable_model(preset: str, *, labels: bool = True) -> ModelConfig:
+    """The preset's model, less what differs between frameworks or is no part of the network.
 
-    A polar model is left without its resampling and circular borders: the image comes in the size of the polar one.
-    Nothing is out of view, for the labels of such cells are dropped. Stochastic depth, which is random, is off. Raises
-    ValueError for a backbone that is no Swin-Unet.
+    Stochastic depth, which is random, is off; images of counts take the place of ready-made ones, which a step rotates;
+    without labels there is no segmentation head, as in a training without them.
     """
     config = model_preset(preset)
-    height, width = config.image_size
-    grid = Grid(config.grid.resolution_m, height, width)
-    if not isinstance(config.backbone, SwinConfig):
-        raise ValueError(f"preset {preset}: expected the backbone 'swin', found {config.backbone.kind!r}")
-    backbone = dataclasses.replace(config.backbone, drop_path=0.0)
-    return dataclasses.replace(config, grid=grid, field="square", blind_m=0.0, polar=None, backbone=backbone)
+    backbone = config.backbone
+    if hasattr(backbone, "drop_path"):
+        backbone = dataclasses.replace(backbone, drop_path=0.0)
+    categories = config.categories if labels else 0
+    return dataclasses.replace(config, image="points", backbone=backbone, categories=categories)
 
 
 def random_params(config: ModelConfig) -> Params:

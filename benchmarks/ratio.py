@@ -130,10 +130,10 @@ def alternate(contenders: Sequence[Contender], *, repeats: int) -> np.ndarray:
     return seconds
 
 
-def report_resources(contenders: Sequence[Contender]) -> None:
-    """Print what a run of each takes after its first ones: processor time, and the peak of its process's memory."""
-    used = "; ".join(f"{one.name} {one.processor_s():.3g} s, {one.peak_mb():.0f} MB" for one in contenders)
-    print(f"Processor time of a run, and peak of resident memory: {used}")
+def report_resources(contenders: Sequence[Contender], *, calls: int = 1) -> None:
+    """Print what each takes after its first runs: processor time of a run, or of each of its calls, and peak memory."""
+    used = "; ".join(f"{one.name} {one.processor_s() / calls:.3g} s, {one.peak_mb():.0f} MB" for one in contenders)
+    print(f"Processor time of a {'call' if calls > 1 else 'run'}, and peak of resident memory: {used}")
 
 
 def report(

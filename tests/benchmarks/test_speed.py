@@ -132,6 +132,14 @@ def test_missing_torch_is_one_clear_error(name, monkeypatch):
         importlib.import_module(name).main()
 
 
+def test_a_missing_compiler_is_one_clear_error(monkeypatch):
+    beside_torch = importlib.import_module("beside_torch")
+    monkeypatch.setattr(beside_torch, "require_torch", lambda: None)
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(SystemExit, match=r"^--compiled: .* C\+\+ compiler, but there is no no-such-compiler$"):
+        beside_torch.prepare_to_compare(1, compiled=True)
+
+
 def test_growth_tells_the_exponent_of_everything():
     growth = importlib.import_module("growth")
     assert growth.exponent([1, 2, 4], [3.0, 12.0, 48.0]) == pytest.approx(2)
