@@ -4,6 +4,7 @@ Weights are float32. Layers multiply in the type of their input, so that a netwo
 (`ModelConfig.compute`) but where a module asks for float32.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -65,12 +66,38 @@ class LayerNorm(nn.Module):
         """Keeps the type of its input."""
         scale = weight(self, "scale", nn.initializers.ones, x.shape[-1:])
         bias = weight(self, "bias", nn.initializers.zeros, x.shape[-1:])
-        y = x.astype(jnp.float32)
-        mean = y.mean(-1, keepdims=True)
-        variance = jnp.maximum((y * y).mean(-1, keepdims=True) - mean * mean, 0.0)
-        along_channels = (1,) * (x.ndim - 1) + (-1,)
-        scaled = jax.lax.rsqrt(variance + self.epsilon) * scale.reshape(along_channels)
-        return ((y - mean) * scaled + bias.reshape(along_channels)).astype(x.dtype)
+        rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
+        return layer_norm(rows, scale, bias, self.epsilon).astype(x.dtype).reshape(x.shape)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def layer_norm(
+    x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"], epsilon: float
+) -> Float[Array, "n c"]:
+    """Layer norm of every row. Its derivative is written out: XLA makes more passes over the rows for JAX's."""
+    mean, per_deviation = _statistics(x, epsilon)
+    return (x - mean) * (per_deviation * scale[None]) + bias[None]
+
+
+@layer_norm.defjvp
+def _(epsilon: float, primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]):
+    (x, scale, bias), (x_tangent, scale_tangent, bias_tangent) = primals, tangents
+    mean, per_deviation = _statistics(x, epsilon)
+    normed = (x - mean) * per_deviation
+    along = x_tangent - _mean(x_tangent) - normed * _mean(normed * x_tangent)
+    tangent = along * (per_deviation * scale[None]) + normed * scale_tangent[None] + bias_tangent[None]
+    return layer_norm(x, scale, bias, epsilon), tangent
+
+
+def _statistics(x: Float[Array, "n c"], epsilon: float) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+    """The mean of each row, and 1 / its standard deviation."""
+    mean = _mean(x)
+    variance = jnp.maximum(_mean(x * x) - mean * mean, 0.0)
+    return mean, jax.lax.rsqrt(variance + epsilon)
+
+
+def _mean(x: Float[Array, "n c"]) -> Float[Array, "n 1"]:
+    return x.mean(-1, keepdims=True)
 
 
 torch_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")

@@ -1,0 +1,68 @@
+"""Layer norm and its derivative, written out, against the plain formula that JAX differentiates itself."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sglpr_jax.models.layers import LayerNorm, layer_norm
+
+EPSILON = 1e-5
+RNG = np.random.default_rng(0)
+SCALE, BIAS = (jnp.asarray(RNG.normal(size=6), jnp.float32) for _ in range(2))
+ROWS = jnp.asarray(RNG.normal(size=(4, 5, 6)) * 3 + 1, jnp.float32)
+WEIGHTS = jnp.asarray(RNG.normal(size=(4, 5, 6)), jnp.float32)
+ours = functools.partial(layer_norm, epsilon=EPSILON)
+
+
+def plain(x, scale, bias):
+    centred = x - x.mean(-1, keepdims=True)
+    return centred / jnp.sqrt((centred**2).mean(-1, keepdims=True) + EPSILON) * scale[None] + bias[None]
+
+
+def assert_close(found, expected):
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-5, atol=2e-5), found, expected)
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+def test_values_and_gradients_are_those_of_the_plain_formula(wrap):
+    def loss(norm, x, scale, bias):
+        return jnp.sum(norm(x, scale, bias) ** 3 * WEIGHTS[0])
+
+    assert_close(wrap(ours)(ROWS[0], SCALE, BIAS), plain(ROWS[0], SCALE, BIAS))
+    found, expected = (wrap(jax.grad(functools.partial(loss, norm), (0, 1, 2))) for norm in (ours, plain))
+    assert_close(found(ROWS[0], SCALE, BIAS), expected(ROWS[0], SCALE, BIAS))
+
+
+def test_forward_mode_is_that_of_the_plain_formula():
+    tangents = WEIGHTS[0], BIAS, SCALE
+    found, expected = (jax.jvp(norm, (ROWS[0], SCALE, BIAS), tangents) for norm in (ours, plain))
+    assert_close(found, expected)
+
+
+def test_gradients_under_vmap_are_those_of_each():
+    def gradient(x, weights):
+        return jax.grad(lambda *of: jnp.sum(ours(*of) * weights), (0, 1, 2))(x, SCALE, BIAS)
+
+    together = jax.vmap(gradient)(ROWS, WEIGHTS)
+    for i in range(len(ROWS)):
+        assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], together), gradient(ROWS[i], WEIGHTS[i]))
+
+
+def test_equal_channels_have_finite_gradients():
+    flat = jnp.full((3, 6), 2.0)
+    found = jax.grad(lambda x: jnp.sum(ours(x, SCALE, BIAS) * WEIGHTS[0, :3]))(flat)
+    assert np.isfinite(found).all()
+
+
+def test_the_layer_keeps_type_and_shape():
+    norm = LayerNorm()
+    for type_ in (jnp.float32, jnp.bfloat16):
+        x = ROWS.astype(type_)
+        variables = {"params": {"scale": SCALE, "bias": BIAS}}
+        found = norm.apply(variables, x)
+        assert found.dtype == type_ and found.shape == x.shape
+        expected = plain(x.astype(jnp.float32).reshape(-1, 6), SCALE, BIAS).reshape(x.shape)
+        np.testing.assert_allclose(found.astype(jnp.float32), expected, atol=2e-5 if type_ == jnp.float32 else 0.03)
