@@ -64,8 +64,8 @@ class LayerNorm(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
         """Keeps the type of its input."""
-        scale = weight(self, "scale", nn.initializers.ones, x.shape[-1:])
-        bias = weight(self, "bias", nn.initializers.zeros, x.shape[-1:])
+        scale = jnp.asarray(weight(self, "scale", nn.initializers.ones, x.shape[-1:]))
+        bias = jnp.asarray(weight(self, "bias", nn.initializers.zeros, x.shape[-1:]))
         rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
         return layer_norm(rows, scale, bias, self.epsilon).astype(x.dtype).reshape(x.shape)
 
