@@ -4,7 +4,7 @@ Reproduces nothing of the paper, which learns both at once; `sglpr` does so firs
 the weights at the end describe a place as those that the run began with (docs/guides/semantics.md).
 
 Expect: begun with the weights `sglpr` of before, mean IoU on a simulated recording of a town never seen rose from .247
-to .309, on 40 real labelled scans from .138 to .169 (sglpr_jax/weights/sglpr/README.md). One step takes 1.6 s of a CPU
+to .309, on 36 real labelled scans from .138 to .169 (sglpr_jax/weights/sglpr/README.md). One step takes 1.6 s of a CPU
 core.
 
 Command: bin/train --seq 08 --data TOWNS --weights sglpr --preset sglpr-segmentation
