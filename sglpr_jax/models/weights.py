@@ -40,9 +40,10 @@ def graft(given: Params, fresh: Params) -> Params:
     """`fresh` with the values of `given` wherever that has them: to train on from weights handed out.
 
     A kernel may see more channels in `fresh` than in `given`: it begins with 0 for those that come last. So a larger
-    network begins by computing what the smaller one does. Raises ValueError where `given` has a weight that `fresh` has
-    not, or one of another shape.
+    network begins by computing what the smaller one does. A segmentation head is left out where `fresh` has none.
+    Raises ValueError where `given` has another weight that `fresh` has not, or one of another shape.
     """
+    given = given if fresh.config.segments else for_places(given)
     all_of_them, values = by_name(fresh.weights), by_name(given.weights)
     for name, value in values.items():
         wanted = all_of_them[name].shape if name in all_of_them else None

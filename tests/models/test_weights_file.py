@@ -35,7 +35,7 @@ def test_weights_and_configuration_come_back_bit_by_bit(params, tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == [CONFIG_FILE, WEIGHTS_FILE]
 
 
-def test_weights_without_the_training_parts_are_grafted_onto_fresh_ones(params):
+def test_weights_with_and_without_a_segmentation_head_are_grafted_onto_each_other(params):
     kept = {name: values for name, values in params.weights.items() if name != "segmentation_head"}
     given = Params(kept, dataclasses.replace(params.config, categories=0))
     fresh = jax.tree.map(np.zeros_like, params)
@@ -43,8 +43,9 @@ def test_weights_without_the_training_parts_are_grafted_onto_fresh_ones(params):
     assert found.config == params.config
     chex.assert_trees_all_equal({k: v for k, v in found.weights.items() if k != "segmentation_head"}, kept)
     chex.assert_trees_all_equal(found.weights["segmentation_head"], fresh.weights["segmentation_head"])
+    chex.assert_trees_all_equal(graft(params, given).weights, kept)
     with pytest.raises(ValueError, match=r"segmentation_head/kernel has shape .*, expected no such weight"):
-        graft(params, given)
+        graft(params, dataclasses.replace(fresh, weights=kept))
 
 
 def with_fine_blocks(*channels):
