@@ -1,6 +1,8 @@
 """For distances between all pairs of two sets of descriptors: blocks that bound the memory, and all shifts at once."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,14 +18,24 @@ def in_blocks(
     *,
     block: int,
     prepare: Callable[[Rows], Any] = lambda rows: rows,
+    prepare_database: Callable[[Rows], Any] | None = None,
+    threads: int | None = 1,
 ) -> Float32[np.ndarray, "q n"]:
-    """Return `compare(prepare(queries), prepare(database))`, computed for at most `block` x `block` pairs at a time."""
+    """Return `compare(prepare(queries), prepare(database))`, computed for at most `block` x `block` pairs at a time.
+
+    The database is prepared by `prepare_database` where that is another function. So many blocks at once as there are
+    `threads` (None: one for each core), where what compares keeps only one busy.
+    """
     out = np.empty((len(queries), len(database)), np.float32)
-    for column in range(0, len(database), block):
-        prepared = prepare(database[column : column + block])
+
+    def fill(column: int) -> None:
+        prepared = (prepare_database or prepare)(database[column : column + block])
         for row in range(0, len(queries), block):
             found = compare(prepare(queries[row : row + block]), prepared)
             out[row : row + block, column : column + block] = found
+
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        list(pool.map(fill, range(0, len(database), block)))  # raises what a block has raised
     return out
 
 

@@ -50,8 +50,9 @@ def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
     def shifts(query, other):
         turned = jnp.fft.rfft2(_turned_and_scaled(query.image, *turn_and_scale(query, other)))
         surface = _correlation(turned, other.spectrum, query.image.shape)
-        half = surface.shape[1] // 2
-        here, opposite = _peak(surface)[1], _peak(jnp.roll(surface, half, axis=1))[1]
+        rows, columns = surface.shape
+        half = columns // 2
+        here, opposite = (_peak(surface, (rows // 2, by))[1] for by in (half, 0))
         return jnp.stack([here, opposite]).astype(jnp.int32) - jnp.array([0, half])
 
     return jax.lax.map(lambda query: jax.lax.map(lambda other: shifts(query, other), database), queries)
@@ -60,7 +61,8 @@ def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
 def turn_and_scale(query: Spectra, other: Spectra) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return by how many radians to turn the query, and by how much it is larger than the other."""
     rows, columns = query.image.shape
-    down, right = _peak(_correlation(query.log_polar, other.log_polar, (rows, columns)))
+    correlation = _correlation(query.log_polar, other.log_polar, (rows, columns))
+    down, right = _peak(correlation, (rows // 2, columns // 2))
     angle, scale = jnp.pi * down / rows, _log_base(rows, columns) ** right
     inverse = scale > LARGEST_SCALE
     return jnp.where(inverse, -angle, angle), jnp.where(inverse, 1 / scale, scale)
@@ -69,21 +71,32 @@ def turn_and_scale(query: Spectra, other: Spectra) -> tuple[Float[Array, ""], Fl
 def _correlation(
     a: Complex[Array, "rows frequencies"], b: Complex[Array, "rows frequencies"], shape: tuple[int, int]
 ) -> Float[Array, "rows columns"]:
-    """Return the phase correlation, whose peak lies as far from the middle as a has to move onto b, backwards."""
+    """Return the phase correlation, whose peak lies as far from the corner as b has to move onto a."""
     cross = a * jnp.conj(b)
     size = jnp.abs(cross)
-    return jnp.fft.fftshift(jnp.fft.irfft2(cross * size / (size**2 + SMALL), shape))
+    return jnp.fft.irfft2(cross * size / (size**2 + SMALL), shape)
 
 
-def _peak(surface: Float[Array, "rows columns"]) -> Float[Array, "2"]:
-    """Return how far down and right the peak's centre of mass lies from the middle, with the opposite sign."""
-    rows, columns = surface.shape
-    row, column = jnp.divmod(jnp.argmax(surface), columns)
-    window = jax.lax.dynamic_slice(jnp.pad(surface, NEAR), (row, column), (2 * NEAR + 1, 2 * NEAR + 1))
-    steps = jnp.arange(-NEAR, NEAR + 1)
+def _peak(surface: Float[Array, "rows columns"], rolled: tuple[int, int]) -> Float[Array, "2"]:
+    """Return how far down and right of the middle the peak's centre of mass lies, with the opposite sign.
+
+    That is in the surface `rolled` by so many rows and columns, at whose borders the peak is cut.
+    """
+    shape = np.array(surface.shape)
+    peak = jnp.stack(jnp.divmod(_argmax(surface), surface.shape[1]))
+    place = (peak + np.array(rolled)) % shape
+    steps = np.arange(-NEAR, NEAR + 1)
+    row, column = (peak[:, None] + steps[None]) % shape[:, None]
+    inside = (place[:, None] + steps[None] >= 0) & (place[:, None] + steps[None] < shape[:, None])
+    window = jnp.where(inside[0][:, None] & inside[1][None], surface[row[:, None], column[None]], 0.0)
     total = window.sum()
     mean = jnp.stack([window.sum(axis=1) @ steps, window.sum(axis=0) @ steps]) / jnp.where(total == 0, 1.0, total)
-    return jnp.array([rows // 2, columns // 2]) - jnp.stack([row, column]) - mean
+    return shape // 2 - place - mean
+
+
+def _argmax(values: Float[Array, "rows columns"]) -> Int[Array, ""]:
+    """Return what `jnp.argmax` does, in an eighth of its time on a CPU."""
+    return jnp.where(values.ravel() == values.max(), jnp.arange(values.size), values.size).min()
 
 
 def _turned_and_scaled(

@@ -92,6 +92,16 @@ def test_segmented_steps_are_timed_against_one_without_labels(tmp_path):
         assert 0 < low <= row["ratio"] <= high
 
 
+def test_all_pairs_are_timed_distance_by_distance(tmp_path):
+    write_dataset(tmp_path, names=("00",), scans=4, sensor=SENSOR)
+    options = ("--methods", "scan-context", "random", "--frames", 100, "--seconds", 0)
+    rows = table(printed("all_pairs.py", "--data", tmp_path, *options))
+    assert [row[:3] for row in rows] == [["scan-context", "scan-context", "64"], ["random", "l2", "64"]]
+    for row in rows:
+        per_pair, whole = float(row[4]), float(row[5].split()[0])
+        assert per_pair > 0 and whole == pytest.approx(per_pair * 1e-6 * 100**2, abs=0.06)
+
+
 def test_the_time_of_a_step_is_told_by_parts():
     rows = table(printed("profile_step.py", "--preset", TINY, "--steps", 1))
     parts = {row[0] for row in rows}

@@ -1,4 +1,5 @@
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -27,6 +28,32 @@ def test_blocks_cover_every_pair_once(rows, q, n):
     expected = 3 * (rows[:q, None] - 2 * rows[None, :n]).sum(-1)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
     assert sum(a * b for a, b in calls) == q * n and max([0, *(max(call) for call in calls)]) <= 4
+
+
+def test_the_database_may_be_prepared_in_another_way(rows):
+    found = pairwise.in_blocks(
+        lambda a, b: a @ b, rows, rows, block=4, prepare=lambda part: 2 * part, prepare_database=lambda part: part.T
+    )
+    np.testing.assert_allclose(found, 2 * rows @ rows.T, rtol=1e-5, atol=1e-5)
+
+
+def test_blocks_at_once_are_those_one_after_another(rows):
+    together = threading.Barrier(2, timeout=60)  # breaks where one block waits for the other
+
+    def compare(a, b):
+        together.wait()
+        return a @ b.T
+
+    found = pairwise.in_blocks(compare, rows, rows[:8], block=4, threads=2)
+    np.testing.assert_allclose(found, rows @ rows[:8].T, rtol=1e-5, atol=1e-5)
+
+
+def test_what_a_block_raises_is_raised(rows):
+    def compare(a, b):
+        raise ValueError("no such rows")
+
+    with pytest.raises(ValueError, match="no such rows"):
+        pairwise.in_blocks(compare, rows, rows, block=4, threads=None)
 
 
 def test_correlation_is_the_sum_it_says():

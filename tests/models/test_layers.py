@@ -1,4 +1,4 @@
-"""Layer norm and its derivative, written out, against the plain formula that JAX differentiates itself."""
+"""Layer norm and the product, whose derivatives are written out, against what JAX differentiates itself."""
 
 import functools
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.layers import LayerNorm, layer_norm
+from sglpr_jax.models.layers import LayerNorm, layer_norm, product
 
 EPSILON = 1e-5
 RNG = np.random.default_rng(0)
@@ -66,3 +66,30 @@ def test_the_layer_keeps_type_and_shape():
         assert found.dtype == type_ and found.shape == x.shape
         expected = plain(x.astype(jnp.float32).reshape(-1, 6), SCALE, BIAS).reshape(x.shape)
         np.testing.assert_allclose(found.astype(jnp.float32), expected, atol=2e-5 if type_ == jnp.float32 else 0.03)
+
+
+SIZES = [pytest.param(20, 7, 3, id="tall"), pytest.param(20, 3, 7, id="wide"), pytest.param(4, 7, 3, id="few rows")]
+"""Rows, and rows and columns of the matrix: the gradients of these are computed in different orders."""
+
+
+def rows_and_matrix(n, c, f):
+    rng = np.random.default_rng(0)
+    return tuple(jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((n, c), (c, f)))
+
+
+@pytest.mark.parametrize("n, c, f", SIZES)
+def test_the_product_and_its_gradients_are_the_plain_ones(n, c, f):
+    x, matrix = rows_and_matrix(n, c, f)
+
+    def of(form, matrix):
+        return jax.value_and_grad(lambda x, m: jnp.sum(form(x, m) ** 2), (0, 1))(x, matrix)
+
+    for matrices, wrap in ((matrix, jax.jit), (jnp.stack([matrix, 2 * matrix]), jax.vmap)):
+        found, expected = (wrap(functools.partial(of, form))(matrices) for form in (product, jnp.matmul))
+        assert_close(found, expected)
+
+
+@pytest.mark.parametrize("n, c, f", SIZES)
+def test_the_product_has_a_forward_mode(n, c, f):
+    of = rows_and_matrix(n, c, f)
+    assert_close(*(jax.jvp(form, of, (2 * of[0], of[1] + 1)) for form in (product, jnp.matmul)))

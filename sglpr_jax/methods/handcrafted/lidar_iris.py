@@ -73,7 +73,7 @@ def lidar_iris_distance(
             [_hamming(bits, faint, database, row) for bits, faint, row in zip(*queries[1:], shifts, strict=True)]
         )
 
-    return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare)
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=_prepare, threads=None)
 
 
 def responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "filters 80 360"]:
@@ -114,16 +114,20 @@ def _hamming(
     database: _Iris,
     shifts: Int[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance of one image to each of the database, whose column j + shift lies on its column j."""
+    """Return the distance of one image to each of the database, at the best shift near its alignments.
+
+    These are mostly a column apart: most shifts near the one are near the other, and count once.
+    """
+    near = np.sort((shifts[..., None] + np.arange(-NEAR, NEAR + 1)).reshape(len(shifts), -1) % COLUMNS, axis=1)
     best = np.ones(len(shifts))
-    rows = np.arange(len(shifts))[:, None]
-    for shift in shifts.T:
-        for step in range(-NEAR, NEAR + 1):
-            columns = (np.arange(COLUMNS) + (shift + step)[:, None]) % COLUMNS
-            clear = ~(faint | database.faint[rows, columns])
-            unlike = np.bitwise_count((bits ^ database.bits[rows, columns]) & clear).sum(axis=(1, 2), dtype=np.int64)
-            counted = np.bitwise_count(clear).sum(axis=(1, 2), dtype=np.int64)
-            best = np.minimum(best, np.divide(unlike, counted, out=np.ones(len(shifts)), where=counted > 0))
+    for shift, new in zip(near.T, (np.diff(near, axis=1, prepend=-1) > 0).T, strict=True):
+        columns = (np.arange(COLUMNS) + shift[new, None]) % COLUMNS
+        there = new.nonzero()[0][:, None], columns
+        clear = ~(faint | database.faint[there])
+        unlike = np.bitwise_count((bits ^ database.bits[there]) & clear).sum(axis=(1, 2), dtype=np.int64)
+        counted = np.bitwise_count(clear).sum(axis=(1, 2), dtype=np.int64)
+        found = np.divide(unlike, counted, out=np.ones(len(columns)), where=counted > 0)
+        best[new] = np.minimum(best[new], found)
     return best
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int, Int32
+from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
 from sglpr_jax.labels import CATEGORIES
 from sglpr_jax.methods.method import HandcraftedMethod
@@ -99,11 +99,17 @@ def _ranks() -> Int[np.ndarray, "20"]:
     return ranks
 
 
-class _Scans(NamedTuple):
-    """What is compared of n scans: one stays, by its cells; the other is moved, by the centres of its fine cells."""
+class _Still(NamedTuple):
+    """What is compared of the n scans that stay as they are."""
 
     outlines: Float32[np.ndarray, "n 2 360"]
     cells: Int32[np.ndarray, "n rings 360"]
+
+
+class _Moved(NamedTuple):
+    """What is compared of the n scans that are laid onto the others: the centres of their fine cells."""
+
+    outlines: Float32[np.ndarray, "n 2 360"]
     centres: Float32[np.ndarray, "n 2 occupied"]
     ranks: Int32[np.ndarray, "n occupied"]
 
@@ -116,23 +122,37 @@ def ssc_distance(
     The scan of the database is turned and moved onto the query (`outline_alignment`). The published method then divides
     its points into cells anew; here, where no points are kept, the centres of its occupied fine cells.
     """
-    compare = functools.partial(_compare, grid)
-    return in_blocks(compare, queries, database, block=BLOCK, prepare=functools.partial(_prepare, grid))
+    compare, still, moved = (functools.partial(function, grid) for function in (_compare, _still, _moved))
+    return in_blocks(compare, queries, database, block=BLOCK, prepare=still, prepare_database=moved, threads=None)
 
 
-def _prepare(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Scans:
+def _still(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Still:
+    fine, outlines = _unpacked(grid, rows)
+    compared = fine[:, grid.inner : grid.inner + FINER * grid.rings]
+    cells = compared.reshape(-1, grid.rings, FINER, SECTORS, FINER).max(axis=(2, 4))
+    return _Still(outlines, cells.astype(np.int32))
+
+
+def _moved(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Moved:
+    fine, outlines = _unpacked(grid, rows)
+    return _Moved(outlines, *_occupied(grid, fine))
+
+
+def _unpacked(
+    grid: PolarGrid, rows: Float32[np.ndarray, "n d"]
+) -> tuple[UInt8[np.ndarray, "n rings sectors"], Float32[np.ndarray, "n 2 360"]]:
+    """Return the rank of every fine cell, and the outlines."""
     if rows.shape[1] != grid.numbers:
         raise ValueError(f"expected rows of {grid.numbers} numbers ({grid.rings} rings), found {rows.shape[1]}")
     packed, outlines = rows[:, : -2 * SECTORS].astype(np.int32), rows[:, -2 * SECTORS :].reshape(-1, 2, SECTORS)
-    fine = (packed[..., None] >> RANK_BITS * np.arange(PACKED)) % (1 << RANK_BITS)
-    fine = fine.reshape(-1, grid.fine_rings, FINE_SECTORS)
-    compared = fine[:, grid.inner : grid.inner + FINER * grid.rings]
-    cells = compared.reshape(-1, grid.rings, FINER, SECTORS, FINER).max(axis=(2, 4))
-    return _Scans(outlines, cells.astype(np.int32), *_occupied(grid, fine))
+    fine = np.empty((*packed.shape, PACKED), np.uint8)
+    for i in range(PACKED):
+        fine[..., i] = packed >> RANK_BITS * i & (1 << RANK_BITS) - 1
+    return fine.reshape(-1, grid.fine_rings, FINE_SECTORS), outlines
 
 
 def _occupied(
-    grid: PolarGrid, fine: Int[np.ndarray, "n rings sectors"]
+    grid: PolarGrid, fine: UInt8[np.ndarray, "n rings sectors"]
 ) -> tuple[Float32[np.ndarray, "n 2 occupied"], Int32[np.ndarray, "n occupied"]]:
     """Return x and y of the middle of every occupied cell, and its rank; filled up with ranks of 0."""
     scan, ring, sector = np.nonzero(fine)
@@ -147,7 +167,7 @@ def _occupied(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _compare(grid: PolarGrid, queries: _Scans, database: _Scans) -> Float[Array, "q n"]:
+def _compare(grid: PolarGrid, queries: _Still, database: _Moved) -> Float[Array, "q n"]:
     """Return the distances of all pairs, one at a time: it stays in the cache, and takes the steps that it needs."""
 
     def distance(query, other):
