@@ -91,7 +91,7 @@ def _peak(surface: Float[Array, "rows columns"], rolled: tuple[int, int]) -> Flo
     window = jnp.where(inside[0][:, None] & inside[1][None], surface[row[:, None], column[None]], 0.0)
     total = window.sum()
     mean = jnp.stack([window.sum(axis=1) @ steps, window.sum(axis=0) @ steps]) / jnp.where(total == 0, 1.0, total)
-    return shape // 2 - place - mean
+    return jnp.asarray(shape // 2) - place - mean
 
 
 def _argmax(values: Float[Array, "rows columns"]) -> Int[Array, ""]:

@@ -87,11 +87,16 @@ def _as_products(
 def _saves_multiplications(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int]
 ) -> bool:
-    """On a GPU cuDNN chooses for itself, and bfloat16 has no digits to spare for sums of columns."""
-    channels = x.shape[-1]
-    suits = len(kernel) == 3 and strides[1] == 1 and x.shape[2] % COLUMNS_AT_ONCE == 0
-    cheaper = channels >= MANY_CHANNELS and x.size // channels >= MANY_PIXELS * channels
-    return suits and cheaper and x.dtype == jnp.float32 and jax.default_backend() == "cpu"
+    """On a GPU cuDNN chooses for itself, and bfloat16 has no digits to spare for sums of columns.
+
+    An exported program, for any number of images and any machine, leaves it to XLA.
+    """
+    images, height, width, channels = x.shape
+    suits = len(kernel) == 3 and strides[1] == 1 and width % COLUMNS_AT_ONCE == 0
+    if not suits or channels < MANY_CHANNELS or not isinstance(images, int):
+        return False
+    enough = images * height * width >= MANY_PIXELS * channels
+    return enough and x.dtype == jnp.float32 and jax.default_backend() == "cpu"
 
 
 def as_product(

@@ -122,8 +122,9 @@ def ssc_distance(
     The scan of the database is turned and moved onto the query (`outline_alignment`). The published method then divides
     its points into cells anew; here, where no points are kept, the centres of its occupied fine cells.
     """
-    compare, still, moved = (functools.partial(function, grid) for function in (_compare, _still, _moved))
-    return in_blocks(compare, queries, database, block=BLOCK, prepare=still, prepare_database=moved, threads=None)
+    compare = functools.partial(_compare, grid)
+    ways = {"prepare": functools.partial(_still, grid), "prepare_database": functools.partial(_moved, grid)}
+    return in_blocks(compare, queries, database, block=BLOCK, threads=None, **ways)
 
 
 def _still(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Still:
