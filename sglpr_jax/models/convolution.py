@@ -1,6 +1,7 @@
 """The convolution of the backbones and heads: XLA's going forward, products going backward.
 
-Of few channels it is a product going forward too, and of many, on a CPU, six products with half of the multiplications.
+Of few channels it is a product going forward too, and of many, on a CPU, Winograd's, of a quarter of the
+multiplications.
 
 On a CPU XLA computes the gradient of a kernel by a slow general loop where the step runs in chunks (27 to 70 times the
 time of the products), and elsewhere it takes up to 1.8 times as long as they do.
@@ -16,15 +17,15 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.layers import product, weight
 from sglpr_jax.models.winograd import AT_ONCE as COLUMNS_AT_ONCE
-from sglpr_jax.models.winograd import four_columns_at_once
+from sglpr_jax.models.winograd import winograd
 
 FEW_INPUTS = 16
 """Numbers of a column of pixels under the kernel up to which a product takes half the time of XLA's convolution."""
 AT_ONCE = 4
 """Columns of the result that one row of such a product gives."""
-MANY_CHANNELS = 96
-"""From here on sums of columns cost less than the multiplications that they spare."""
-MANY_PIXELS = 6
+MANY_CHANNELS = 32
+"""Of the image and of the result: from here on sums of pixels cost less than the multiplications that they spare."""
+MANY_PIXELS = 2
 """For each channel: below it sums of the kernel cost more than that."""
 
 
@@ -80,20 +81,19 @@ def _as_products(
 ) -> Float[Array, "b _ _ f"]:
     if not _saves_multiplications(x, kernel, strides):
         return as_product(x, kernel, strides, circular)
-    x = jnp.pad(_columns_around(x, 1, circular), ((0, 0), (1, 1), (0, 0), (0, 0)))
-    return four_columns_at_once(x, kernel, strides[0])
+    return winograd(x, kernel, strides[0], circular)
 
 
 def _saves_multiplications(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int]
 ) -> bool:
-    """On a GPU cuDNN chooses for itself, and bfloat16 has no digits to spare for sums of columns.
+    """On a GPU cuDNN chooses for itself, and bfloat16 has no digits to spare for sums of pixels.
 
     An exported program, for any number of images and any machine, leaves it to XLA.
     """
     images, height, width, channels = x.shape
     suits = len(kernel) == 3 and strides[1] == 1 and width % COLUMNS_AT_ONCE == 0
-    if not suits or channels < MANY_CHANNELS or not isinstance(images, int):
+    if not suits or min(kernel.shape[2:]) < MANY_CHANNELS or not isinstance(images, int):
         return False
     enough = images * height * width >= MANY_PIXELS * channels
     return enough and x.dtype == jnp.float32 and jax.default_backend() == "cpu"

@@ -1,12 +1,12 @@
-"""A 3 x 3 convolution by half of the multiplications: Winograd's minimal filtering along the columns, F(4, 3).
+"""A 3 x 3 convolution by a quarter of the multiplications: Winograd's minimal filtering, F(4, 3), along both axes.
 
-Six sums of six neighbouring columns are multiplied with six sums of the kernel's three columns, and four sums of the
-products are four columns of the result (Lavin and Gray 2016). Along the rows nothing changes, so that these may have a
-stride. Its derivative needs as few multiplications.
+Six sums of six neighbouring pixels are multiplied with six sums of the kernel's three, and four sums of the products
+are four pixels of the result (Lavin and Gray 2016). Rows that have a stride, or whose number is no multiple of four, go
+without: half of the multiplications. The derivative needs as few.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,10 @@ from jaxtyping import Array, Float
 from sglpr_jax.models.layers import product
 
 AT_ONCE = 4
-"""Columns of the result from one set of products."""
-OF_COLUMNS = np.array(
+"""Pixels of the result, along an axis, from one set of products."""
+BEYOND = 2
+"""Pixels after the border that fill the last block of four."""
+OF_PIXELS = np.array(
     [
         [4, 0, -5, 0, 1, 0],
         [0, -4, -4, 1, 1, 0],
@@ -32,32 +34,77 @@ OF_KERNEL = np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4
 OF_PRODUCTS = np.array([[1, 1, 1, 1, 1, 0], [0, 1, -1, 2, -2, 0], [0, 1, 1, 4, 4, 0], [0, 1, -1, 8, -8, 1]], np.float32)
 
 
-def four_columns_at_once(
-    x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"], stride: int
-) -> Float[Array, "b _ _ f"]:
-    """The convolution of an image that has its border, one pixel each way; `stride` is along the rows.
+def winograd(
+    x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"], stride: int, circular: bool
+) -> Float[Array, "b _ {x.shape[2]} f"]:
+    """The convolution of an image that gets a border of one pixel; `stride` is along the rows, w a multiple of 4."""
+    beside = (1, 1 + BEYOND)
+    if circular:
+        wide = jnp.concatenate([x[:, :, -1:], x, x[:, :, : 1 + BEYOND]], axis=2)
+    else:
+        wide = jnp.pad(x, ((0, 0), (0, 0), beside, (0, 0)))
+    if stride > 1 or x.shape[1] % AT_ONCE:
+        return _along_columns(wide, kernel, stride)
+    return _along_both(jnp.pad(wide, ((0, 0), beside, (0, 0), (0, 0))), kernel)
 
-    w - 2, the columns of the result, is a multiple of 4.
+
+def _along_both(x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"]) -> Float[Array, "b h-4 w-4 f"]:
+    b, h, w, c = x.shape
+    f = kernel.shape[-1]
+    sums = _sums_of_kernel(np.kron(OF_KERNEL, OF_KERNEL), kernel).reshape(len(OF_KERNEL), -1, c, f)
+
+    def along_columns(rows: Float[Array, "b m i"], kernels: Float[Array, "6 c f"]) -> Float[Array, "b m _"]:
+        return four_at_once(rows.reshape(-1, w, c), _each(kernels), _of_pixels).reshape(*rows.shape[:2], -1)
+
+    found = four_at_once(x.reshape(b, h, w * c), _each(sums), along_columns)
+    return found.reshape(*found.shape[:2], -1, f)
+
+
+def _along_columns(
+    x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"], stride: int
+) -> Float[Array, "b _ w-4 f"]:
+    b, h, w, c = x.shape
+    f = kernel.shape[-1]
+    sums = _sums_of_kernel(OF_KERNEL, kernel.swapaxes(0, 1)).reshape(len(OF_KERNEL), 3 * c, f)
+
+    def three_rows(columns: Float[Array, "n m c"], kernel: Float[Array, "3*c f"]) -> Float[Array, "_ m f"]:
+        rows = jnp.pad(columns.reshape(b, h, -1), ((0, 0), (1, 1), (0, 0)))
+        above = [jax.lax.slice_in_dim(rows, i, i + h, stride, axis=1).reshape(-1, c) for i in range(3)]
+        return product(jnp.concatenate(above, axis=-1), kernel).reshape(-1, columns.shape[1], f)
+
+    found = four_at_once(x.reshape(b * h, w, c), _each(sums), three_rows)
+    return found.reshape(b, -1, *found.shape[1:])
+
+
+def four_at_once(
+    x: Float[Array, "a n i"], kernels: Sequence[Array], multiply: Callable[[Array, Array], Float[Array, "b m j"]]
+) -> Float[Array, "b n-4 j"]:
+    """Winograd's filtering along the middle axis, n a multiple of 4; `multiply` is what else a kernel does.
+
+    The last two places are there to fill a block: the gradient of whole blocks is quicker than that of slices.
     """
-    b, _, w, c = x.shape
-    met = w - len(OF_COLUMNS) + 1
-    columns = [jax.lax.slice_in_dim(x, j, j + met, AT_ONCE, axis=2) for j in range(len(OF_COLUMNS))]
-    kernels = jnp.einsum("ij,rjcf->ircf", OF_KERNEL, kernel, precision=jax.lax.Precision.HIGHEST)
-    products = []
-    for weights, by in zip(OF_COLUMNS, kernels.reshape(len(OF_COLUMNS), 3 * c, -1), strict=True):
-        rows = _three_rows(_weighted(weights, columns), stride)
-        products.append(product(rows.reshape(-1, 3 * c), by))
-    results = jnp.stack([_weighted(weights, products) for weights in OF_PRODUCTS], axis=1)
-    return results.reshape(b, -1, w - 2, kernel.shape[-1])
+    a, n, i = x.shape
+    blocks = x.reshape(a, n // AT_ONCE, AT_ONCE * i)
+    sixes = [*jax.lax.split(blocks[:, :-1], [i] * AT_ONCE, 2), *jax.lax.split(blocks[:, 1:, : 2 * i], [i] * 2, 2)]
+    products = [multiply(_weighted(by, sixes), of_one) for by, of_one in zip(OF_PIXELS, kernels, strict=True)]
+    results = jnp.concatenate([_weighted(by, products) for by in OF_PRODUCTS], axis=-1)
+    return results.reshape(len(results), n - AT_ONCE, -1)
+
+
+def _of_pixels(x: Float[Array, "a m c"], matrix: Float[Array, "c f"]) -> Float[Array, "a m f"]:
+    return product(x.reshape(-1, x.shape[-1]), matrix).reshape(*x.shape[:2], -1)
+
+
+def _sums_of_kernel(by: Float[np.ndarray, "s k"], kernel: Float[Array, "3 3 c f"]) -> Float[Array, "s _"]:
+    return jnp.matmul(by, kernel.reshape(by.shape[1], -1), precision=jax.lax.Precision.HIGHEST)
+
+
+def _each(kernels: Float[Array, "n *dims"]) -> list[Float[Array, "*dims"]]:
+    """The kernels as arrays of their own; of an index the gradient would be an array of zeros for each of them."""
+    return [of_one[0] for of_one in jax.lax.split(kernels, [1] * len(kernels), 0)]
 
 
 def _weighted(weights: Float[np.ndarray, " n"], parts: Sequence[Array]) -> Array:
     """The weighted sum; weights of 0 and 1 cost nothing."""
     terms = [part if by == 1 else by * part for by, part in zip(weights, parts, strict=True) if by]
     return functools.reduce(jnp.add, terms)
-
-
-def _three_rows(x: Float[Array, "b h w c"], stride: int) -> Float[Array, "b _ w 3*c"]:
-    """Rows above each other, as channels."""
-    met = x.shape[1] - 2
-    return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + met, stride, axis=1) for i in range(3)], axis=-1)
