@@ -1,47 +1,18 @@
-"""Are two scans of one place, and how do they lie? The correlation of their images seen from above, over all turns.
+"""How the images of two scans lie to each other: the pose of `pose_search`, refined, with covariance and correlation.
 
-The square root of the query's image is turned, filtered and shifted over the match's; where the two agree best is the
-pose. First on cells merged by `coarse`, over the whole circle; then about the best peak on whole cells, where a Fourier
-series tells what lies between cells, and a parabola between turns. The filter leaves what is as wide as a wall, a pole
-or a trunk: a blur, less a wider blur, without which one street looks like any other.
+About the best peak of the exhaustive search, the correlation is taken on whole cells. A Fourier series gives its values
+between cells, and a parabola those between rotations.
 """
 
-import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, Num
-from scipy.fft import next_fast_len
+from jaxtyping import Array, Complex, Float, Num
 
-from sglpr_jax.bev import centre_crop, rotate_image
-from sglpr_jax.data.density_grid import RESOLUTION_M
-
-
-@dataclasses.dataclass(frozen=True)
-class VerificationConfig:
-    """How two images are laid over each other."""
-
-    resolution_m: float = RESOLUTION_M
-    """The edge of an image's cell."""
-    reach_m: float = 25.0
-    """Cells farther from the sensor do not count, so that an image looks alike however it is turned."""
-    max_shift_m: float = 12.0
-    """Scans of one place are no farther apart, along x or y."""
-    turns: int = 72
-    """Turns that the first search tries, over the whole circle."""
-    coarse: int = 2
-    """So many cells a side are one in the first search."""
-    blur_m: float = 0.4
-    wide_blur_m: float = 1.0
-    """Standard deviations of the two blurs, the second of which is taken away."""
-    refine_deg: float = 3.0
-    """The second search turns so far to both sides, in 8 steps."""
-    second_m: float = 3.0
-    second_deg: float = 15.0
-    """A second peak is farther than this from the best one, in metres or in degrees."""
+from sglpr_jax.loops.pose_search import DEFAULT, Peak, VerificationConfig, prepared, rotations, search, spectrum, twice
 
 
 class Alignment(NamedTuple):
@@ -64,7 +35,6 @@ class Alignment(NamedTuple):
         return Alignment(*(value[k] for value in self))
 
 
-DEFAULT = VerificationConfig()
 TURN_STEPS = 4
 """Steps of the second search to each side in angle."""
 SHIFT_STEPS = 5
@@ -85,9 +55,22 @@ def align(
     Works under jit and vmap; of one query with several matches (`align_all`) the query is turned once. Raises
     ValueError for images that are not square or have an odd number of cells.
     """
-    query, match = _prepared(query, config), _prepared(match, config)
-    start, second = _whole_circle(_merged(query, config.coarse), _merged(match, config.coarse), config)
-    pose, correlation, curvature = _refined(query, match, start, config)
+    peak = jax.tree.map(lambda values: values[0], search(query, jnp.asarray(match)[None], config=config))
+    return refined(query, match, peak, config=config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def refined(
+    query: Num[Array | np.ndarray, "h w"],
+    match: Num[Array | np.ndarray, "h w"],
+    peak: Peak,
+    *,
+    config: VerificationConfig = DEFAULT,
+) -> Alignment:
+    """The alignment at the peak that `search` has found, on whole cells. Errors are those of `search`."""
+    second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
+    query, match = prepared(query, config), prepared(match, config)
+    pose, correlation, curvature = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     occupied = jnp.minimum((query > 0).sum(), (match > 0).sum())
     blurred_cells = 1 + 2 * np.pi * (config.blur_m / config.resolution_m) ** 2
     noise = 2 * (1 - correlation) / jnp.maximum(occupied / blurred_cells, 1)
@@ -103,91 +86,9 @@ def align_all(
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
     """`align` one query with each of several matches; every field has a leading axis of k."""
-    return jax.vmap(lambda match: align(query, match, config=config))(jnp.asarray(matches))
-
-
-def _prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
-    """The square root of the counts within reach, zero around them; m is a multiple of two merged cells."""
-    if image.shape[0] != image.shape[1] or image.shape[0] % 2:
-        raise ValueError(f"expected a square image of an even number of cells, found {image.shape}")
-    size = min(2 * _cells(config.reach_m, config.resolution_m), image.shape[0])
-    size = max(size - size % (2 * config.coarse), 2 * config.coarse)
-    axis = (np.arange(size) - (size - 1) / 2) * config.resolution_m
-    inside = np.hypot(axis[:, None], axis[None]) < min(config.reach_m, size / 2 * config.resolution_m)
-    counts = centre_crop(jnp.asarray(image, jnp.float32), height=size, width=size)
-    return jnp.where(inside, jnp.sqrt(jnp.maximum(counts, 0)), 0)
-
-
-def _cells(metres: float, cell_m: float) -> int:
-    return int(np.ceil(metres / cell_m))
-
-
-def _merged(image: Float[Array, "m m"], cells: int) -> Float[Array, "k k"]:
-    size = image.shape[0] // cells
-    return image.reshape(size, cells, size, cells).mean((1, 3))
-
-
-def _whole_circle(
-    query: Float[Array, "m m"], match: Float[Array, "m m"], config: VerificationConfig
-) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
-    """The best of all turns and shifts, as (x, y, yaw), and the second peak as a share of the best."""
-    cell_m = config.resolution_m * config.coarse
-    reach = _cells(config.max_shift_m, cell_m)
-    angles = np.arange(config.turns, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
-    product, size = _product(_turned(query, jnp.asarray(angles)), match, cell_m, config)
-    shifts = jnp.roll(jnp.fft.irfft2(product, (size, size)), (reach, reach), (-2, -1))
-    found = shifts[:, : 2 * reach + 1, : 2 * reach + 1]
-    turn, down, right = jnp.unravel_index(jnp.argmax(found), found.shape)
-    best = found[turn, down, right]
-    elsewhere = jnp.where(_near(found.shape, (turn, down, right), cell_m, config), 0.0, found)
-    start = jnp.stack([(right - reach) * cell_m, (reach - down) * cell_m, jnp.asarray(angles)[turn]])
-    second = jnp.maximum(jnp.max(elsewhere), 0) / jnp.maximum(best, 1e-6)
-    return start, jnp.where(best > 1e-3, second, 1.0)  # where nothing fits, any pose fits as well
-
-
-def _turned(image: Float[Array, "m m"], angles: Float[Array, " t"]) -> Float[Array, "t m m"]:
-    return rotate_image(jnp.broadcast_to(image, (len(angles), *image.shape)), angles)
-
-
-def _product(
-    queries: Float[Array, "t m m"], match: Float[Array, "m m"], cell_m: float, config: VerificationConfig
-) -> tuple[Complex[Array, "t s f"], int]:
-    """The Fourier transform of the correlation of each query with the match, and s, the size of that.
-
-    It is so large that no shift up to the greatest one wraps around.
-    """
-    size = _fast_size(match.shape[0] + _cells(config.max_shift_m, cell_m))
-    along, across = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
-    frequency = 2 * (np.pi / cell_m) ** 2 * (along**2 + across**2)
-    band = np.exp(-frequency * config.blur_m**2) - np.exp(-frequency * config.wide_blur_m**2)
-
-    def spectrum(images: Float[Array, "t m m"]) -> Complex[Array, "t s f"]:
-        filtered = jnp.fft.rfft2(images, (size, size)) * band[None].astype(np.float32)
-        power = jnp.sum(jnp.abs(filtered) ** 2 * _twice(size)[None], axis=(-2, -1), keepdims=True) / size**2
-        return filtered / jnp.sqrt(jnp.maximum(power, 1e-9))
-
-    return spectrum(match[None]) * jnp.conj(spectrum(queries)), size
-
-
-def _fast_size(least: int) -> int:
-    """A size, no smaller, of which Fourier transforms are fast."""
-    size: Any = next_fast_len(least, real=True)  # whose types say None
-    return int(size)
-
-
-def _twice(size: int) -> Float[np.ndarray, "1 f"]:
-    """How often each column of a real image's half spectrum stands in the whole one."""
-    return np.where(np.isin(np.arange(size // 2 + 1), (0, size / 2)), 1, 2).astype(np.float32)[None]
-
-
-def _near(
-    shape: tuple[int, ...], peak: tuple[Int[Array, ""], ...], cell_m: float, config: VerificationConfig
-) -> Bool[Array, "t d r"]:
-    """Which values of the first search belong to its best peak."""
-    apart = [jnp.abs(jnp.arange(n) - at) for n, at in zip(shape, peak, strict=True)]
-    turns = jnp.minimum(apart[0], shape[0] - apart[0]) * (360 / shape[0]) <= config.second_deg
-    down, right = (cells * cell_m <= config.second_m for cells in apart[1:])
-    return turns[:, None, None] & down[None, :, None] & right[None, None, :]
+    matches = jnp.asarray(matches)
+    peaks = search(query, matches, config=config)
+    return jax.lax.map(lambda one: refined(query, *one, config=config), (matches, peaks))
 
 
 def _refined(
@@ -196,11 +97,12 @@ def _refined(
     """The peak near the pose `start`: (x, y, yaw), the correlation there, and its curvature, minus the Hessian."""
     cell_m, step_rad = config.resolution_m, np.float32(np.radians(config.refine_deg) / TURN_STEPS)
     yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * step_rad
-    product, size = _product(_turned(query, yaws), match, cell_m, config)
+    product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotations(query, yaws), cell_m, config))
+    size = product.shape[1]
     steps = np.arange(-SHIFT_STEPS, SHIFT_STEPS + 1, dtype=np.float32) * (cell_m / 2)
     xs, ys = start[0] + steps, start[1] + steps
     rows = _waves(-ys / cell_m, np.fft.fftfreq(size))
-    columns = _waves(xs / cell_m, np.fft.rfftfreq(size)) * _twice(size)
+    columns = _waves(xs / cell_m, np.fft.rfftfreq(size)) * twice(size)
     volume = jnp.einsum("tij,yi,xj->xyt", product, rows, columns).real / size**2
     peak = jnp.unravel_index(jnp.argmax(volume), volume.shape)
     middle = [jnp.clip(at, 1, n - 2) for at, n in zip(peak, volume.shape, strict=True)]

@@ -1,0 +1,88 @@
+"""How the sensor moved from frame to frame: by odometry or, without it, by registering each scan with a keyframe.
+
+Evidence of repetition needs to know which earlier scans the query may resemble because they show the same place. The
+motion is good enough for that over some tens of metres; it is not an odometry. Where the surroundings do not tell how
+the sensor moved, as in a tunnel, the motion is unknown: a new segment begins.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionConfig:
+    """When a registration with the keyframe is trusted, and when a frame becomes the next keyframe."""
+
+    min_correlation: float = 0.4
+    """Minimum correlation of the two images."""
+    max_second: float = 0.8
+    """Maximum ratio of the second peak to the best one."""
+    keyframe_m: float = 3.0
+    keyframe_deg: float = 20.0
+    """A frame farther from the keyframe than this, in metres or degrees, is the next keyframe."""
+    standing_s: float = 5.0
+    """A keyframe accounts for at most this much time, in seconds: a vehicle that stands sees nothing new."""
+
+
+class Motion:
+    """Planar poses of all frames so far, in order."""
+
+    def __init__(self, config: MotionConfig = MotionConfig()):
+        self.config = config
+        self.poses: list[Float[np.ndarray, "4 4"]] = []
+        """Pose of each frame in the frame of its segment."""
+        self.segments: list[int] = []
+        """Frames of one segment have a known relative pose."""
+        self.travelled: list[float] = []
+        """Distance from keyframe to keyframe, in metres."""
+        self.clock: list[float] = []
+        """Seconds, without those in which the sensor stood still."""
+        self.keyframe = 0
+        self._times: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def add(
+        self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None
+    ) -> None:
+        """Add a frame at `time` (seconds), by its `pose` from odometry or its peak over the keyframe's image."""
+        n, segment = len(self), self.segments[-1] if self.segments else 0
+        if pose is None and link is not None and self._is_trusted(link):
+            pose = self.poses[self.keyframe] @ transform(float(link.x), float(link.y), float(link.yaw))
+        elif pose is None:
+            pose, segment = np.eye(4), segment + 1
+        key = self.keyframe
+        moved, known = (0.0, False) if not n else (self._moved(key, pose), segment == self.segments[key])
+        passed = min(time - self._times[key], self.config.standing_s) if n and known else 0.0
+        if n and not known:
+            passed = self.clock[-1] - self.clock[key] + time - self._times[-1]
+        self.clock.append(self.clock[key] + passed if n else 0.0)
+        self.travelled.append(self.travelled[key] + moved if n and known else self.travelled[-1] if n else 0.0)
+        self.poses.append(pose)
+        self.segments.append(segment)
+        self._times.append(time)
+        if not n or not known or self._is_next_keyframe(key, pose):
+            self.keyframe = n
+
+    def from_frame(self, frame: int, rows: np.ndarray) -> tuple[Float[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
+        """The poses of `frame` in the frames of `rows`, and which of them are known."""
+        known = np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
+        poses = np.stack([self.poses[row] for row in rows]) if len(rows) else np.zeros((0, 4, 4))
+        return inverse(poses) @ self.poses[frame], known
+
+    def _is_trusted(self, link: Peak) -> bool:
+        best = float(link.correlation)
+        return best >= self.config.min_correlation and float(link.second) <= self.config.max_second * best
+
+    def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> float:
+        return float(np.linalg.norm(pose[:2, 3] - self.poses[key][:2, 3]))
+
+    def _is_next_keyframe(self, key: int, pose: Float[np.ndarray, "4 4"]) -> bool:
+        rotation = abs(float(yaw_of(inverse(self.poses[key]) @ pose)))
+        return self._moved(key, pose) > self.config.keyframe_m or rotation > np.radians(self.config.keyframe_deg)
