@@ -9,6 +9,7 @@ The odometry is that of the true poses, made 1 % too long and turned by half a d
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -27,8 +28,8 @@ from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
 from sglpr_jax.loops.candidates import Candidate
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.loops.find import settled
-from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.joint import settled
+from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.optimization import optimized, trajectory_error
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.reliability import Bin, reliability_of
@@ -71,13 +72,14 @@ class Simulated:
             poses = drive.poses.world_from_lidar
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(drive, params, odometry, f"town {town}")
-            kept, refused = settled(drive, detector.supported, odometry, DetectorConfig(), registered=self.registered)
-            sure[f"town {town}"] = report(f"town {town}", drive, poses, detector, kept, refused, seconds)
+            kept, rejected = settled(drive, detector.supported, odometry, DetectorConfig(), registered=self.registered)
+            rejected = [*detector.rejected, *rejected]
+            sure[f"town {town}"] = report(f"town {town}", drive, poses, detector, kept, rejected, seconds)
             if self.optimized and odometry is not None:
                 found = optimized(odometry, tuple(kept))
                 before, after = (trajectory_error(each, drive.positions) for each in (odometry, found.poses))
                 print(f"  trajectory: off by {before:.2f} m before, {after:.2f} m after, ", end="")
-                print(f"{found.believed.sum()} of {len(kept)} loops believed")
+                print(found)
         Console().print(sure_table(sure))
 
 
@@ -101,8 +103,9 @@ class Images:
             poses[:, :3] = read_poses(self.data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(recording, params, odometry, name)
-            kept, refused = settled(recording, detector.supported, odometry, DetectorConfig(), registered=False)
-            sure[name] = report(name, recording, poses, detector, kept, refused, seconds)
+            kept, rejected = settled(recording, detector.supported, odometry, DetectorConfig(), registered=False)
+            rejected = [*detector.rejected, *rejected]
+            sure[name] = report(name, recording, poses, detector, kept, rejected, seconds)
             log_odds = detector.model.log_odds(Evidence.stack([one.evidence for one in detector.candidates]))
             agreed = {(loop.query, loop.match) for loop in kept}
             bonus = [1000.0 * ((one.query, one.match) in agreed) for one in detector.candidates]
@@ -185,7 +188,7 @@ def report(
     poses: Float[np.ndarray, "n 4 4"],
     detector: LoopDetector,
     kept: Sequence[Loop],
-    refused: Sequence[Loop],
+    rejected: Sequence[Rejected],
     seconds: Float[np.ndarray, " n"],
 ) -> Bin | None:
     """Print precision, recall, pose errors, calibration and time; return what `calibration` does."""
@@ -200,8 +203,9 @@ def report(
         print(f"{np.sum((apart > LOOP_M) & (apart <= OTHER_M))} in between; ", end="")
         print(f"recall of {revisited.sum()} revisits < {REVISIT_M:g} m: {recall:.4f}")
     pose_errors("poses of kept loops", kept, poses)
-    refused_right = distances(refused, poses) <= LOOP_M
-    print(f"  refused afterwards: {len(refused)}, of which {refused_right.sum()} right")
+    for reason, count in Counter(one.reason for one in rejected).items():
+        right = distances([one.loop for one in rejected if one.reason == reason], poses) <= LOOP_M
+        print(f"  {reason}: {count} rejected, of which {right.sum()} right")
     pairs = [planar_loop(c.query, c.match, c.alignment, probability=0.0) for c in detector.candidates]
     for low, high in ((0, REVISIT_M), (REVISIT_M, LOOP_M)):
         near = (distances(pairs, poses) >= low) & (distances(pairs, poses) < high)

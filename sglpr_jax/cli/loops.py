@@ -10,7 +10,7 @@ import tyro
 from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.choices import MIN_PROBABILITY, OdometryFormat
+from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
@@ -45,6 +45,11 @@ class LoopsCommand:
     itself. Without it, loops are judged by the scans alone."""
     odometry_format: OdometryFormat = "auto"
     """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
+    drift_percent: float = DRIFT_PERCENT
+    """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
+    more than four standard deviations are rejected."""
+    drift_deg_per_100m: float = DRIFT_DEG_PER_100M
+    """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
     weights: str = DEFAULT_WEIGHTS
     """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
@@ -62,10 +67,12 @@ class LoopsCommand:
 def loops_of_recording(command: LoopsCommand) -> int:
     """Do what the command says; returns the exit status."""
     from sglpr_jax.loops.detector import DetectorConfig
+    from sglpr_jax.loops.drift import DriftModel
     from sglpr_jax.loops.unfinished import alone  # these bring JAX and more, which --help does not need
 
     _check(command)
-    config = DetectorConfig(min_probability=command.min_probability)
+    drift = DriftModel(command.drift_percent / 100, command.drift_deg_per_100m / 100)
+    config = DetectorConfig(min_probability=command.min_probability, drift=drift)
     with alone(command.out / UNFINISHED):
         return _search(command, config)
 
@@ -121,7 +128,7 @@ def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
     paths.append(write_loops_page(found, command.out, optimized=corrected))
     print(found)
     if corrected is not None:
-        print(f"trajectory corrected by {corrected.believed.sum()} of {len(found.loops)} loops")
+        print(corrected)
     print(f"{command.out}: {', '.join(path.name for path in paths)}")
     if not found.whole:
         print("the same command goes on from here", file=sys.stderr)

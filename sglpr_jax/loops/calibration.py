@@ -17,6 +17,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
+from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import align
@@ -111,8 +112,9 @@ class _Places:
 
     def far(self, frame: int) -> Bool[np.ndarray, " n"]:
         """Which frames certainly show another place."""
-        bound = self.config.gate_m + self.config.gate_share * np.abs(self.way - self.way[frame])
-        return self.apart(frame) > bound
+        drift = self.finder.drift
+        drifted = position_deviations(self.positions, frame, drift=drift)
+        return self.apart(frame) > NEGATIVE_M + drift.max_deviation * drifted
 
     def nearest(self, descriptor: Float32[np.ndarray, " d"], among: Bool[np.ndarray, " n"]) -> np.ndarray:
         """The frame of these that looks most like a descriptor; none where there are none."""

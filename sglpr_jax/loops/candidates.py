@@ -16,6 +16,7 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
+from sglpr_jax.loops.drift import DriftModel, position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
@@ -41,9 +42,6 @@ class CandidateConfig:
     """Without odometry, scans so many frames apart are taken for other places."""
     min_cells: int = 20
     """Images of fewer occupied cells, of a sensor that was covered or failed, show no place."""
-    gate_m: float = 20.0
-    gate_share: float = 0.05
-    """With odometry, a candidate is no farther than `gate_m`, and this share of the way since, from where it says."""
 
 
 class Candidate(NamedTuple):
@@ -76,11 +74,12 @@ class CandidateFinder:
         *,
         config: CandidateConfig = CandidateConfig(),
         verification: VerificationConfig = VerificationConfig(),
+        drift: DriftModel = DriftModel(),
     ):
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
-        self.params, self.config, self.verification = params, config, verification
+        self.params, self.config, self.verification, self.drift = params, config, verification, drift
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
@@ -192,15 +191,15 @@ class CandidateFinder:
             raise ValueError(f"expected times that do not go back, found {time} after {self.index.times[-1]}")
 
     def _excluded(self, time: float | None, position: Float[np.ndarray, " 3"] | None) -> Bool[np.ndarray, " n"]:
-        """Which frames are no candidates of the next one: too young, next to empty, or too far off by odometry."""
+        """Frames that are no candidates of the next one: too recent, almost empty, or too far away by odometry."""
         config, known = self.config, self.index.positions
         excluded = self.index.recent(time, seconds=config.exclude_s, frames=config.exclude_frames)
         excluded = excluded | np.array(self.empty, bool)
         if position is not None and known is not None and len(known):
-            steps = np.linalg.norm(np.diff(known, axis=0, append=position[None]), axis=1)
-            way = np.cumsum(steps[::-1])[::-1]  # from each frame to the next one's position
+            drifted = position_deviations(np.concatenate([known, position[None]]), -1, drift=self.drift)[:-1]
             apart = np.linalg.norm(known - position, axis=1)
-            excluded = excluded | (apart > config.gate_m + config.gate_share * way)
+            place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
+            excluded = excluded | (apart > place_m + self.drift.max_deviation * drifted)
         return excluded
 
     def _other_place(self, descriptor: Float32[np.ndarray, " d"], row: int, excluded: Bool[np.ndarray, " n"]) -> float:

@@ -1,6 +1,7 @@
 """Loop closures of a stream: each scan as it comes, and the loops that it closes."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,8 +11,9 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.choices import MIN_PROBABILITY
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
+from sglpr_jax.loops.drift import DriftModel, deviations
 from sglpr_jax.loops.given import given_pose, given_record, given_time
-from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import VerificationConfig
@@ -31,6 +33,8 @@ class DetectorConfig:
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
+    drift: DriftModel = DriftModel()
+    """Drift of the odometry. Loops that contradict it are rejected."""
 
     def __post_init__(self):
         """Raise ValueError for a probability that is none."""
@@ -55,7 +59,9 @@ class LoopDetector:
 
     def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
         """`model` says how probable pairs are (None: that which ships for these weights)."""
-        self.finder = CandidateFinder(params, config=config.candidates, verification=config.verification)
+        self.finder = CandidateFinder(
+            params, config=config.candidates, verification=config.verification, drift=config.drift
+        )
         self.model = default_model(self.finder.index.weights_hash) if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
@@ -64,6 +70,8 @@ class LoopDetector:
         """All that were returned."""
         self.supported: list[Loop] = []
         """All that the frames beside them speak for: those returned, and those that other loops contradict."""
+        self.rejected: list[Rejected] = []
+        """Loops that the frames beside them support, but that contradict the odometry."""
         self.by_scans: set[int] = set()
         """The frames that would have a loop by the scans alone: odometry that most of them contradict is none."""
         self._waiting: list[Loop] = []
@@ -121,7 +129,8 @@ class LoopDetector:
         found = self._supported(agree_in_order(self._waiting, config=rules))
         self.by_scans |= {loop.query for loop in found}
         if odometry is not None:
-            found = self._supported(agree(self._waiting, odometry, mounting=self.finder.mounting, config=rules))
+            found = self._supported(agree(self._waiting, odometry, **self._rules))
+            found = self._within_drift(found, odometry)
         known = {loop.query for loop in self.supported[-rules.neighbours :]}
         self.supported += [loop for loop in found if loop.query not in known]
         done = {loop.query for loop in self.loops[-rules.neighbours :]}
@@ -132,6 +141,20 @@ class LoopDetector:
         enough = pairs.sum(axis=1) >= self.config.consistency.support
         probable = [loop.probability >= self.config.min_probability for loop in self._waiting]
         return [loop for loop, fits in zip(self._waiting, enough & probable, strict=True) if fits]
+
+    def _within_drift(self, loops: list[Loop], odometry: Float[np.ndarray, "n 4 4"]) -> list[Loop]:
+        """The loops that the drift of the odometry explains. The others are rejected."""
+        drift, mounting = self.config.drift, self.finder.mounting
+        fits = deviations(loops, odometry, drift=drift, mounting=mounting) <= drift.max_deviation
+        known = {one.loop.query for one in self.rejected[-self.config.consistency.neighbours :]}
+        against = [loop for loop, fit in zip(loops, fits, strict=True) if not fit and loop.query not in known]
+        self.rejected += [Rejected(loop, "contradicts the odometry") for loop in against]
+        return [loop for loop, fit in zip(loops, fits, strict=True) if fit]
+
+    @property
+    def _rules(self) -> dict[str, Any]:
+        config = self.config
+        return {"mounting": self.finder.mounting, "drift": config.drift, "config": config.consistency}
 
     def _agrees(self, loop: Loop, odometry: Float[np.ndarray, "n 4 4"]) -> bool:
         """Whether it agrees with half of the loops about it or more.
@@ -145,8 +168,7 @@ class LoopDetector:
             if other.query != loop.query
             and abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
         ]
-        rules = {"mounting": self.finder.mounting, "config": self.config.consistency}
-        return not about or bool(agree([loop], odometry, about, **rules).mean() >= 0.5)
+        return not about or bool(agree([loop], odometry, about, **self._rules).mean() >= 0.5)
 
     def _loop(self, one: Candidate, probability: float) -> Loop:
         mountings = dict.fromkeys(("query_mounting", "match_mounting"), self.finder.mounting)

@@ -1,7 +1,8 @@
-"""All loops of a recording: the detector over its scans, then what only the whole drive can tell."""
+"""All loops of a recording: the detector over its scans, then the joint acceptance over the whole drive."""
 
 import dataclasses
 import functools
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,23 +13,18 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.candidates import Candidate, Seen
-from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.drift import DriftModel
 from sglpr_jax.loops.given import check_is, given_poses
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.joint import check_odometry, settled
+from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.probability import LoopModel
-from sglpr_jax.loops.registration import check_installed, register
+from sglpr_jax.loops.registration import check_installed
 from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.embed import OnBadScan
-
-MIN_OVERLAP = 0.6
-"""Registered scans that share less of their space show two places. Measured: docs/decisions/loops.md."""
-FEWEST_AGAINST = 5
-"""Fewer loops than this contradict good odometry now and then."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,31 +33,35 @@ class FoundLoops:
 
     recording: Recording
     frames: int
-    """So many of the recording's scans were looked at: all, unless it was stopped."""
+    """Number of scans that were searched: all, unless the search was stopped."""
     loops: tuple[Loop, ...]
-    refused: tuple[Loop, ...]
-    """Pairs that were called loops first, but agree with too few others, or do not overlap."""
+    rejected: tuple[Rejected, ...]
+    """Pairs that looked like loops to the detector and were rejected, each with its reason."""
     odometry: Float[np.ndarray, "n 4 4"] | None
-    """Of all of the recording's scans."""
+    """Pose of the LiDAR at every scan of the recording."""
     skipped: tuple[str, ...] = ()
-    """The ids of scans that could not be read."""
+    """Ids of scans that cannot be read."""
     candidates: tuple[Candidate, ...] = ()
-    """All pairs that were looked at, loops or not."""
+    """All pairs that were compared, loops or not."""
     model: LoopModel | None = None
-    """What said how probable they are."""
+    """Model of the probabilities."""
     unregistered: int = 0
-    """So many of the loops were to be registered and are not: none, unless it was stopped."""
+    """Number of loops that were not registered because the search was stopped."""
+    drift: DriftModel = DriftModel()
+    """Drift model of the odometry."""
 
     @property
     def whole(self) -> bool:
-        """Whether all was done: not where it was stopped."""
+        """Whether the search was not stopped."""
         return self.frames == len(self.recording) and not self.unregistered
 
     def __str__(self) -> str:
         found = f"{len(self.loops)} loops in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
+        counts = Counter(one.reason for one in self.rejected)
+        why = f" ({', '.join(f'{count} {reason}' for reason, count in counts.most_common())})" if counts else ""
         skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
         left = f", {self.unregistered} not registered" if self.unregistered else ""
-        return f"{found}, {len(self.refused)} refused afterwards{left}{skipped}"
+        return f"{found}, {len(self.rejected)} pairs rejected{why}{left}{skipped}"
 
 
 def find_loops(
@@ -79,19 +79,30 @@ def find_loops(
 ) -> FoundLoops:
     """Find the loops of a recording.
 
-    With `odometry`, a pose for each scan (LiDAR frame, drifting as it may), candidates too far from it are left out,
-    and of the loops found the largest set is kept in which all agree. With `registered` the pose of each loop is made
-    one in 6 degrees of freedom from its full scans (extra `slam`), and loops of little overlap are refused. Poses are
-    of the LiDAR's own frame, as the points have it, however the sensor is mounted.
+    Poses are between LiDAR frames, as the points of the scans have them, however the sensor is mounted. Scans with
+    next to nothing in them have no loops. A warning says if the odometry contradicts most of the loops.
 
-    A scan that cannot be read raises its error or, given `on_bad_scan(id, error)`, is left out; frames keep their
-    numbers. Scans that show next to nothing have no loops. With `kept_in`, a folder, what was seen of the scans is kept
-    there, and a run that was killed goes on from it, if the recording, the odometry, the weights and the settings are
-    the same; the folder stays. Ends early, with what was found, when `should_stop` says so: loops that are not
-    registered then are in the plane, without an overlap. `on_progress` is told how many scans are done. Warns of
-    odometry that most of the loops contradict, as they do in other axes. Raises ValueError for odometry of another
-    length or shape and where no scan can be read or shows something, TypeError for what is no recording, no params or
-    no array, ImportError without the extra, and what reading the scans raises.
+    Arguments:
+      recording: The scans.
+      params: Weights of the model that describes them.
+      odometry: Pose of the LiDAR at each scan, with drift (`config.drift`). Candidates and loops beyond the drift are
+        rejected, and of the others the largest consistent set is kept.
+      model: Model of the probabilities, by default the one shipped for the weights.
+      config: Settings of the detector.
+      registered: Register the full scans of each loop in 6 degrees of freedom (extra `slam`). Loops with little overlap
+        are rejected.
+      on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
+        their numbers. Without it the error is raised.
+      kept_in: Folder for intermediate results. If recording, odometry, weights and settings are the same, a run that
+        was stopped continues from it. The folder stays.
+      should_stop: Ends the search with the loops found so far if it returns True. Loops not registered by then have no
+        overlap.
+      on_progress: Called with the number of searched scans.
+
+    Raises:
+      ValueError: If the odometry has another length or shape, or if no scan can be read or shows anything.
+      TypeError: If an argument is not a recording, parameters or an array.
+      ImportError: If the extra is not installed.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
@@ -130,14 +141,26 @@ def find_loops(
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
     if all(detector.finder.empty) and len(detector) == len(recording):
         raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
-    loops, refused = settled(
+    loops, rejected = settled(
         recording, detector.supported, odometry, config, registered=registered, should_stop=should_stop
     )
+    rejected = [*detector.rejected, *rejected]
     if odometry is not None:
-        _check_odometry(recording.name, detector.by_scans, loops, refused)
-    left = sum(loop.overlap is None for loop in loops) if registered else 0
-    seen = {"skipped": skipped, "candidates": tuple(detector.candidates), "model": detector.model, "unregistered": left}
-    return FoundLoops(recording, len(detector), tuple(loops), tuple(refused), odometry, **seen)
+        check_odometry(
+            recording.name, detector.by_scans, loops, rejected, odometry, config, mounting=recording.mounting
+        )
+    return FoundLoops(
+        recording,
+        len(detector),
+        tuple(loops),
+        tuple(rejected),
+        odometry,
+        skipped=skipped,
+        candidates=tuple(detector.candidates),
+        model=detector.model,
+        unregistered=sum(loop.overlap is None for loop in loops) if registered else 0,
+        drift=config.drift,
+    )
 
 
 def _recall(
@@ -148,7 +171,7 @@ def _recall(
     *,
     missing: bool,
 ) -> None:
-    """Add what an earlier run has seen to a detector; `given` has time and odometry of a frame."""
+    """Add the frames of an earlier run to a detector. `given` returns time and odometry of a frame."""
 
     def add(seen: Seen | None, candidates: list[Candidate]) -> None:
         detector.add_seen(seen, **given(len(detector)), candidates=candidates)
@@ -160,70 +183,3 @@ def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i:
     """Time and odometry of a frame."""
     time = None if recording.times is None else float(recording.times[i])
     return {"time": time, "odometry": None if odometry is None else odometry[i]}
-
-
-def _check_odometry(name: str, by_scans: set[int], loops: list[Loop], refused: list[Loop]) -> None:
-    """Warn where most frames that have a loop by the scans alone have none that agrees with the odometry.
-
-    Drift does not do that, other axes do: the loops left are then few, and `refused` has not those that contradict the
-    odometry from one frame to the next.
-    """
-    agreeing = {loop.query for loop in loops} | {loop.query for loop in refused if loop.overlap is not None}
-    against = by_scans - agreeing
-    if len(against) < FEWEST_AGAINST or 2 * len(against) <= len(by_scans):
-        return
-    warn(
-        f"{name}: expected odometry that most loops agree with, found {len(against)} of {len(by_scans)} loops that are "
-        "probable by the scans against it: check the frame and the axes of its file (x forward, y left, z up, of the "
-        "LiDAR, not of a camera), and whether its poses are those of these scans"
-    )
-
-
-def settled(
-    recording: Recording,
-    loops: list[Loop],
-    odometry: Float[np.ndarray, "n 4 4"] | None,
-    config: DetectorConfig,
-    *,
-    registered: bool,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> tuple[list[Loop], list[Loop]]:
-    """The loops of a whole drive that agree and, where they are registered, overlap; and those that do not.
-
-    Those that are not registered when `should_stop` says so are taken as they are.
-    """
-    kept, refused = _agreeing(loops, odometry, recording.mounting, config)
-    if registered:
-        kept, others = _registered(recording, kept, should_stop)
-        refused = refused + others
-    return kept, refused
-
-
-def _agreeing(
-    loops: list[Loop],
-    odometry: Float[np.ndarray, "n 4 4"] | None,
-    mounting: Mounting | None,
-    config: DetectorConfig,
-) -> tuple[list[Loop], list[Loop]]:
-    """The largest set of loops that all agree, and the others; without odometry all of them."""
-    if odometry is None or len(loops) < 2:
-        return loops, []
-    pairs = agree(loops, odometry, mounting=mounting, config=config.consistency)
-    members = set(largest_consistent_set(pairs).tolist())
-    return [loop for i, loop in enumerate(loops) if i in members], [
-        loop for i, loop in enumerate(loops) if i not in members
-    ]
-
-
-def _registered(
-    recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
-) -> tuple[list[Loop], list[Loop]]:
-    """Loops with poses from full scans, and those whose scans do not overlap; after a stop the others as they are."""
-    kept, refused = [], []
-    for i, loop in enumerate(loops):
-        if should_stop():
-            return [*kept, *loops[i:]], refused
-        found = register(recording.points(loop.query), recording.points(loop.match), initial=loop.match_from_query)
-        values = {"match_from_query": found.match_from_query, "covariance": found.covariance, "overlap": found.overlap}
-        (kept if found.overlap >= MIN_OVERLAP else refused).append(dataclasses.replace(loop, **values))
-    return kept, refused

@@ -25,7 +25,7 @@ def write_found(
     """
     folder = Path(folder)
     odometry = None if found.odometry is None else found.odometry[: found.frames]
-    write_g2o(folder / GRAPH, found.loops, odometry)
+    write_g2o(folder / GRAPH, found.loops, odometry, drift=found.drift)
     write_loops_jsonl(folder / LINES, found.loops, found.recording.ids)
     write_loops_csv(folder / TABLE, found.loops)
     names = [GRAPH, LINES, TABLE]

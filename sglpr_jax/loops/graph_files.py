@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, check_times, numbers_of, read_poses, read_rows
 from sglpr_jax.files import in_short, parse_json, write_text
+from sglpr_jax.loops.drift import DriftModel, step_deviations
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
 from sglpr_jax.poses import are_rotations
@@ -22,8 +23,6 @@ from sglpr_jax.poses import are_rotations
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 UPPER = np.triu_indices(6)
 """The 21 numbers of an information matrix, row by row: translation first, then rotation."""
-ODOMETRY_M, ODOMETRY_DEG = 0.05, 0.1
-"""Standard deviations of a step of the odometry in a graph, where none are given."""
 COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
 
 
@@ -35,18 +34,31 @@ class Graph(NamedTuple):
     """From frame, to frame, from_from_to, and the information matrix, translation first."""
 
 
-def write_g2o(path: Path | str, loops: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"] | None = None) -> None:
+def write_g2o(
+    path: Path | str,
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"] | None = None,
+    *,
+    drift: DriftModel = DriftModel(),
+) -> None:
     """Write a pose graph: a vertex for each pose, an edge for each step of the odometry, an edge for each loop.
 
-    Without odometry the loops' edges stand alone, to be added to a graph of one's own.
+    Arguments:
+      path: File to write.
+      loops: Loops.
+      odometry: Pose of the LiDAR at each frame. Without it, the file has the edges of the loops alone.
+      drift: Drift of the odometry, from which the information of its edges is taken (`step_deviations`).
+
+    Raises:
+      WriteError: If the file cannot be written.
     """
     lines = []
     if odometry is not None:
         lines += [f"{VERTEX} {i} {row}" for i, row in enumerate(_pose_rows(odometry))]
-        steps = inverse(odometry[:-1]) @ odometry[1:]
-        spread = np.repeat([ODOMETRY_M, np.radians(ODOMETRY_DEG)], 3) ** 2
-        information = _numbers(np.diag(1 / spread)[UPPER])
-        lines += [f"{EDGE} {i} {i + 1} {row} {information}" for i, row in enumerate(_pose_rows(steps))]
+        steps = _pose_rows(inverse(odometry[:-1]) @ odometry[1:])
+        spread = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
+        information = (_numbers(np.diag(1 / row)[UPPER]) for row in spread)
+        lines += [f"{EDGE} {i} {i + 1} {row} {next(information)}" for i, row in enumerate(steps)]
     for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
         lines.append(f"{EDGE} {loop.match} {loop.query} {row} {_numbers(loop.information[UPPER])}")
     write_text(Path(path), "".join(f"{line}\n" for line in lines))

@@ -1,6 +1,7 @@
-"""A loop closure: two scans of one place, and how they lie to each other."""
+"""A loop closure: two scans of one place, and the pose of one relative to the other."""
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -12,7 +13,10 @@ from sglpr_jax.loops.verification import Alignment
 
 UNSEEN_HEIGHT_M = 0.5
 UNSEEN_TILT_DEG = 2.0
-"""Standard deviations of what an image from above does not show: the height, and pitch and roll."""
+"""Standard deviations of height, pitch and roll, which an image from above does not show."""
+
+Reason = Literal["contradicts the odometry", "contradicts other loops", "little overlap"]
+"""Why a pair that looked like a loop closure was rejected."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -21,26 +25,35 @@ class Loop:
 
     query: int
     match: int
-    """Frames, counted from 0; the match is the earlier one."""
+    """Frame numbers, counted from 0. The match is the earlier frame."""
     match_from_query: Float[np.ndarray, "4 4"]
-    """The pose of the query's sensor in the frame of the match's: LiDAR frames, as the points of the scans have them,
-    tilted where the sensor is. Metres."""
+    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. The frames are those of the points, and
+    tilted if the sensor is."""
     covariance: Float[np.ndarray, "6 6"]
-    """Of a small motion of the query in its own frame: x, y, z in metres, then about x, y, z in radians."""
+    """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
+    radians."""
     probability: float
-    """That the two show one place."""
+    """Probability that both frames show one place."""
     overlap: float | None = None
-    """Of the scans, where they were registered in 6 degrees of freedom."""
+    """Overlap of the scans, if they were registered in 6 degrees of freedom."""
 
     @property
     def yaw(self) -> float:
-        """How the query is turned in the match's frame, radians counter-clockwise."""
+        """Rotation of the query in the match's frame, in radians counter-clockwise."""
         return float(yaw_of(self.match_from_query))
 
     @property
     def information(self) -> Float[np.ndarray, "6 6"]:
         """The inverse of the covariance."""
         return np.linalg.inv(self.covariance)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rejected:
+    """A pair that looked like a loop closure, and the reason why it was rejected."""
+
+    loop: Loop
+    reason: Reason
 
 
 def planar_loop(
@@ -52,9 +65,15 @@ def planar_loop(
     query_mounting: Mounting | None = None,
     match_mounting: Mounting | None = None,
 ) -> Loop:
-    """The loop of two images: in the plane of the ground, and unsure of height, pitch and roll.
+    """Returns the loop of two aligned images, in the plane of the ground.
 
-    The mountings say how the sensors were tilted whose points were turned upright for these images.
+    Arguments:
+      query: Frame of the query.
+      match: Frame of the match.
+      alignment: Pose of the query's image in the match's image, and its covariance.
+      probability: Probability that both frames show one place.
+      query_mounting: Mounting of the query's sensor, whose points were turned upright for the image.
+      match_mounting: Mounting of the match's sensor.
     """
     upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
     covariance = np.diag([0.0, 0, UNSEEN_HEIGHT_M, *[np.radians(UNSEEN_TILT_DEG)] * 2, 0]) ** 2

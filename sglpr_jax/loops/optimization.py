@@ -1,39 +1,66 @@
-"""The trajectory that odometry and loops agree on best: a pose graph, solved by gtsam (extra `gtsam`).
+"""Correction of a trajectory by its loops: a pose graph, solved by gtsam (extra `gtsam`).
 
-One wrong loop bends a graph that is solved by least squares. Graduated non-convexity (Yang et al., RA-L 2020) begins
-with a convex cost, on which every loop pulls a little, and ends with one that leaves out those that do not fit.
+Least squares bends the graph for every wrong loop. Graduated non-convexity (Yang et al., RA-L 2020) starts with a
+convex cost and ends with one that ignores outliers. The result is compared with the stated drift of the odometry.
 """
 
 import importlib
+import itertools
+from collections.abc import Sequence
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.drift import DriftModel, deviations, step_deviations
 from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.graph_files import ODOMETRY_DEG, ODOMETRY_M
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import inverse
 
 FIRST_POSE = 1e-6
-"""Standard deviation of the first pose, metres and radians: it stays where it is."""
+"""Standard deviation of the first pose, which stays fixed, in metres and radians."""
+ROUNDS = 5
+"""Maximum number of solutions. Loops that bend a solution beyond the drift are dropped before the next one."""
 
 
 class OptimizedTrajectory(NamedTuple):
-    """A corrected trajectory, and the loops that it was corrected with."""
+    """A corrected trajectory, and how far it is from the odometry."""
 
     poses: Float[np.ndarray, "n 4 4"]
-    """Of the LiDAR at each frame that was looked at, in the frame of the odometry; the first is the odometry's."""
-    believed: Bool[np.ndarray, " k"]
-    """Which of the loops the solution agrees with."""
+    """Pose of the LiDAR at each searched frame, in the frame of the odometry. The first pose is the odometry's."""
+    inliers: Bool[np.ndarray, " k"]
+    """Whether the corrected trajectory agrees with each loop."""
+    moved_m: float = 0.0
+    moved_rms_m: float = 0.0
+    """Distance between corrected and given positions, maximum and root mean square, in metres."""
+    deviation: float = 0.0
+    """Largest deviation of the corrected trajectory from the odometry, in sigmas of the stated drift (`deviations`),
+    between the two frames of an inlier, and between consecutive frames of inliers."""
+    drift: DriftModel = DriftModel()
+    """Stated drift."""
+
+    def __str__(self) -> str:
+        loops = f"{self.inliers.sum()} of {len(self.inliers)} loops"
+        if len(self.inliers) and not self.inliers.any():
+            limit = f"{self.drift.max_deviation:g} sigmas of the stated drift ({self.drift})"
+            return f"trajectory not corrected: {loops} agree with the odometry within {limit}"
+        moved = f"{self.moved_m:.2f} m at most, {self.moved_rms_m:.2f} m RMS"
+        return f"trajectory corrected by {loops}: moved by {moved}, {self.deviation:.2f} sigmas of the stated drift"
 
 
 def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
-    """Correct the odometry of a recording by its loops.
+    """Correct the odometry of a recording by its loops, within the drift that was stated.
 
-    Takes a second for some hundred frames, a minute or two for some thousand. Raises ValueError where there was no
-    odometry, ImportError where the extra `gtsam` is not installed.
+    The solution takes a second for some hundred frames, and minutes for some thousand.
+
+    Arguments:
+      found: Loops found with odometry.
+
+    Raises:
+      ValueError: If the loops were found without odometry.
+      ImportError: If the extra `gtsam` is not installed.
 
     Example:
       found = find_loops(recording, params, odometry=odometry)
@@ -41,22 +68,62 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     """
     if found.odometry is None:
         raise ValueError(f"{found.recording.name}: expected loops found with odometry to correct, found none")
-    return optimized(found.odometry[: found.frames], found.loops)
+    odometry = found.odometry[: found.frames]
+    return optimized(odometry, found.loops, drift=found.drift, mounting=found.recording.mounting)
 
 
-def optimized(odometry: Float[np.ndarray, "n 4 4"], loops: tuple[Loop, ...]) -> OptimizedTrajectory:
-    """Solve the graph of odometry and loops. Raises ImportError where the extra `gtsam` is not installed."""
-    gtsam = _library()
-    if not loops:
-        return OptimizedTrajectory(odometry.copy(), np.zeros(0, bool))
+def optimized(
+    odometry: Float[np.ndarray, "n 4 4"],
+    loops: tuple[Loop, ...],
+    *,
+    drift: DriftModel = DriftModel(),
+    mounting: Mounting | None = None,
+) -> OptimizedTrajectory:
+    """Solve the graph of odometry and loops.
+
+    Loops that contradict the odometry, or between whose frames the solution does, are dropped, and the graph is solved
+    again. If a contradiction is left after `ROUNDS` solutions, the odometry is returned without inliers.
+
+    Arguments:
+      odometry: Pose of the LiDAR at each frame.
+      loops: Loops between these frames.
+      drift: Stated drift of the odometry.
+      mounting: Mounting of the LiDAR.
+
+    Raises:
+      ImportError: If the extra `gtsam` is not installed.
+    """
+    gtsam, rules = _library(), {"drift": drift, "mounting": mounting}
+    used = deviations(loops, odometry, **rules) <= drift.max_deviation
+    for _ in range(ROUNDS):
+        if not used.any():
+            break
+        chosen = np.flatnonzero(used)
+        poses, fits = _solved(gtsam, odometry, [loops[i] for i in chosen], drift)
+        members = chosen[fits]
+        bend = _bend(odometry, poses, [loops[i] for i in members], **rules)
+        if (bend <= drift.max_deviation).all():
+            moved = np.linalg.norm(poses[:, :3, 3] - odometry[:, :3, 3], axis=1)
+            rms, deviation = float(np.sqrt(np.mean(moved**2))), float(bend.max(initial=0))
+            inliers = np.isin(np.arange(len(loops)), members)
+            return OptimizedTrajectory(poses, inliers, float(moved.max()), rms, deviation, drift)
+        used[members[bend > drift.max_deviation]] = False
+    return OptimizedTrajectory(odometry.copy(), np.zeros(len(loops), bool), drift=drift)
+
+
+def _solved(
+    gtsam: ModuleType, odometry: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], drift: DriftModel
+) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " k"]]:
+    """The poses of the solution, and whether each loop is an inlier of it."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for frame, pose in enumerate(odometry):
         start.insert(frame, gtsam.Pose3(pose))
     first = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(odometry[0]), first))
-    step = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([np.radians(ODOMETRY_DEG), ODOMETRY_M], 3))
+    sigmas = np.repeat(np.stack(step_deviations(odometry, drift)[::-1], axis=1), 3, axis=1)
     for frame, pose in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
-        graph.add(gtsam.BetweenFactorPose3(frame, frame + 1, gtsam.Pose3(pose), step))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[frame])
+        graph.add(gtsam.BetweenFactorPose3(frame, frame + 1, gtsam.Pose3(pose), noise))
     certain = graph.size()
     for loop in loops:
         noise = gtsam.noiseModel.Gaussian.Covariance(_rotation_first(loop.covariance))
@@ -66,11 +133,33 @@ def optimized(odometry: Float[np.ndarray, "n 4 4"], loops: tuple[Loop, ...]) -> 
     solver = gtsam.GncLMOptimizer(graph, start, options)
     solution = solver.optimize()
     poses = np.stack([solution.atPose3(frame).matrix() for frame in range(len(odometry))])
-    return OptimizedTrajectory(poses, np.asarray(solver.getWeights())[certain:] > 0.5)
+    return poses, np.asarray(solver.getWeights())[certain:] > 0.5
+
+
+def _bend(
+    odometry: Float[np.ndarray, "n 4 4"], poses: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], **rules: Any
+) -> Float[np.ndarray, " k"]:
+    """Deviation of a solution from the odometry for each inlier, in sigmas.
+
+    The maximum over the path between its frames and the paths from these to the next frames of inliers.
+    """
+    frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
+    ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
+    solved = [Loop(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
+    found = deviations(solved, odometry, **rules)
+    return np.array(
+        [max(found[k], *(found[len(loops) :][_touching(frames, loop)]), 0.0) for k, loop in enumerate(loops)]
+    )
+
+
+def _touching(frames: np.ndarray, loop: Loop) -> Bool[np.ndarray, " m"]:
+    """Which of the paths between consecutive `frames` begin or end at a frame of the loop."""
+    ends = np.isin(frames, [loop.match, loop.query])
+    return ends[:-1] | ends[1:]
 
 
 def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndarray, "n 3"]) -> float:
-    """Metres (RMSE) between a trajectory and true positions, after the rotation and shift that bring them nearest."""
+    """Root mean square distance of a trajectory from true positions, in metres, after rigid alignment."""
     found, true = (each - each.mean(axis=0) for each in (poses[:, :3, 3], positions))
     left, _, right = np.linalg.svd(found.T @ true)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
@@ -78,13 +167,13 @@ def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndar
 
 
 def _rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """As gtsam orders it."""
+    """The covariance with rotation before translation, as in gtsam."""
     order = np.array([3, 4, 5, 0, 1, 2])
     return covariance[np.ix_(order, order)]
 
 
 def check_installed() -> None:
-    """Raise ImportError where the extra `gtsam` is not installed, before hours of work that end in a graph."""
+    """Raises ImportError if the extra `gtsam` is not installed."""
     _library()
 
 

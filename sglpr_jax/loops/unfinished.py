@@ -47,6 +47,7 @@ def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray 
         "times": _digest(recording.times),
         "weights": finder.index.weights_hash,
         "candidates": dataclasses.asdict(finder.config),
+        "drift": dataclasses.asdict(finder.drift),
         "verification": dataclasses.asdict(finder.verification),
         **{name: _digest(value) if isinstance(value, np.ndarray) else value for name, value in given.items()},
     }

@@ -59,12 +59,10 @@ def _where(found: FoundLoops) -> str:
 
 
 def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
-    """Before and after the graph was solved and, where true positions are known, how far each is off."""
+    """The trajectory before and after the correction and, if true positions are known, the error of each."""
     assert found.odometry is not None
     both = {"odometry": found.odometry[: found.frames], "optimized": optimized.poses}
-    believed = int(optimized.believed.sum())
-    others = "" if believed == len(found.loops) else "; the others do not fit these"
-    about = f"Corrected by {believed} of {len(found.loops)} loops{others}."
+    about = f"The {optimized}."
     true = found.recording.positions
     if true is not None and found.frames > 2:
         errors = (f"{name} {trajectory_error(poses, true[: found.frames]):.2f} m" for name, poses in both.items())

@@ -1,0 +1,164 @@
+"""Drift model of odometry: how far a loop is from the odometry between its two frames, in standard deviations."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
+from sglpr_jax.loops.transforms import travelled
+
+STEP_M, STEP_DEG = 0.01, 0.02
+"""Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DriftModel:
+    """Standard deviations of odometry per metre of travelled distance."""
+
+    metres_per_metre: float = DRIFT_PERCENT / 100
+    """Position drift in the direction of travel."""
+    degrees_per_metre: float = DRIFT_DEG_PER_100M / 100
+    """Heading drift. It turns the rest of the path and so moves the position, too."""
+    sideways: float = 0.25
+    """Position drift across the direction of travel, as a fraction of the drift along it."""
+    position_m: float = 0.5
+    yaw_deg: float = 1.5
+    """Standard deviations of the comparison itself, whatever the distance, in metres and degrees."""
+    max_deviation: float = 4.0
+    """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
+
+    def __post_init__(self):
+        """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
+        for name, value in dataclasses.asdict(self).items():
+            positive = name in ("position_m", "yaw_deg", "max_deviation")
+            if not np.isfinite(value) or value < 0 or (positive and value == 0):
+                raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
+
+    def scaled(self, factor: float) -> "DriftModel":
+        """The same model with `factor` times the drift per metre."""
+        metres, degrees = factor * self.metres_per_metre, factor * self.degrees_per_metre
+        return dataclasses.replace(self, metres_per_metre=metres, degrees_per_metre=degrees)
+
+    def __str__(self) -> str:
+        return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"
+
+
+def deviations(
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"],
+    *,
+    drift: DriftModel = DriftModel(),
+    mounting: Mounting | None = None,
+) -> Float[np.ndarray, " k"]:
+    """Mahalanobis distance of each loop from the odometry between its frames.
+
+    The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom: e is x, y and yaw of the query by the loop minus those
+    by the odometry; S sums the drift along the path, the loop's covariance and the constants of the model. Without
+    errors of the loop, the distance is the smallest RMS drift along the path that explains the loop, as a multiple of
+    the model's: drift of constant rate f and g times the model's gives at most `sqrt(f^2 + g^2)`.
+
+    Arguments:
+      loops: Loops between frames of the odometry.
+      odometry: Pose of the LiDAR at each frame.
+      drift: Drift model.
+      mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
+    """
+    flat = planar_odometry(odometry, mounting)
+    poses, covariances = planar_loops(loops, mounting)
+    query, match = frames_of(loops)
+    by_loop = compose(flat[match], poses)
+    error = by_loop - flat[query]
+    error[:, 2] = wrapped(error[:, 2])
+    spread = _drifted(flat, match, query, drift) + _turned(covariances, by_loop[:, 2])
+    spread += np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
+    return np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+
+
+def position_deviations(
+    positions: Float[np.ndarray, "n 3"], frame: int, *, drift: DriftModel = DriftModel()
+) -> Float[np.ndarray, " n"]:
+    """Standard deviation of the position of every frame relative to `frame`, in metres, over all directions."""
+    path = _Path.of(positions - positions[frame])
+    length = np.abs(path.length - path.length[frame])
+    lever = np.abs(path.squares - path.squares[frame]).trace(axis1=1, axis2=2)
+    across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
+    return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
+
+
+def step_deviations(
+    odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel
+) -> tuple[Float[np.ndarray, " n-1"], Float[np.ndarray, " n-1"]]:
+    """Standard deviations of the steps of a pose graph, in metres and radians.
+
+    Steps of a graph are independent, so that their variances grow with the distance, those of the model with its
+    square. The variance of a step is its share of that of the whole path: both agree at the end of the path.
+    """
+    way = travelled(odometry)
+    root = np.sqrt(np.diff(way) * way[-1])
+    metres, degrees = (
+        np.hypot(drift.metres_per_metre * root, STEP_M),
+        np.hypot(drift.degrees_per_metre * root, STEP_DEG),
+    )
+    return metres, np.radians(degrees)
+
+
+class _Path(NamedTuple):
+    """Integrals along a path from its first frame to every frame: metres and products of metres."""
+
+    length: Float[np.ndarray, " n"]
+    directions: Float[np.ndarray, "n d d"]
+    """Of the product of the direction of travel with itself."""
+    first: Float[np.ndarray, "n d"]
+    """Of the position."""
+    squares: Float[np.ndarray, "n d d"]
+    """Of the product of the position with itself."""
+
+    @classmethod
+    def of(cls, positions: Float[np.ndarray, "n d"]) -> "_Path":
+        steps, middle = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2
+        length = np.linalg.norm(steps, axis=1)
+        square = steps[:, :, None] * steps[:, None]
+        direction = square / np.maximum(length, 1e-12)[:, None, None]
+        squares = length[:, None, None] * (middle[:, :, None] * middle[:, None] + square / 12)
+        parts = (length, direction, length[:, None] * middle, squares)
+        return cls(
+            *(np.concatenate([np.zeros_like(part[:1], shape=(1, *part.shape[1:])), part.cumsum(0)]) for part in parts)
+        )
+
+
+def _drifted(flat: Planar, start: np.ndarray, end: np.ndarray, drift: DriftModel) -> Float[np.ndarray, "k 3 3"]:
+    """Covariance of x, y, yaw of frame `end` by odometry from frame `start`.
+
+    The rates of drift along the path are independent. Their integral has the variance of a constant rate.
+    """
+    positions = flat[:, :2] - flat[:, :2].mean(axis=0)
+    between = _Path(*(part[end] - part[start] for part in _Path.of(positions)))
+    last, length = positions[end], between.length[:, None, None]
+    crossed = last[:, :, None] * between.first[:, None]
+    levers = length * last[:, :, None] * last[:, None] - crossed - np.swapaxes(crossed, 1, 2) + between.squares
+    left = np.array([[0.0, -1], [1, 0]])
+    found = np.zeros((len(last), 3, 3))
+    found[:, :2, :2] = left @ levers @ left.T
+    found[:, :2, 2] = found[:, 2, :2] = (between.length[:, None] * last - between.first) @ left.T
+    found[:, 2, 2] = between.length
+    found *= np.radians(drift.degrees_per_metre) ** 2
+    share = drift.sideways**2
+    directions = (1 - share) * between.directions + share * length * np.eye(2)
+    found[:, :2, :2] += drift.metres_per_metre**2 * directions
+    return found * length
+
+
+def _turned(covariances: Float[np.ndarray, "k 3 3"], yaw: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3 3"]:
+    """Covariances in the frames of the queries, whose yaw is given, turned into the frame of the odometry."""
+    turn = np.zeros_like(covariances)
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(yaw)
+    turn[:, 1, 0] = np.sin(yaw)
+    turn[:, 0, 1] = -turn[:, 1, 0]
+    turn[:, 2, 2] = 1
+    return turn @ covariances @ np.swapaxes(turn, 1, 2)

@@ -1,0 +1,157 @@
+"""Joint acceptance: which loops of a whole drive are kept, given the odometry and the full scans."""
+
+import dataclasses
+from collections.abc import Callable, Collection, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse.csgraph import connected_components
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.warning import warn
+from sglpr_jax.loops.consistency import ConsistencyConfig, agree, largest_consistent_set
+from sglpr_jax.loops.detector import DetectorConfig
+from sglpr_jax.loops.drift import DriftModel, deviations
+from sglpr_jax.loops.loop import Loop, Reason, Rejected
+from sglpr_jax.loops.planar import frames_of
+from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.transforms import travelled
+
+MIN_OVERLAP = 0.6
+"""Minimum overlap of two registered scans of one place. Measured: docs/decisions/loops.md."""
+FEWEST_AGAINST = 5
+"""Minimum number of frames against the odometry for a warning."""
+AXES = "x forward, y left, z up, of the LiDAR, not of a camera."
+
+
+def accepted(
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"],
+    *,
+    mounting: Mounting | None = None,
+    drift: DriftModel = DriftModel(),
+    config: ConsistencyConfig = ConsistencyConfig(),
+) -> tuple[list[Loop], list[Rejected]]:
+    """Accept the loops of a whole drive jointly against the odometry.
+
+    Loops that contradict the odometry are rejected, however many agree with each other: loops of repeating places do.
+    Among the others the largest consistent set is accepted.
+
+    Returns:
+      The accepted and the rejected loops, each in the given order.
+    """
+    fits = deviations(loops, odometry, drift=drift, mounting=mounting) <= drift.max_deviation
+    left = np.flatnonzero(fits).tolist()
+    pairs = agree([loops[i] for i in left], odometry, mounting=mounting, drift=drift, config=config)
+    members = {left[i] for i in largest_consistent_set(pairs)}
+    reasons: tuple[Reason, Reason] = ("contradicts the odometry", "contradicts other loops")
+    rejected = [Rejected(loop, reasons[int(fits[i])]) for i, loop in enumerate(loops) if i not in members]
+    return [loops[i] for i in sorted(members)], rejected
+
+
+def stretches(
+    loops: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], *, apart_m: float = 50.0, fewest: int = 3
+) -> int:
+    """Number of groups of at least `fewest` loops whose queries and matches are more than `apart_m` metres apart."""
+    way, (query, match) = travelled(odometry), frames_of(loops)
+    near = [np.abs(np.subtract.outer(way[frames], way[frames])) <= apart_m for frames in (query, match)]
+    _, group = connected_components(near[0] | near[1], directed=False)
+    return int((np.bincount(group) >= fewest).sum()) if len(loops) else 0
+
+
+def check_odometry(
+    name: str,
+    by_scans: Collection[int],
+    loops: Sequence[Loop],
+    rejected: Sequence[Rejected],
+    odometry: Float[np.ndarray, "n 4 4"],
+    config: DetectorConfig,
+    mounting: Mounting | None = None,
+) -> None:
+    """Warns if the odometry contradicts most of the frames that have a loop.
+
+    Drift and places that repeat both do that, so the message names both, and the option that states a larger drift.
+
+    Arguments:
+      name: Name of the recording.
+      by_scans: Frames whose scans alone support a loop.
+      loops: Accepted loops.
+      rejected: Rejected loops.
+      odometry: Pose of the LiDAR at each frame.
+      config: Settings of the detector.
+      mounting: Mounting of the LiDAR.
+    """
+    against = [one.loop for one in rejected if one.reason == "contradicts the odometry"]
+    agreeing = {one.query for one in loops} | {one.loop.query for one in rejected} - {one.query for one in against}
+    frames = set(by_scans) | {loop.query for loop in against} | agreeing
+    contrary = len(frames - agreeing)
+    if contrary < FEWEST_AGAINST or 2 * contrary <= len(frames):
+        return
+    said = (
+        f"{name}: the odometry contradicts the loops of {contrary} of {len(frames)} frames; these loops are rejected."
+    )
+    if against:
+        said += f" {_readings(against, odometry, config, mounting)}"
+    warn(f"{said} If the poses are not those of these scans, or in other axes, check the file: {AXES}")
+
+
+def _readings(
+    against: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], config: DetectorConfig, mounting: Mounting | None
+) -> str:
+    """Both readings of loops that contradict the odometry, with the drift that explains them."""
+    found = deviations(against, odometry, drift=config.drift, mounting=mounting)
+    drift = config.drift.scaled(float(np.median(found)))
+    pairs = agree(against, odometry, mounting=mounting, drift=drift, config=config.consistency)
+    members = [against[i] for i in largest_consistent_set(pairs)]
+    percent, degrees = 100 * drift.metres_per_metre, 100 * drift.degrees_per_metre
+    return (
+        f"Either places repeat, or the odometry drifts by about {drift} and not by {config.drift}: {len(members)} of "
+        f"{len(against)} loops then agree with each other, in {stretches(members, odometry)} separate parts of the "
+        f"drive. If it drifts that much, state it: --drift-percent {percent:.2g} --drift-deg-per-100m {degrees:.2g}."
+    )
+
+
+def settled(
+    recording: Recording,
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    config: DetectorConfig,
+    *,
+    registered: bool,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[list[Loop], list[Rejected]]:
+    """Accept the loops of a whole drive jointly and, with `registered`, check the overlap of their scans.
+
+    When `should_stop` returns True, the remaining loops are kept without registration. Without odometry, all loops
+    are consistent.
+
+    Returns:
+      The accepted and the rejected loops.
+    """
+    kept, rejected = list(loops), []
+    if odometry is not None:
+        rules = {"mounting": recording.mounting, "drift": config.drift, "config": config.consistency}
+        kept, rejected = accepted(loops, odometry, **rules)
+    if registered:
+        kept, others = _registered(recording, kept, should_stop)
+        rejected = rejected + others
+    return kept, rejected
+
+
+def _registered(
+    recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
+) -> tuple[list[Loop], list[Rejected]]:
+    """Loops with poses from full scans, and those whose scans do not overlap. After a stop the others as they are."""
+    kept, rejected = [], []
+    for i, loop in enumerate(loops):
+        if should_stop():
+            return [*kept, *loops[i:]], rejected
+        found = register(recording.points(loop.query), recording.points(loop.match), initial=loop.match_from_query)
+        values = {"match_from_query": found.match_from_query, "covariance": found.covariance, "overlap": found.overlap}
+        loop = dataclasses.replace(loop, **values)
+        if found.overlap >= MIN_OVERLAP:
+            kept.append(loop)
+        else:
+            rejected.append(Rejected(loop, "little overlap"))
+    return kept, rejected

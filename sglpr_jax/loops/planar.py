@@ -1,0 +1,65 @@
+"""Poses in the plane of the ground, as rows of x, y (metres) and yaw (radians), and loops as such poses."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import moved_covariance, yaw_of
+from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry, upright_poses
+
+Planar = Float[np.ndarray, "*n 3"]
+"""Poses in the plane: x, y, yaw."""
+
+SEEN = np.array([0, 1, 5])
+"""Rows of x, y and yaw in a covariance of six degrees of freedom."""
+
+
+def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
+    """Position and heading in the plane of the poses' own frame."""
+    return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
+
+
+def planar_odometry(odometry: Float[np.ndarray, "n 4 4"], mounting: Mounting | None) -> Planar:
+    """Odometry of a LiDAR, tilted as its `mounting` says, in the plane of the ground."""
+    return planar(upright_odometry(odometry, mounting))
+
+
+def planar_loops(loops: Sequence[Loop], mounting: Mounting | None) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
+    """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries."""
+    poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
+    covariances = np.array([loop.covariance for loop in loops], np.float64).reshape(-1, 6, 6)
+    covariances = moved_covariance(covariances, upright_from_lidar(mounting))
+    return planar(upright_poses(poses, mounting)), covariances[:, SEEN[:, None], SEEN]
+
+
+def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Queries and matches."""
+    return np.array([loop.query for loop in loops], np.int64), np.array([loop.match for loop in loops], np.int64)
+
+
+def compose(a: Planar, b: Planar) -> Planar:
+    """Returns a_from_c of a_from_b and b_from_c."""
+    a, b = np.broadcast_arrays(a, b)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
+    y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
+    return np.stack([x, y, wrapped(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def inverted(a: Planar) -> Planar:
+    """Returns b_from_a of a_from_b."""
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack([-cos * a[..., 0] - sin * a[..., 1], sin * a[..., 0] - cos * a[..., 1], -a[..., 2]], axis=-1)
+
+
+def relative(a: Planar, b: Planar) -> Planar:
+    """Returns a_from_b of two poses in one frame."""
+    return compose(inverted(a), b)
+
+
+def wrapped(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """The angle from -pi to pi."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
