@@ -5,12 +5,13 @@ import dataclasses
 import jax
 import numpy as np
 
-from sglpr_jax.sim.drive import check_drawing, drive_seed, timed
+from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
-from sglpr_jax.sim.sceneries import REPEATING
+from sglpr_jax.sim.sceneries import REPEATING, Repeating
 from sglpr_jax.sim.sceneries.site import build
 from sglpr_jax.sim.sceneries.ways import LAPS, REVISITS, Revisit, way
 from sglpr_jax.sim.sensor import HDL64E, Sensor
+from sglpr_jax.sim.world import World
 
 SHORTEST_S = 75.0
 """Minimum duration of a drive; fewer scans are farther apart."""
@@ -49,24 +50,36 @@ def simulate_repeating(
     scenery = REPEATING[name]
     check_drawing(rate_hz := scenery.rate_hz if rate_hz is None else rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
-    rng = np.random.default_rng((*seeds, 1))
-    speed = rng.uniform(*scenery.speed_mps)
-    length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
-    site = scenery.site(rng, length, revisit == "same")
-    line = way(rng, site.line, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
-    path = timed(rng, line, free_mps=speed, poses=scans)
+    world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz)
     rows = np.arange(scans) * (len(path.times) // scans)
-    if scenery.height_m is not None:
-        least = min(LEAST_RANGE_M, sensor.min_range_m)
-        sensor = dataclasses.replace(sensor, height_m=scenery.height_m, min_range_m=least)
     return drive_through(
-        build(site, line, clearance_m=scenery.clearance_m),
+        world,
         path,
         rows,
         name=f"{name}-{revisit}",
         ids=tuple(f"{i:06d}" for i in range(scans)),
         times=path.times[rows],
-        sensor=sensor,
+        sensor=mounted(sensor, scenery),
         key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
         rng=np.random.default_rng((*seeds, 2)),
     )
+
+
+def plan_drive(
+    scenery: Repeating, seeds: tuple[int, ...], *, scans: int, revisit: Revisit, rate_hz: float
+) -> tuple[World, PlanarPath]:
+    """Draw a scenery and the drive through it, a whole multiple of `scans` poses."""
+    rng = np.random.default_rng((*seeds, 1))
+    speed = rng.uniform(*scenery.speed_mps)
+    length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
+    site = scenery.site(rng, length, revisit == "same")
+    line = way(rng, site.line, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
+    return build(site, line, clearance_m=scenery.clearance_m), timed(rng, line, free_mps=speed, poses=scans)
+
+
+def mounted(sensor: Sensor, scenery: Repeating) -> Sensor:
+    """The sensor as the vehicle of a scenery carries it."""
+    if scenery.height_m is None:
+        return sensor
+    least = min(LEAST_RANGE_M, sensor.min_range_m)
+    return dataclasses.replace(sensor, height_m=scenery.height_m, min_range_m=least)

@@ -1,12 +1,14 @@
 """A corridor with doors at equal distances on both sides."""
 
 import numpy as np
+from jaxtyping import Float
 
 from sglpr_jax.sim.raw_ids import BUILDING, OTHER_GROUND
 from sglpr_jax.sim.sceneries.site import Site, Spot, block, even_ground
-from sglpr_jax.sim.sceneries.ways import STEP_M, Line, rounded
+from sglpr_jax.sim.sceneries.ways import STEP_M, rounded
 from sglpr_jax.sim.things import Thing
 
+Place = Float[np.ndarray, "2"]
 DOOR_M = 1.0
 BEYOND_M = 40.0
 """Length of the corridor before the first and after the last scan."""
@@ -19,7 +21,7 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     if closed:
         size = np.array([0.5 + rng.uniform(0, 0.15), 0.0]) * length_m / 2
         size[1] = length_m / 2 - size[0]
-        corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])])
+        corners = np.array([(0.0, 0.0), (size[0], 0.0), size, (0.0, size[1])])
         line = rounded(corners, corner_m=0.5, closed=True)
     else:
         corners = np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
@@ -35,7 +37,7 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _walls(
-    start: Line, stop: Line, half: float, height: float, pitch: float, recess: float, closed: bool
+    start: Place, stop: Place, half: float, height: float, pitch: float, recess: float, closed: bool
 ) -> list[Spot]:
     """Walls along one straight corridor. In a closed one the left wall is the core's, which is shorter."""
     length, ahead = float(np.linalg.norm(stop - start)), (stop - start) / np.linalg.norm(stop - start)

@@ -20,7 +20,7 @@ def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     fence = _both(block(FENCE, 1.1 * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1))
     beam = block(FENCE, 4.2, 0.1, 0.32, y=rail, bottom=0.5)
     rails = _both(beam, post(POLE, 0.12, 0.8, y=rail + 0.12))
-    lamps = _both(post(POLE, 0.2, 9, y=rail + 1))
+    lamps = _both(post(POLE, 0.2, 9.0, y=rail + 1))
     gantry = (*_both(post(POLE, 0.4, 6.5, y=rail + 0.8)), block(TRAFFIC_SIGN, 0.4, 2 * rail + 2, 1.5, bottom=5.5))
     things = ((fence, panel), (rails, 4.0), (lamps, rng.uniform(30, 60)), (gantry, rng.uniform(120, 250)))
     spots = [spot for thing, every in things for spot in along(whole, lambda thing=thing: thing, every)]

@@ -16,7 +16,7 @@ LAPS = 1.5
 """Laps around a closed line for revisits in the same direction."""
 SWAY_WAVELENGTH_M = (15.0, 60.0)
 
-Line = Float[np.ndarray, "n 2"]
+Line = Float[np.ndarray, "_ 2"]
 Revisit = Literal["none", "same", "opposite"]
 REVISITS: tuple[Revisit, ...] = ("none", "same", "opposite")
 
