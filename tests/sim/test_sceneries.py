@@ -145,5 +145,5 @@ def test_strips_are_painted_left_of_the_line_and_dashes_with_gaps():
 
 
 def test_an_unknown_name_is_an_error():
-    with pytest.raises(ValueError, match="scenery among walls, .* found 'moon'"):
+    with pytest.raises(ValueError, match=r"scenery among walls, .* found 'moon'"):
         simulate_repeating("moon")
