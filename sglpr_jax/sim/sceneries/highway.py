@@ -4,7 +4,7 @@ import numpy as np
 
 from sglpr_jax.sim import vehicles
 from sglpr_jax.sim.raw_ids import FENCE, LANE_MARKING, POLE, ROAD, TERRAIN, TRAFFIC_SIGN
-from sglpr_jax.sim.sceneries.site import Site, Spot, Strip, along, block, post, rolling, striped_ground
+from sglpr_jax.sim.sceneries.site import OVERLAP, Site, Spot, Strip, along, block, post, rolling, striped_ground
 from sglpr_jax.sim.sceneries.ways import STEP_M, Line, road, shifted
 from sglpr_jax.sim.things import Thing
 
@@ -17,8 +17,8 @@ PIECE_S = 1.5
 def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     whole, driven = road(rng, length_m, closed)
     rail, wall, panel = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
-    fence = _both(block(FENCE, 1.1 * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1))
-    beam = block(FENCE, 4.2, 0.1, 0.32, y=rail, bottom=0.5)
+    fence = _both(block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1))
+    beam = block(FENCE, OVERLAP * 4.0, 0.1, 0.32, y=rail, bottom=0.5)
     rails = _both(beam, post(POLE, 0.12, 0.8, y=rail + 0.12))
     lamps = _both(post(POLE, 0.2, 9.0, y=rail + 1))
     gantry = (*_both(post(POLE, 0.4, 6.5, y=rail + 0.8)), block(TRAFFIC_SIGN, 0.4, 2 * rail + 2, 1.5, bottom=5.5))

@@ -20,6 +20,8 @@ HEAD_ROOM_M = 2.0
 """Parts that begin higher may be above the vehicle."""
 FLAT = Relief(np.zeros(4), np.full((4, 2), 0.01), np.zeros(4))
 _ROLLING = dataclasses.replace(TOWN, steepest=0.015)
+OVERLAP = 1.25
+"""Length of a piece of wall over the distance to the next one: in curves, the outer wall is longer than the road."""
 _AROUND_M = 30.0
 
 

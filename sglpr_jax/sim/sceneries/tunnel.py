@@ -3,7 +3,7 @@
 import numpy as np
 
 from sglpr_jax.sim.raw_ids import BUILDING, OTHER_OBJECT, ROAD
-from sglpr_jax.sim.sceneries.site import Site, along, block, even_ground
+from sglpr_jax.sim.sceneries.site import OVERLAP, Site, along, block, even_ground
 from sglpr_jax.sim.sceneries.ways import road
 from sglpr_jax.sim.things import Thing
 
@@ -24,7 +24,7 @@ def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _piece(half: float, height: float, niche: float) -> Thing:
-    long, away = 1.05 * PIECE_M, half + THICK_M / 2
+    long, away = OVERLAP * PIECE_M, half + THICK_M / 2
     wall = block(BUILDING, long, THICK_M, height + 0.5, y=away, roughness=0.02)
-    ceiling = block(BUILDING, 1.1 * PIECE_M, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
+    ceiling = block(BUILDING, OVERLAP * PIECE_M, 2 * half + 1, 0.5, bottom=height, roughness=0.02)
     return wall, wall._replace(y=-away - niche), ceiling
