@@ -73,11 +73,18 @@ def plan_path(
     role = ROLES[name]
     seconds = max(scans / rate_hz, SHORTEST_S)
     path = _in_lane(rng, plan_route(rng, role, blocks=round(seconds * role.speed_mps / role.block_m), days=days))
-    heading = np.unwrap(np.arctan2(*np.gradient(path, axis=0).T[::-1]))
-    clock = _clock(rng, path, heading, FREE_SPEED * role.speed_mps)
-    poses = scans * days
+    return timed(rng, path, free_mps=FREE_SPEED * role.speed_mps, poses=scans * days)
+
+
+def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
+    """Return the drive along `line` with a pose about every 0.1 s: a whole multiple of `poses`.
+
+    `free_mps` is the mean speed where nothing slows the vehicle down. It is slower in corners.
+    """
+    heading = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
+    clock = _clock(rng, line, heading, free_mps)
     times = np.linspace(0, clock[-1], poses * max(1, round(clock[-1] * PATH_HZ / poses)))
-    x, y, yaw = (np.interp(times, clock, values) for values in (*path.T, heading))
+    x, y, yaw = (np.interp(times, clock, values) for values in (*line.T, heading))
     return PlanarPath(np.stack([x, y], axis=1), yaw, times)
 
 

@@ -1,0 +1,85 @@
+"""Simulated drives through sceneries where places repeat, with and without revisits."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, timed
+from sglpr_jax.sim.recording import SimulatedRecording, drive_through
+from sglpr_jax.sim.sceneries import REPEATING, Repeating
+from sglpr_jax.sim.sceneries.site import build
+from sglpr_jax.sim.sceneries.ways import LAPS, REVISITS, Revisit, way
+from sglpr_jax.sim.sensor import HDL64E, Sensor
+from sglpr_jax.sim.world import World
+
+SHORTEST_S = 75.0
+"""Minimum duration of a drive; fewer scans are farther apart."""
+LEAST_RANGE_M = 0.5
+"""Minimum range of the sensor of a small robot, at most."""
+
+
+def simulate_repeating(
+    name: str,
+    *,
+    scans: int = 300,
+    seed: int = 0,
+    sensor: Sensor = HDL64E,
+    revisit: Revisit = "none",
+    rate_hz: float | None = None,
+) -> SimulatedRecording:
+    """Return the recording of a drive through scenery `name`, one of `REPEATING`, drawn by `seed`.
+
+    Arguments:
+      scans: number of scans, evenly spread over the drive.
+      sensor: the LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of 0.5 m.
+      revisit: "none" never returns to a place: frames 30 s apart are more than `other_m` apart. "opposite" drives to
+        the end and returns. "same" drives one and a half laps around a closed way.
+      rate_hz: scans per second; None for the scenery's own.
+
+    Raises:
+      ValueError: the name or `revisit` is unknown, the rate is not above 0, or the seed is below 0.
+
+    Example:
+      drive = simulate_repeating("tunnel", seed=1, revisit="opposite")
+    """
+    if name not in REPEATING:
+        raise ValueError(f"expected a scenery among {', '.join(REPEATING)}, found {name!r}")
+    if revisit not in REVISITS:
+        raise ValueError(f"revisit: expected one of {', '.join(REVISITS)}, found {revisit!r}")
+    scenery = REPEATING[name]
+    check_drawing(rate_hz := scenery.rate_hz if rate_hz is None else rate_hz, seed)
+    seeds = drive_seed(seed, f"{name} {revisit}")
+    world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz)
+    rows = np.arange(scans) * (len(path.times) // scans)
+    return drive_through(
+        world,
+        path,
+        rows,
+        name=f"{name}-{revisit}",
+        ids=tuple(f"{i:06d}" for i in range(scans)),
+        times=path.times[rows],
+        sensor=mounted(sensor, scenery),
+        key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
+        rng=np.random.default_rng((*seeds, 2)),
+    )
+
+
+def plan_drive(
+    scenery: Repeating, seeds: tuple[int, ...], *, scans: int, revisit: Revisit, rate_hz: float
+) -> tuple[World, PlanarPath]:
+    """Draw a scenery and the drive through it, a whole multiple of `scans` poses."""
+    rng = np.random.default_rng((*seeds, 1))
+    speed = rng.uniform(*scenery.speed_mps)
+    length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
+    site = scenery.site(rng, length, revisit == "same")
+    line = way(rng, site.line, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
+    return build(site, line, clearance_m=scenery.clearance_m), timed(rng, line, free_mps=speed, poses=scans)
+
+
+def mounted(sensor: Sensor, scenery: Repeating) -> Sensor:
+    """The sensor as the vehicle of a scenery carries it."""
+    if scenery.height_m is None:
+        return sensor
+    least = min(LEAST_RANGE_M, sensor.min_range_m)
+    return dataclasses.replace(sensor, height_m=scenery.height_m, min_range_m=least)

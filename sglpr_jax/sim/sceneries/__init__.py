@@ -1,0 +1,61 @@
+"""Sceneries where places repeat, by name."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from sglpr_jax.sim.sceneries.car_park import car_park
+from sglpr_jax.sim.sceneries.corridor import corridor
+from sglpr_jax.sim.sceneries.field import field
+from sglpr_jax.sim.sceneries.garage import garage
+from sglpr_jax.sim.sceneries.highway import LANE_M, highway
+from sglpr_jax.sim.sceneries.orchard import orchard
+from sglpr_jax.sim.sceneries.rooms import rooms, rooms_equal
+from sglpr_jax.sim.sceneries.row_houses import row_houses
+from sglpr_jax.sim.sceneries.site import Site
+from sglpr_jax.sim.sceneries.tunnel import tunnel
+from sglpr_jax.sim.sceneries.vineyard import vineyard
+from sglpr_jax.sim.sceneries.walls import walls
+from sglpr_jax.sim.sceneries.warehouse import warehouse
+from sglpr_jax.sim.things import Range
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeating:
+    """A scenery where places repeat, and how it is driven through."""
+
+    site: Callable[[np.random.Generator, float, bool], Site]
+    """Draws the scenery around a line of this length in metres, closed or open."""
+    speed_mps: Range
+    rate_hz: float = 4.0
+    """Scans per second."""
+    other_m: float = 20.0
+    """Frames farther apart than this show different places. Without revisits, all frames 30 s apart are."""
+    clearance_m: float = 1.2
+    """Minimum horizontal distance of standing things from the driven way."""
+    right_m: float = 0.4
+    """Distance of the way from the middle of the road or aisle, to the right."""
+    sway_m: float = 0.3
+    """Maximum further distance, which varies along the way."""
+    height_m: float | None = None
+    """Height of the sensor over the ground; None for the sensor's own."""
+
+
+_ROBOT = {"rate_hz": 2.0, "clearance_m": 0.4, "right_m": 0.2, "sway_m": 0.15, "height_m": 0.5}
+REPEATING = {
+    "walls": Repeating(walls, (8.0, 12.0)),
+    "highway": Repeating(highway, (15.0, 20.0), right_m=LANE_M / 2),
+    "tunnel": Repeating(tunnel, (8.0, 14.0)),
+    "car_park": Repeating(car_park, (4.0, 7.0)),
+    "garage": Repeating(garage, (3.0, 5.0), other_m=9.0),
+    "corridor": Repeating(corridor, (0.5, 1.0), other_m=5.0, **_ROBOT),
+    "rooms_equal": Repeating(rooms_equal, (0.45, 0.7), other_m=4.0, **{**_ROBOT, "right_m": 0.0, "sway_m": 0.05}),
+    "rooms": Repeating(rooms, (0.45, 0.7), other_m=4.0, **{**_ROBOT, "right_m": 0.0, "sway_m": 0.05}),
+    "warehouse": Repeating(warehouse, (1.0, 1.6), other_m=4.0, **{**_ROBOT, "height_m": 1.0}),
+    "orchard": Repeating(orchard, (3.5, 6.0), clearance_m=0.5, right_m=0.2, sway_m=0.15),
+    "vineyard": Repeating(vineyard, (3.5, 6.0), clearance_m=0.8, right_m=0.2, sway_m=0.15),
+    "row_houses": Repeating(row_houses, (6.0, 9.0), right_m=0.2, sway_m=0.2),
+    "field": Repeating(field, (7.0, 12.0)),
+}
+"""By the names of `simulate_repeating`."""
