@@ -19,13 +19,16 @@ from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
+from sglpr_jax.loops.rivals import rival_share
 from sglpr_jax.loops.transforms import travelled
-from sglpr_jax.loops.verification import align
+from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.same_place import NEGATIVE_M
 
 NEAR_M = (2.0, 10.0)
 """How far apart the frames of a certain loop are."""
+RIVALS = 10
+"""Number of other places that a query is compared with."""
 SAME_PASS_M = 50.0
 """Of way between them, at most."""
 
@@ -130,11 +133,14 @@ class _Places:
         return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
 
     def evidence(self, frame: int, query: Seen, row: int) -> Evidence:
-        """What speaks for a pair; the next other place is none of the frame's own, which a search leaves out too."""
-        index = self.finder.index
-        found = jax.device_get(align(query.image, self.images[row], config=self.finder.verification))
-        distance = float(np.linalg.norm(index.descriptors[row].astype(np.float64) - query.descriptor))
-        same = ~self.far(frame) | (self.apart(row) <= NEGATIVE_M)
-        other = float(index.query(query.descriptor, exclude=same).distances[0])
-        margin = other - distance if np.isfinite(other) else np.nan
-        return Evidence.of(distance, margin, found.correlation, found.second)
+        """The evidence of a pair. Its rivals are the nearest frames that show neither place."""
+        finder = self.finder
+        elsewhere = self.far(frame) & (self.apart(row) > NEGATIVE_M)
+        found = finder.index.query(query.descriptor, RIVALS, exclude=~elsewhere).rows
+        rows = [row, *found[found >= 0].tolist()]
+        peaks = finder.search(query.image, [self.images[k] for k in rows], 1 + RIVALS)
+        peak = peaks.one(0)
+        share = rival_share(peaks.some(slice(1, None)), float(peak.correlation), [])
+        fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))
+        distance = float(np.linalg.norm(finder.index.descriptors[row].astype(np.float64) - query.descriptor))
+        return Evidence.of(distance, fitted.correlation, fitted.second, share)

@@ -1,4 +1,4 @@
-"""From a scan to the earlier scans that may show its place: described, looked up, and laid over each other."""
+"""From a scan to the earlier scan that may show its place: description, retrieval, and comparison of the images."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,8 +18,13 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.loops.drift import DriftModel, position_deviations
 from sglpr_jax.loops.given import check_is
+from sglpr_jax.loops.motion import Motion, MotionConfig
+from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, search
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.verification import Alignment, VerificationConfig, align_all
+from sglpr_jax.loops.rivals import RivalConfig, expected_poses, rival_share, rivals
+from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.upright import upright_from_lidar
+from sglpr_jax.loops.verification import Alignment, refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
@@ -31,17 +36,21 @@ from sglpr_jax.same_place import NEGATIVE_M
 
 @dataclasses.dataclass(frozen=True)
 class CandidateConfig:
-    """Which earlier scans are looked at."""
+    """Selection of candidate matches, and of the frames that they are compared with."""
 
     candidates: int = 3
-    """How many of the nearest are laid over each scan."""
+    """Number of nearest descriptors whose images are compared. The best fit is the candidate."""
     exclude_s: float = EXCLUDED_S
     exclude_frames: int = EXCLUDED_FRAMES
-    """Scans younger than this are neighbours and no loop: seconds, or frames where there are no times."""
-    other_place_frames: int = 50
-    """Without odometry, scans so many frames apart are taken for other places."""
+    """Minimum age of a match in seconds, or in frames if there are no times."""
+    min_travelled_m: float = 10.0
+    """Minimum travelled distance between match and query, in metres, if the motion is known."""
     min_cells: int = 20
-    """Images of fewer occupied cells, of a sensor that was covered or failed, show no place."""
+    """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
+    min_rival_correlation: float = 0.25
+    """Candidates with a lower correlation are no loops whatever else fits, and have no rivals."""
+    rivals: RivalConfig = RivalConfig()
+    motion: MotionConfig = MotionConfig()
 
 
 class Candidate(NamedTuple):
@@ -51,8 +60,17 @@ class Candidate(NamedTuple):
     match: int
     """Frames, counted from 0; the match is the earlier one."""
     alignment: Alignment
-    """How their images lie."""
+    """Pose of the query's image in the match's."""
     evidence: Evidence
+
+
+class Compared(NamedTuple):
+    """The results of all image comparisons of a frame."""
+
+    candidates: list[Candidate]
+    """One, or none."""
+    link: Peak | None
+    """Pose over the keyframe, which the motion without odometry is made of."""
 
 
 class Seen(NamedTuple):
@@ -87,16 +105,24 @@ class CandidateFinder:
         """Of the sensor, one for all frames."""
         self.empty: list[bool] = []
         """Which frames show next to nothing."""
+        self.motion = Motion(config.motion)
+        self.links: list[Peak | None] = []
+        """Pose of each frame over its keyframe, if there is no odometry."""
         self.missing: list[int] = []
         """The frames whose scans could not be read."""
 
     def add(
         self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
     ) -> list[Candidate]:
-        """Describe a scan or image, and return its candidates, those of the nearest descriptor first.
+        """Describe a scan or image, add it, and return its candidate, if there is one.
 
-        `odometry` is its pose, LiDAR frame in any fixed frame. Raises ValueError where some frames have a time or a
-        pose and others have none, where times run backwards, and for a record of a sensor mounted otherwise.
+        Arguments:
+          record: The scan or image.
+          time: Its time, in seconds.
+          odometry: Pose of the LiDAR in any fixed frame.
+
+        Raises:
+          ValueError: If only some frames have a time or a pose, if times decrease, or if the mounting changes.
         """
         return self.add_seen(self.seen(record), time=time, odometry=odometry)
 
@@ -106,27 +132,32 @@ class CandidateFinder:
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
-        candidates: list[Candidate] | None = None,
+        compared: Compared | None = None,
     ) -> list[Candidate]:
-        """Do what `add` does, of a record that was looked at before; None where its scan cannot be read.
+        """Add a frame that is described already; None is a scan that cannot be read.
 
-        `candidates` are those that an earlier run found for it, which saves the search. Errors are those of `add`.
+        `compared` has the comparisons of an earlier run, which are not repeated. Errors are those of `add`.
         """
         self._check(seen, time, odometry)
         pose = None if odometry is None else np.asarray(odometry, np.float64)
         position = None if pose is None else pose[:3, 3]
-        if candidates is None:
-            candidates = [] if seen is None else self._candidates(seen, time, position)
+        clock = len(self.index) * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
+        upright = None if pose is None else pose @ inverse(upright_from_lidar(self._mounting_of(seen)))
+        if compared is None:
+            compared = self._compared(seen, time, position, upright, clock)
+        else:
+            self.motion.add(clock, pose=upright, link=compared.link)
         if seen is None:
             seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
             self.missing.append(len(self.index))
         self.index.add(seen.descriptor, times=time, positions=position)
         self.images.append(seen.image)
         self.empty.append(self.is_empty(seen.image))
+        self.links.append(compared.link)
         self.mounting = seen.mounting
         if pose is not None:
             self.odometry.append(pose)
-        return candidates
+        return compared.candidates
 
     def seen(self, record: Record) -> Seen:
         """The descriptor of a scan or image, and its density image as 8 bits; nothing is remembered."""
@@ -160,21 +191,56 @@ class CandidateFinder:
         """Whether an image shows too little to tell a place by."""
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
-    def _candidates(self, seen: Seen, time: float | None, position: Float[np.ndarray, " 3"] | None) -> list[Candidate]:
-        excluded = self._excluded(time, position) | self.is_empty(seen.image)
-        rows, distances = self.index.query(seen.descriptor, self.config.candidates, exclude=excluded)
-        rows, distances = rows[rows >= 0], distances[rows >= 0]
+    def _compared(
+        self,
+        seen: Seen | None,
+        time: float | None,
+        position: Float[np.ndarray, " 3"] | None,
+        pose: Float[np.ndarray, "4 4"] | None,
+        clock: float,
+    ) -> Compared:
+        """Compare the next frame with its nearest descriptors and the keyframe, and add it to the motion."""
+        if seen is None or self.is_empty(seen.image):
+            self.motion.add(clock, pose=pose)
+            return Compared([], None)
+        found = self.index.query(seen.descriptor, self.config.candidates, exclude=self._excluded(time, position))
+        rows, distances = (values[found.rows >= 0] for values in found)
+        key = self.motion.keyframe
+        linked = pose is None and len(self.images) > 0 and not self.empty[key]
+        matches = [self.images[row] for row in ([*rows, key] if linked else rows)]
+        peaks = self.search(seen.image, matches, self.config.candidates + linked)
+        link = peaks.one(len(rows)) if linked else None
+        self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
-            return []
-        padded = np.resize(rows, self.config.candidates)  # always as many, so that it compiles once
-        matches = np.stack([self.images[row] for row in padded])
-        found = jax.device_get(align_all(seen.image, matches, config=self.verification))
-        pairs = []
-        for k, (row, distance) in enumerate(zip(rows, distances, strict=True)):
-            alignment, other = found.one(k), self._other_place(seen.descriptor, int(row), excluded)
-            evidence = Evidence.of(distance, other - distance, alignment.correlation, alignment.second)
-            pairs.append(Candidate(len(self.index), int(row), alignment, evidence))
-        return pairs
+            return Compared([], link)
+        best = int(np.argmax(peaks.correlation[: len(rows)]))
+        return Compared([self._candidate(seen, int(rows[best]), float(distances[best]), peaks.one(best))], link)
+
+    def _candidate(self, seen: Seen, match: int, distance: float, peak: Peak) -> Candidate:
+        query, rules = len(self.index), self.config.rivals
+        alignment = jax.device_get(refined(seen.image, self.images[match], peak, config=self.verification))
+        share = np.nan
+        if peak.correlation >= self.config.min_rival_correlation:
+            usable = ~np.array(self.empty, bool)
+            known = self.index.descriptors
+            rows = rivals(seen.descriptor, known, match, self.motion, usable, config=rules)
+            found = self.search(seen.image, [self.images[row] for row in rows], rules.of_query + rules.of_match)
+            match_from_query = transform(float(peak.x), float(peak.y), float(peak.yaw))
+            by_query = expected_poses(self.motion, query, rows, np.eye(4), config=rules)
+            by_match = expected_poses(self.motion, match, rows, match_from_query, config=rules)
+            share = rival_share(found, float(peak.correlation), [by_query, by_match], config=rules)
+        evidence = Evidence.of(distance, alignment.correlation, alignment.second, share)
+        return Candidate(query, match, alignment, evidence)
+
+    def search(self, image: UInt8[np.ndarray, "n n"], matches: Sequence[UInt8[np.ndarray, "n n"]], size: int) -> Peak:
+        """The poses of an image over those of some matches; `size` of them are compared, so that it compiles once."""
+        if not matches:
+            return NO_PEAKS
+        padded = np.stack([matches[k % len(matches)] for k in range(size)])
+        return jax.device_get(search(image, padded, config=self.verification)).some(slice(len(matches)))
+
+    def _mounting_of(self, seen: Seen | None) -> Mounting | None:
+        return self.mounting if seen is None else seen.mounting
 
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self.index):
@@ -194,22 +260,13 @@ class CandidateFinder:
         """Frames that are no candidates of the next one: too recent, almost empty, or too far away by odometry."""
         config, known = self.config, self.index.positions
         excluded = self.index.recent(time, seconds=config.exclude_s, frames=config.exclude_frames)
-        excluded = excluded | np.array(self.empty, bool)
+        excluded = excluded | np.array(self.empty, bool) | self.motion.near_last(config.min_travelled_m)
         if position is not None and known is not None and len(known):
             drifted = position_deviations(np.concatenate([known, position[None]]), -1, drift=self.drift)[:-1]
             apart = np.linalg.norm(known - position, axis=1)
             place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
             excluded = excluded | (apart > place_m + self.drift.max_deviation * drifted)
         return excluded
-
-    def _other_place(self, descriptor: Float32[np.ndarray, " d"], row: int, excluded: Bool[np.ndarray, " n"]) -> float:
-        """The distance of the nearest descriptor of a place that is not that of `row`; NaN where there is none."""
-        if self.index.positions is not None:
-            near = np.linalg.norm(self.index.positions - self.index.positions[row], axis=1) <= NEGATIVE_M
-        else:
-            near = np.abs(np.arange(len(self.index)) - row) <= self.config.other_place_frames
-        distance = float(self.index.query(descriptor, exclude=excluded | near).distances[0])
-        return distance if np.isfinite(distance) else np.nan
 
 
 def labelled(

@@ -8,15 +8,15 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Compared, Seen
 from sglpr_jax.loops.choices import MIN_PROBABILITY
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
 from sglpr_jax.loops.drift import DriftModel, deviations
 from sglpr_jax.loops.given import given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
+from sglpr_jax.loops.pose_search import VerificationConfig
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.transforms import travelled
-from sglpr_jax.loops.verification import VerificationConfig
 from sglpr_jax.models.params import Params
 
 
@@ -103,13 +103,13 @@ class LoopDetector:
         *,
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
-        candidates: list[Candidate] | None = None,
+        compared: Compared | None = None,
     ) -> list[Loop]:
-        """Do what `add` does, of a frame that was looked at before; None where its scan cannot be read.
+        """Add a frame that is described already; None is a scan that cannot be read.
 
-        `candidates` are those that an earlier run found for it (see `loops.unfinished`).
+        `compared` has the comparisons of an earlier run (see `loops.unfinished`).
         """
-        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, candidates=candidates)
+        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared)
         self.candidates += candidates
         if candidates:
             probabilities = self.model.probability(Evidence.stack([one.evidence for one in candidates]))

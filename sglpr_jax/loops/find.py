@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.candidates import Candidate, Seen
+from sglpr_jax.loops.candidates import Candidate, Compared, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.drift import DriftModel
 from sglpr_jax.loops.given import check_is, given_poses
@@ -173,8 +173,8 @@ def _recall(
 ) -> None:
     """Add the frames of an earlier run to a detector. `given` returns time and odometry of a frame."""
 
-    def add(seen: Seen | None, candidates: list[Candidate]) -> None:
-        detector.add_seen(seen, **given(len(detector)), candidates=candidates)
+    def add(seen: Seen | None, compared: Compared) -> None:
+        detector.add_seen(seen, **given(len(detector)), compared=compared)
 
     kept.recall(detector.finder, mounting, add, missing=missing)
 

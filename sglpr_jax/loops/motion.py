@@ -48,9 +48,7 @@ class Motion:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def add(
-        self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None
-    ) -> None:
+    def add(self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None) -> None:
         """Add a frame at `time` (seconds), by its `pose` from odometry or its peak over the keyframe's image."""
         n, segment = len(self), self.segments[-1] if self.segments else 0
         if pose is None and link is not None and self._is_trusted(link):
@@ -76,12 +74,19 @@ class Motion:
         poses = np.stack([self.poses[row] for row in rows]) if len(rows) else np.zeros((0, 4, 4))
         return inverse(poses) @ self.poses[frame], known
 
+    def near_last(self, travelled_m: float) -> Bool[np.ndarray, " n"]:
+        """Which frames are known to be less than a travelled distance before the last frame."""
+        if not len(self):
+            return np.zeros(0, bool)
+        known = np.array(self.segments) == self.segments[-1]
+        return np.asarray(known & (self.travelled[-1] - np.array(self.travelled) < travelled_m))
+
     def _is_trusted(self, link: Peak) -> bool:
         best = float(link.correlation)
         return best >= self.config.min_correlation and float(link.second) <= self.config.max_second * best
 
     def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> float:
-        return float(np.linalg.norm(pose[:2, 3] - self.poses[key][:2, 3]))
+        return float(np.linalg.norm(pose[:3, 3] - self.poses[key][:3, 3]))
 
     def _is_next_keyframe(self, key: int, pose: Float[np.ndarray, "4 4"]) -> bool:
         rotation = abs(float(yaw_of(inverse(self.poses[key]) @ pose)))

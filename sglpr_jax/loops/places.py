@@ -8,21 +8,24 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Compared, Seen
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.pose_search import Peak, VerificationConfig, search
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
+from sglpr_jax.loops.rivals import RivalConfig, rival_share
+from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.unfinished import Unfinished, settings
-from sglpr_jax.loops.upright import check_level
-from sglpr_jax.loops.verification import VerificationConfig, align_all
+from sglpr_jax.loops.upright import check_level, upright_from_lidar
+from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
@@ -30,6 +33,10 @@ from sglpr_jax.same_place import NEGATIVE_M
 
 ARRAYS = ("images", "world_from_place", "mountings")
 """What a map's file holds beside the index."""
+RIVALS = 10
+"""Number of other places that a query is compared with."""
+RIVAL_SPACING_M = 8.0
+"""Minimum distance between these, and from the match, in metres."""
 Content = tuple[bytes | None, bytes]
 """What tells a place from every other one: descriptor (None: not known yet) and pose."""
 
@@ -134,18 +141,18 @@ class PlaceMap:
         if not len(rows):
             return []
         model = default_model(self.index.weights_hash) if model is None else model
-        alignments = jax.device_get(align_all(image, self.images[rows], config=VerificationConfig()))
+        settings = VerificationConfig()
+        peaks = jax.device_get(search(image, self.images[rows], config=settings))
         pairs = []
-        for k, (row, distance) in enumerate(zip(rows, distances, strict=True)):
-            alignment = alignments.one(k)
-            margin = self._other_place(descriptor, int(row)) - distance
-            evidence = Evidence.of(float(distance), margin, alignment.correlation, alignment.second)
-            mountings = {"query_mounting": mounting, "match_mounting": self.mounting(int(row))}
+        for k, (row, distance) in enumerate(zip(rows.tolist(), distances.tolist(), strict=True)):
+            alignment = jax.device_get(refined(image, self.images[row], peaks.one(k), config=settings))
+            share = self._rival_share(descriptor, image, row, peaks.one(k))
+            evidence = Evidence.of(distance, alignment.correlation, alignment.second, share)
+            mountings = {"query_mounting": mounting, "match_mounting": self.mounting(row)}
             probability = float(model.probability(evidence))
-            loop = planar_loop(len(self), int(row), alignment, probability=probability, **mountings)
-            pose = self.world_from_place[row] @ loop.match_from_query
-            pairs.append(Relocated(self.index.ids[row], pose, loop))
-        return sorted(pairs, key=lambda pair: -pair.probability)
+            loop = planar_loop(len(self), row, alignment, probability=probability, **mountings)
+            pairs.append(Relocated(self.index.ids[row], self.world_from_place[row] @ loop.match_from_query, loop))
+        return sorted(_shared(pairs), key=lambda pair: -pair.probability)
 
     def save(self, path: Path | str) -> None:
         """Write one file, whole or not at all: the index's, with images and poses beside its arrays."""
@@ -182,10 +189,47 @@ class PlaceMap:
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
             yield descriptor.tobytes(), pose.tobytes()
 
-    def _other_place(self, descriptor: Float[np.ndarray, " d"], row: int) -> float:
-        near = np.linalg.norm(self.world_from_place[:, :3, 3] - self.world_from_place[row, :3, 3], axis=1) <= NEGATIVE_M
-        distance = float(self.index.query(descriptor, exclude=near).distances[0])
-        return distance if np.isfinite(distance) else np.nan
+    def _rival_share(
+        self, descriptor: Float[np.ndarray, " d"], image: UInt8[np.ndarray, "h h"], match: int, peak: Peak
+    ) -> float:
+        """How well the query fits other places of the map, as a share of how well it fits the match."""
+        if peak.correlation < CandidateConfig().min_rival_correlation:
+            return np.nan
+        rows = self._rivals(descriptor, match)
+        if not len(rows):
+            return np.nan
+        found = jax.device_get(search(image, self.images[np.resize(rows, RIVALS)])).some(slice(len(rows)))
+        upright = self.world_from_place @ inverse(upright_from_lidar(self.mounting(match)))
+        query = upright[match] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
+        expected = inverse(upright[rows]) @ query, np.full(len(rows), RivalConfig().agree_m)
+        return rival_share(found, float(peak.correlation), [expected])
+
+    def _rivals(self, descriptor: Float[np.ndarray, " d"], match: int) -> Int[np.ndarray, " k"]:
+        """Places that look like a query, away from its match and from each other."""
+        places, chosen = self.world_from_place[:, :3, 3], [match]
+        distances = np.linalg.norm(self.index.descriptors - descriptor, axis=1)
+        while len(chosen) <= RIVALS:
+            apart = np.linalg.norm(places[:, None] - places[chosen][None], axis=2).min(axis=1)
+            left = np.where(apart >= RIVAL_SPACING_M, distances, np.inf)
+            if not np.isfinite(left).any():
+                break
+            chosen.append(int(left.argmin()))
+        return np.array(chosen[1:], np.int64)
+
+
+def _shared(pairs: list[Relocated]) -> list[Relocated]:
+    """Answers that stand apart exclude each other: together they have a probability of at most 1."""
+    groups: list[list[Relocated]] = []
+    for pair in sorted(pairs, key=lambda pair: -pair.probability):
+        position = pair.world_from_query[:3, 3]
+        near = (group for group in groups if np.linalg.norm(group[0].world_from_query[:3, 3] - position) <= NEGATIVE_M)
+        group = next(near, None)
+        if group is None:
+            groups.append([pair])
+        else:
+            group.append(pair)
+    total = max(1.0, sum(group[0].probability for group in groups))
+    return [pair._replace(loop=dataclasses.replace(pair.loop, probability=pair.probability / total)) for pair in pairs]
 
 
 def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
@@ -263,7 +307,7 @@ def map_recording(
             if len(looked_at) == len(finder.index):  # not seen by an earlier run
                 if should_stop():
                     break
-                finder.add_seen(finder.seen_scan(recording, i, on_bad_scan), candidates=[])
+                finder.add_seen(finder.seen_scan(recording, i, on_bad_scan), compared=Compared([], None))
                 if kept is not None:
                     kept.keep(finder)
             if not finder.empty[len(looked_at)]:
@@ -291,8 +335,8 @@ def _recalled(
     """The folder of what an earlier run has seen, which the finder has now."""
     kept = Unfinished.opened(folder, settings(recording, finder, poses=poses, spacing_m=spacing_m))
 
-    def add(seen: Seen | None, candidates: list[Candidate]) -> None:
-        finder.add_seen(seen, candidates=candidates)
+    def add(seen: Seen | None, compared: Compared) -> None:
+        finder.add_seen(seen, compared=compared)
 
     kept.recall(finder, recording.mounting, add, missing=on_bad_scan is not None)
     return kept

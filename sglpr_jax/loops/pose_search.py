@@ -47,18 +47,32 @@ class VerificationConfig:
 DEFAULT = VerificationConfig()
 
 
+AnyArray = Array | np.ndarray
+
+
 class Peak(NamedTuple):
     """The best pose of a query in the frame of a match, to half a merged cell."""
 
-    x: Float[Array, "*b"]
-    y: Float[Array, "*b"]
+    x: Float[AnyArray, "*b"]
+    y: Float[AnyArray, "*b"]
     """Position of the query in the match's frame, in metres."""
-    yaw: Float[Array, "*b"]
+    yaw: Float[AnyArray, "*b"]
     """Rotation of the query, in radians, counter-clockwise, from 0 to 2 pi."""
-    correlation: Float[Array, "*b"]
+    correlation: Float[AnyArray, "*b"]
     """1 for equal images, about 0 for unrelated ones."""
-    second: Float[Array, "*b"]
+    second: Float[AnyArray, "*b"]
     """Highest correlation at any other pose (`second_m`, `second_deg`)."""
+
+    def one(self, k: int) -> "Peak":
+        """The k-th of several."""
+        return Peak(*(values[k] for values in self))
+
+    def some(self, rows: slice) -> "Peak":
+        """Some of several."""
+        return Peak(*(values[rows] for values in self))
+
+
+NO_PEAKS = Peak(*[np.zeros(0, np.float32)] * 5)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -166,10 +180,11 @@ def _inverse_transforms(size: int, reach: int) -> tuple[np.ndarray, np.ndarray]:
     Complex numbers are pairs of real ones, which XLA multiplies faster.
     """
     shifts = np.arange(-reach, reach + 1)
-    down = np.exp(2j * np.pi * np.outer(shifts, np.fft.fftfreq(size)))
-    right = np.exp(2j * np.pi * np.outer(np.fft.rfftfreq(size), shifts)) * twice(size).T / size**2
-    rows = np.block([[down.real, -down.imag], [down.imag, down.real]])
-    return rows.astype(np.float32), np.concatenate([right.real, -right.imag]).astype(np.float32)
+    down = 2 * np.pi * np.outer(shifts, np.fft.fftfreq(size))
+    right, often = 2 * np.pi * np.outer(np.fft.rfftfreq(size), shifts), twice(size).T / size**2
+    rows = np.block([[np.cos(down), -np.sin(down)], [np.sin(down), np.cos(down)]])
+    columns = np.concatenate([np.cos(right) * often, -np.sin(right) * often])
+    return rows.astype(np.float32), columns.astype(np.float32)
 
 
 def _peak(found: Float[Array, "d t r"], cell_m: float, config: VerificationConfig) -> Peak:

@@ -1,4 +1,9 @@
-"""How probable it is that two scans show one place: a logistic model of what retrieval and verification found."""
+"""How probable it is that two scans show one place: a monotone additive model of retrieval, comparison and repetition.
+
+The log odds are a sum of one piecewise linear function a number of `Evidence`. Each can only fall where the evidence
+weakens, and each is bounded: descriptors and images that agree perfectly say "this much and no more", so that they
+cannot outweigh other places that agree as well.
+"""
 
 import dataclasses
 import json
@@ -9,30 +14,39 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.optimize import minimize
 
 DEFAULTS = Path(__file__).with_name("probability.json")
-"""Models fitted in simulated towns, by the hash of the weights; "" is for all others. See docs/decisions/loops.md."""
-RIDGE = 1.0
-"""Pull of every weight towards 0, which keeps them finite where loops and others can be told apart without error."""
-STEPS = 50
+"""Models fitted in the simulator, by the hash of the weights; "" is for all others. See docs/decisions/loops.md."""
+KNOTS: Mapping[str, tuple[float, ...]] = {
+    "distance": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
+    "correlation": (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+    "second": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    "rival": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+}
+"""Where the functions may bend. Outside they are constant."""
+RISING = ("correlation",)
+"""Numbers that speak for a loop where they are large; the others speak against it."""
+RIDGE = 0.02
+"""Weight of the squared differences of the functions' values in the fit: keeps them finite, and smooth."""
 
 
 class Evidence(NamedTuple):
     """What speaks for pairs of scans, a number for each pair."""
 
     distance: Float[np.ndarray, "*n"]
-    """Between the descriptors."""
-    margin: Float[np.ndarray, "*n"]
-    """How much farther the nearest descriptor of another place is, more than 20 m off; NaN where there is none."""
+    """Distance of the descriptors."""
     correlation: Float[np.ndarray, "*n"]
-    """Of the images."""
+    """Correlation of the images."""
     second: Float[np.ndarray, "*n"]
-    """The second peak as a share of the first."""
+    """Second peak of the correlation, as a share of the best."""
+    rival: Float[np.ndarray, "*n"]
+    """Correlation with the best rival, as a share of the match's (`loops.rivals`); NaN if there are no rivals."""
 
     @classmethod
-    def of(cls, distance: float, margin: float, correlation: Any, second: Any) -> "Evidence":
-        """Of one pair."""
-        return cls(*(np.asarray(value, np.float64) for value in (distance, margin, correlation, second)))
+    def of(cls, distance: float, correlation: Any, second: Any, rival: float) -> "Evidence":
+        """Evidence of one pair."""
+        return cls(*(np.asarray(value, np.float64) for value in (distance, correlation, second, rival)))
 
     @classmethod
     def stack(cls, pairs: Sequence["Evidence"]) -> "Evidence":
@@ -41,94 +55,138 @@ class Evidence(NamedTuple):
 
 
 ALL = Evidence._fields
-OF_IMAGES = ("correlation", "second")
-"""What means the same whatever weights made the descriptors."""
+OF_IMAGES = ("correlation", "second", "rival")
+"""The numbers that mean the same whatever weights made the descriptors."""
+
+
+class Curve(NamedTuple):
+    """A piecewise linear function, constant outside its knots."""
+
+    knots: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def __call__(self, numbers: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """The values at some numbers; a missing one (NaN) counts as the worst."""
+        return np.where(np.isnan(numbers), min(self.values), np.interp(numbers, self.knots, self.values))
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopModel:
-    """Probability = 1 / (1 + exp(-(bias + sum of weight * (value - mean) / scale)))."""
+    """Probability = 1 / (1 + exp(-(bias + sum of curves)))."""
 
-    weights: Mapping[str, float]
-    """By the name of a field of `Evidence`; those that are not named do not count."""
-    means: Mapping[str, float]
-    scales: Mapping[str, float]
+    curves: Mapping[str, Curve]
+    """By the name of a field of `Evidence`. Fields without a curve do not count."""
     bias: float
     made_with: str
-    """On what it was fitted."""
+    """The pairs that it was fitted to."""
 
     def probability(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Of each pair, that it is a loop."""
+        """The probability of each pair that it is a loop."""
         return np.asarray(1 / (1 + np.exp(-np.clip(self.log_odds(evidence), -50, 50))))
 
     def log_odds(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """The logarithm of probability / (1 - probability)."""
-        return np.asarray(self.bias + self._standard(evidence) @ np.array(list(self.weights.values())))
+        return np.asarray(self.bias + sum(self.contributions(evidence).values()))
+
+    def contributions(self, evidence: Evidence) -> dict[str, Float[np.ndarray, "*n"]]:
+        """What each number adds to the log odds."""
+        values = evidence._asdict()
+        return {name: curve(np.asarray(values[name], np.float64)) for name, curve in self.curves.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """What `from_json` reads."""
-        return dataclasses.asdict(self)
+        """The value that `from_json` reads."""
+        curves = {name: curve._asdict() for name, curve in self.curves.items()}
+        return {"curves": curves, "bias": self.bias, "made_with": self.made_with}
 
     @classmethod
     def from_json(cls, value: Any, *, source: str) -> "LoopModel":
-        """Raises ValueError, naming the `source`, for anything but what `to_json` gave."""
+        """Raises ValueError, naming the `source`, for anything but the values of `to_json`."""
         try:
-            model = cls(**value)
-            columns = (model.weights, model.means, model.scales)
-            numbers = [model.bias, *(number for column in columns for number in column.values())]
-            fits = set(model.weights) == set(model.means) == set(model.scales) <= set(ALL)
-            fits = fits and all(math.isfinite(number) for number in numbers)
+            curves = {name: Curve(**{k: tuple(v) for k, v in one.items()}) for name, one in value["curves"].items()}
+            model = cls(curves, value["bias"], value["made_with"])
+            numbers = [model.bias, *(number for curve in curves.values() for part in curve for number in part)]
+            fits = set(curves) <= set(ALL) and all(math.isfinite(number) for number in numbers)
+            fits = fits and all(_is_curve(curve) for curve in curves.values())
         except (TypeError, KeyError, AttributeError, OverflowError):
             fits = False
         if not fits:
             raise ValueError(f"{source}: expected a model of loops ({', '.join(ALL)}), found another value")
         return model
 
-    def _standard(self, evidence: Evidence) -> Float[np.ndarray, "*n k"]:
-        """The values that count, on the scale of the fit; one that is missing is as in the mean."""
-        values = evidence._asdict()
-        columns = [(np.asarray(values[name]) - self.means[name]) / self.scales[name] for name in self.weights]
-        return np.nan_to_num(np.stack(columns, axis=-1))
+
+def _is_curve(curve: Curve) -> bool:
+    return len(curve.knots) == len(curve.values) > 0 and bool(np.all(np.diff(curve.knots) > 0))
 
 
 def fit(
-    evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, names: Sequence[str] = ALL, made_with: str = ""
+    evidence: Evidence,
+    is_loop: Bool[np.ndarray, " n"],
+    *,
+    names: Sequence[str] = ALL,
+    weights: Float[np.ndarray, " n"] | None = None,
+    made_with: str = "",
 ) -> LoopModel:
-    """The likeliest model of pairs that are known to be loops or not, by Newton's steps, with a small ridge.
+    """Fit the likeliest monotone model to pairs that are known to be loops or not.
 
-    Loops and others count as they come: the probabilities are those of a place where as many of the pairs are loops.
-    Raises ValueError where there are none of either.
+    Arguments:
+      evidence: One number of each kind a pair.
+      is_loop: Which pairs are loops.
+      names: The kinds that count.
+      weights: Of the pairs; without them all count alike.
+      made_with: What the pairs are, for people.
+
+    Raises:
+      ValueError: If there are no loops, or nothing else.
     """
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and others to fit to, found {is_loop.sum()} loops of {len(is_loop)} pairs")
-    values = {name: np.asarray(value, np.float64) for name, value in evidence._asdict().items() if name in names}
-    means = {name: float(np.nanmean(value)) for name, value in values.items()}
-    scales = {name: float(max(np.nanstd(value), 1e-9)) for name, value in values.items()}
-    model = LoopModel(dict.fromkeys(values, 0.0), means, scales, 0.0, made_with)
-    rows = np.column_stack([model._standard(evidence), np.ones(len(is_loop))])
-    ridge = np.diag([RIDGE] * len(values) + [1e-6])
-    found = np.zeros(rows.shape[1])
-    for _ in range(STEPS):
-        expected = 1 / (1 + np.exp(-np.clip(rows @ found, -50, 50)))
-        gradient = rows.T @ (is_loop - expected) - ridge @ found
-        curvature = (rows * (expected * (1 - expected))[:, None]).T @ rows + ridge
-        found = found + np.linalg.solve(curvature, gradient).clip(-3, 3)
-    weights = {name: float(weight) for name, weight in zip(values, found, strict=False)}
-    return dataclasses.replace(model, weights=weights, bias=float(found[-1]))
+    weights = np.ones(len(is_loop)) if weights is None else weights
+    columns = np.concatenate([_rises(name, getattr(evidence, name)) for name in names], axis=1)
+    columns = np.column_stack([columns, np.ones(len(is_loop))])
+    sign = np.where(is_loop, 1.0, -1.0)
+
+    def cost(steps: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
+        margin = sign * (columns @ steps)
+        slope = -weights * sign / (1 + np.exp(np.clip(margin, -50, 50)))
+        penalty = RIDGE * np.append(steps[:-1], 0.0)
+        return float(weights @ np.logaddexp(0, -margin) + penalty @ steps / 2), columns.T @ slope + penalty
+
+    bounds = [(0.0, None)] * (columns.shape[1] - 1) + [(None, None)]
+    steps = minimize(cost, np.zeros(columns.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
+    curves, used = {}, 0
+    for name in names:
+        count = len(KNOTS[name]) - 1
+        rise = np.concatenate([[0.0], np.cumsum(steps[used : used + count])])
+        values = rise if name in RISING else (rise[-1] - rise)
+        curves[name] = Curve(KNOTS[name], tuple(np.round(values, 4).tolist()))
+        used += count
+    return LoopModel(curves, float(steps[-1]), made_with)
+
+
+def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """How much of each step between two knots a number has made, from 0 to 1, from its worst value on."""
+    knots = np.array(KNOTS[name])
+    made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
+    return np.nan_to_num(made if name in RISING else 1 - made, nan=0.0)
 
 
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
-    """`model` on another sensor: its log odds stretched and shifted so that they are the likeliest there.
+    """`model` for another sensor: its log odds scaled and shifted so that they are the likeliest there.
 
-    These are two numbers, so that some hundred pairs that are known to be loops or not are enough. Raises ValueError
-    where there are none of either.
+    These are two numbers, so that some hundred pairs are enough. Raises ValueError as `fit` does.
     """
-    log_odds = model.log_odds(evidence)
-    single = fit(Evidence(*[log_odds] * len(ALL)), is_loop, names=ALL[:1])
-    gain = single.weights[ALL[0]] / single.scales[ALL[0]]
-    bias = single.bias - gain * single.means[ALL[0]]
-    weights = {name: gain * weight for name, weight in model.weights.items()}
-    return dataclasses.replace(model, weights=weights, bias=gain * model.bias + bias, made_with=made_with)
+    if is_loop.all() or not is_loop.any():
+        raise ValueError(f"expected loops and others to fit to, found {is_loop.sum()} loops of {len(is_loop)} pairs")
+    log_odds, sign = model.log_odds(evidence), np.where(is_loop, 1.0, -1.0)
+
+    def cost(line: Float[np.ndarray, " 2"]) -> float:
+        return float(np.logaddexp(0, -sign * (line[0] * log_odds + line[1])).sum() + (line[0] - 1) ** 2)
+
+    gain, shift = minimize(cost, np.array([1.0, 0.0]), method="L-BFGS-B", bounds=[(0.0, None), (None, None)]).x
+    curves = {
+        name: Curve(curve.knots, tuple(gain * value for value in curve.values)) for name, curve in model.curves.items()
+    }
+    return LoopModel(curves, float(gain * model.bias + shift), made_with)
 
 
 def default_model(weights_hash: str, *, path: Path = DEFAULTS) -> LoopModel:

@@ -7,13 +7,15 @@ there only its second-best pose counts.
 """
 
 import dataclasses
+import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.transforms import transform, yaw_of
+from sglpr_jax.loops.transforms import yaw_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,72 +35,78 @@ class RivalConfig:
 
 
 def rivals(
-    distances: Float[np.ndarray, " n"],
+    descriptor: Float[np.ndarray, " d"],
+    descriptors: Float[np.ndarray, "n d"],
     match: int,
     motion: Motion,
     usable: Bool[np.ndarray, " n"],
     *,
-    now: float,
     config: RivalConfig = RivalConfig(),
 ) -> Int[np.ndarray, " k"]:
     """Choose the rivals of a match: of each stretch of time the frame whose descriptor is nearest to the query's.
 
     Arguments:
-      distances: from the query's descriptor to those of all earlier frames.
-      match: the frame of the match.
-      motion: of all earlier frames.
-      usable: which frames show something.
-      now: the motion's clock at the query, in seconds.
-      config: how many, and how old.
+      descriptor: Descriptor of the query.
+      descriptors: Descriptors of all earlier frames.
+      match: Frame of the match.
+      motion: Motion of all earlier frames and the query.
+      usable: Earlier frames that show something.
+      config: Number and age of the rivals.
+
+    Returns:
+      Frames, in order.
     """
-    clock = np.array(motion.clock)
+    clock, now = np.array(motion.clock[: len(descriptors)]), motion.clock[len(descriptors)]
     youngest, oldest = config.age_s
-    starts = [now - oldest] + [clock[match] - oldest, clock[match] + youngest]
+    starts = (now - oldest, clock[match] - oldest, clock[match] + youngest)
     chosen = []
     for start, count in zip(starts, (config.of_query, config.of_match // 2, config.of_match // 2), strict=True):
         edges = np.linspace(start, start + oldest - youngest, count + 1)
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in itertools.pairwise(edges):
             pool = np.flatnonzero(usable & (clock >= low) & (clock < high) & (clock <= now - youngest))
             if len(pool):
-                chosen.append(pool[np.argmin(distances[pool])])
+                chosen.append(pool[np.linalg.norm(descriptors[pool] - descriptor, axis=1).argmin()])
     return np.unique(np.array(chosen, np.int64))
 
 
 def rival_share(
     peaks: Peak,
-    rows: Int[np.ndarray, " k"],
+    match_correlation: float,
+    expected: Sequence[tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]],
     *,
-    match: int,
-    match_peak: Peak,
-    motion: Motion,
-    query: int,
     config: RivalConfig = RivalConfig(),
 ) -> float:
-    """The best correlation of the query with a rival, at a pose that the motion does not explain, over the match's.
+    """Return the best correlation of a query with a rival, as a share of that with its match; NaN without rivals.
 
-    NaN without rivals. `motion` knows the query, too; `peaks` are those of the query over `rows`.
+    Arguments:
+      peaks: Poses of the query over k rivals.
+      match_correlation: Correlation of the query with its match.
+      expected: Poses of the query in the frames of the rivals, by what is known of the motion, and how far from them
+        a peak may be, in metres; NaN if the pose is not known. A peak there is no evidence of repetition, and the
+        second one counts in its place.
     """
-    if not len(rows):
+    if not len(peaks.correlation):
         return np.nan
-    match_from_query = transform(float(match_peak.x), float(match_peak.y), float(match_peak.yaw))
-    by_query, known = motion.from_frame(query, rows)
-    explained = known & _agree(peaks, by_query, _travelled(motion, query, rows), config)
-    by_match, known = motion.from_frame(match, rows)
-    explained |= known & _agree(peaks, by_match @ match_from_query, _travelled(motion, match, rows), config)
+    explained = np.zeros(len(peaks.correlation), bool)
+    for poses, tolerance_m in expected:
+        apart = np.hypot(poses[:, 0, 3] - np.asarray(peaks.x), poses[:, 1, 3] - np.asarray(peaks.y))
+        rotation = np.asarray(peaks.yaw) - yaw_of(poses)
+        rotation = np.abs((rotation + np.pi) % (2 * np.pi) - np.pi)
+        explained |= (apart <= tolerance_m) & (rotation <= np.radians(config.agree_deg))
     counted = np.where(explained, np.asarray(peaks.second), np.asarray(peaks.correlation))
-    return float(counted.max() / max(float(match_peak.correlation), 1e-6))
+    return float(counted.max() / max(match_correlation, 1e-6))
 
 
-def _travelled(motion: Motion, frame: int, rows: Int[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    return np.abs(np.array([motion.travelled[row] for row in rows]) - motion.travelled[frame])
-
-
-def _agree(
-    peaks: Peak, rival_from_query: Float[np.ndarray, "k 4 4"], travelled: Float[np.ndarray, " k"], config: RivalConfig
-) -> Bool[np.ndarray, " k"]:
-    """Which peaks are where the motion puts the query."""
-    apart = np.hypot(rival_from_query[:, 0, 3] - np.asarray(peaks.x), rival_from_query[:, 1, 3] - np.asarray(peaks.y))
-    turned = np.asarray(peaks.yaw) - yaw_of(rival_from_query)
-    turned = np.abs((turned + np.pi) % (2 * np.pi) - np.pi)
-    near = apart <= config.agree_m + config.agree_share * travelled
-    return np.asarray(near & (turned <= np.radians(config.agree_deg)))
+def expected_poses(
+    motion: Motion,
+    frame: int,
+    rows: Int[np.ndarray, " k"],
+    frame_from_query: Float[np.ndarray, "4 4"],
+    *,
+    config: RivalConfig = RivalConfig(),
+) -> tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]:
+    """The poses of a query at a known pose in a `frame`, in the frames of its rivals, as `rival_share` takes them."""
+    poses, known = motion.from_frame(frame, rows)
+    travelled = np.abs(np.array([motion.travelled[row] for row in rows]) - motion.travelled[frame])
+    tolerance = np.where(known, config.agree_m + config.agree_share * travelled, np.nan)
+    return poses @ frame_from_query, tolerance

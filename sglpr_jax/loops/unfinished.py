@@ -20,14 +20,15 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import alone_in, read_json, replacing, write_json, writing
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Seen
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
+from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import fingerprint
 
 KIND = "sglpr-jax unfinished loops"
-FORMAT = f"{KIND} 1"
+FORMAT = f"{KIND} 2"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
 OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
@@ -83,7 +84,7 @@ class Unfinished:
         self,
         finder: CandidateFinder,
         mounting: Mounting | None,
-        add: Callable[[Seen | None, list[Candidate]], None],
+        add: Callable[[Seen | None, Compared], None],
         *,
         missing: bool,
     ) -> None:
@@ -103,7 +104,9 @@ class Unfinished:
                 seen = Seen(np.array(descriptor), next(images), mounting) if row in shown else None
                 if seen is None and not missing:
                     return
-                add(seen, [one for one in candidates if one.query == row])
+                link = more["links"][row - self.kept]
+                compared = [one for one in candidates if one.query == row]
+                add(seen, Compared(compared, None if np.isnan(link).all() else Peak(*link)))
             self.kept = len(finder.index)
 
     def keep(self, finder: CandidateFinder, candidates: Sequence[Candidate] = (), *, all: bool = False) -> None:
@@ -116,6 +119,7 @@ class Unfinished:
         shown = sorted(set(range(first, end)) - set(finder.missing))
         images = [finder.images[row] for row in shown]
         more = {"shown": np.array(shown, np.int64), "images": np.stack(images) if images else np.zeros(0, np.uint8)}
+        more["links"] = np.array([_numbers(link) for link in finder.links[first:end]], np.float64)
         content = frames.to_bytes(more | _columns([one for one in candidates if one.query >= first]))
         with replacing(self._path) as temporary:
             temporary.write_bytes(content)
@@ -189,6 +193,10 @@ def _empty(folder: Path) -> None:
 
 def _is_own(path: Path) -> bool:
     return OWN.fullmatch(path.name) is not None and path.is_file()
+
+
+def _numbers(link: Peak | None) -> list[float]:
+    return [np.nan] * len(Peak._fields) if link is None else [float(value) for value in link]
 
 
 def _columns(candidates: list[Candidate]) -> dict[str, np.ndarray]:
