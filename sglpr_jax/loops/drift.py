@@ -13,7 +13,9 @@ from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
 from sglpr_jax.loops.transforms import travelled
 
-STEP_M, STEP_DEG = 0.01, 0.02
+GRAPH_M = 100.0
+"""Travelled distance after which the drift of a pose graph is that of the model, in metres."""
+STEP_M, STEP_DEG = 0.005, 0.005
 """Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
 
 
@@ -93,14 +95,13 @@ def position_deviations(
 
 def step_deviations(
     odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel
-) -> tuple[Float[np.ndarray, " n-1"], Float[np.ndarray, " n-1"]]:
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Standard deviations of the steps of a pose graph, in metres and radians.
 
-    Steps of a graph are independent, so that their variances grow with the distance, those of the model with its
-    square. The variance of a step is its share of that of the whole path: both agree at the end of the path.
+    Steps of a graph are independent, so their variances add up in proportion to the distance. Those of the model grow
+    with its square. Both are equal after `GRAPH_M`.
     """
-    way = travelled(odometry)
-    root = np.sqrt(np.diff(way) * way[-1])
+    root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
     metres, degrees = (
         np.hypot(drift.metres_per_metre * root, STEP_M),
         np.hypot(drift.degrees_per_metre * root, STEP_DEG),

@@ -67,7 +67,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
     done = []
     found = find_loops(drive, params, odometry=poses, registered=True, on_progress=done.append)
     assert done == list(range(1, len(drive) + 1)) and found.frames == len(drive)
-    assert len(found.loops) + len(found.refused) == len(streamed[0].supported)
+    assert len(found.loops) + len(found.rejected) == len(streamed[0].supported) + len(streamed[0].rejected)
     assert str(found).startswith(f"{len(found.loops)} loops in 240 of 240 frames of 08")
     for loop in found.loops:
         error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
