@@ -86,9 +86,11 @@ def position_deviations(
     positions: Float[np.ndarray, "n 3"], frame: int, *, drift: DriftModel = DriftModel()
 ) -> Float[np.ndarray, " n"]:
     """Standard deviation of the position of every frame relative to `frame`, in metres, over all directions."""
-    path = _Path.of(positions - positions[frame])
-    length = np.abs(path.length - path.length[frame])
-    lever = np.abs(path.squares - path.squares[frame]).trace(axis1=1, axis2=2)
+    away = positions - positions[frame]
+    steps = np.linalg.norm(np.diff(away, axis=0), axis=1)
+    levers = steps * ((away[:-1] + away[1:]) ** 2).sum(axis=1) / 4 + steps**3 / 12
+    length, lever = (np.concatenate([[0.0], np.cumsum(part)]) for part in (steps, levers))
+    length, lever = np.abs(length - length[frame]), np.abs(lever - lever[frame])
     across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
     return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
 

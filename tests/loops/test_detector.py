@@ -9,7 +9,8 @@ import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen, labelled, square_image
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.loops.find import MIN_OVERLAP, find_loops
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.joint import MIN_OVERLAP
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.verification import Alignment

@@ -1,4 +1,4 @@
-"""Wrong loops of places that repeat are rejected by odometry, true ones are kept whatever it drifts within the model."""
+"""Odometry rejects wrong loops of places that repeat, and keeps true ones whatever it drifts within the model."""
 
 import dataclasses
 import re
