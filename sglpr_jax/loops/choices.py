@@ -13,7 +13,7 @@ SPACING_M = 1.0
 """Scans nearer than this to the last place of their own drive are left out of a map."""
 CANDIDATES = 5
 """How many places of a map are looked at."""
-DRIFT_PERCENT = 2.0
+DRIFT_PERCENT = 1.0
 """Position drift of odometry: one standard deviation, in percent of the travelled distance."""
-DRIFT_DEG_PER_100M = 1.0
+DRIFT_DEG_PER_100M = 0.5
 """Heading drift of odometry: one standard deviation, in degrees per 100 m of travelled distance."""

@@ -13,7 +13,9 @@ from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
 from sglpr_jax.loops.transforms import travelled
 
-STEP_M, STEP_DEG = 0.01, 0.02
+GRAPH_M = 100.0
+"""Travelled distance after which the drift of a pose graph is that of the model, in metres."""
+STEP_M, STEP_DEG = 0.005, 0.005
 """Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
 
 
@@ -84,23 +86,24 @@ def position_deviations(
     positions: Float[np.ndarray, "n 3"], frame: int, *, drift: DriftModel = DriftModel()
 ) -> Float[np.ndarray, " n"]:
     """Standard deviation of the position of every frame relative to `frame`, in metres, over all directions."""
-    path = _Path.of(positions - positions[frame])
-    length = np.abs(path.length - path.length[frame])
-    lever = np.abs(path.squares - path.squares[frame]).trace(axis1=1, axis2=2)
+    away = positions - positions[frame]
+    steps = np.linalg.norm(np.diff(away, axis=0), axis=1)
+    levers = steps * ((away[:-1] + away[1:]) ** 2).sum(axis=1) / 4 + steps**3 / 12
+    length, lever = (np.concatenate([[0.0], np.cumsum(part)]) for part in (steps, levers))
+    length, lever = np.abs(length - length[frame]), np.abs(lever - lever[frame])
     across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
     return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
 
 
 def step_deviations(
     odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel
-) -> tuple[Float[np.ndarray, " n-1"], Float[np.ndarray, " n-1"]]:
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Standard deviations of the steps of a pose graph, in metres and radians.
 
-    Steps of a graph are independent, so that their variances grow with the distance, those of the model with its
-    square. The variance of a step is its share of that of the whole path: both agree at the end of the path.
+    Steps of a graph are independent, so their variances add up in proportion to the distance. Those of the model grow
+    with its square. Both are equal after `GRAPH_M`.
     """
-    way = travelled(odometry)
-    root = np.sqrt(np.diff(way) * way[-1])
+    root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
     metres, degrees = (
         np.hypot(drift.metres_per_metre * root, STEP_M),
         np.hypot(drift.degrees_per_metre * root, STEP_DEG),

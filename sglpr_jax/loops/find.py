@@ -58,7 +58,7 @@ class FoundLoops:
     def __str__(self) -> str:
         found = f"{len(self.loops)} loops in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
         counts = Counter(one.reason for one in self.rejected)
-        why = f" ({', '.join(f'{count} {reason}' for reason, count in counts.most_common())})" if counts else ""
+        why = f" ({', '.join(f'{reason}: {count}' for reason, count in counts.most_common())})" if counts else ""
         skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
         left = f", {self.unregistered} not registered" if self.unregistered else ""
         return f"{found}, {len(self.rejected)} pairs rejected{why}{left}{skipped}"

@@ -101,14 +101,15 @@ def _readings(
 ) -> str:
     """Both readings of loops that contradict the odometry, with the drift that explains them."""
     found = deviations(against, odometry, drift=config.drift, mounting=mounting)
-    drift = config.drift.scaled(float(np.median(found)))
+    drift = config.drift.scaled(float(f"{np.median(found):.2g}"))
     pairs = agree(against, odometry, mounting=mounting, drift=drift, config=config.consistency)
     members = [against[i] for i in largest_consistent_set(pairs)]
     percent, degrees = 100 * drift.metres_per_metre, 100 * drift.degrees_per_metre
     return (
-        f"Either places repeat, or the odometry drifts by about {drift} and not by {config.drift}: {len(members)} of "
-        f"{len(against)} loops then agree with each other, in {stretches(members, odometry)} separate parts of the "
-        f"drive. If it drifts that much, state it: --drift-percent {percent:.2g} --drift-deg-per-100m {degrees:.2g}."
+        f"Either places repeat, or the odometry drifts by about {drift}, not by {config.drift}: {len(members)} of "
+        f"{len(against)} loops would then be consistent (separate parts of the drive with at least three of them: "
+        f"{stretches(members, odometry)}). If it drifts that much, state it: --drift-percent {percent:.3g} "
+        f"--drift-deg-per-100m {degrees:.3g}."
     )
 
 

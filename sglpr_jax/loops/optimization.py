@@ -42,10 +42,11 @@ class OptimizedTrajectory(NamedTuple):
     """Stated drift."""
 
     def __str__(self) -> str:
-        loops = f"{self.inliers.sum()} of {len(self.inliers)} loops"
-        if len(self.inliers) and not self.inliers.any():
+        if not self.inliers.any():
             limit = f"{self.drift.max_deviation:g} sigmas of the stated drift ({self.drift})"
-            return f"trajectory not corrected: {loops} agree with the odometry within {limit}"
+            why = f"{len(self.inliers)} loops need more than {limit}" if len(self.inliers) else "no loops"
+            return f"trajectory not corrected: {why}"
+        loops = f"{self.inliers.sum()} of {len(self.inliers)} loops"
         moved = f"{self.moved_m:.2f} m at most, {self.moved_rms_m:.2f} m RMS"
         return f"trajectory corrected by {loops}: moved by {moved}, {self.deviation:.2f} sigmas of the stated drift"
 

@@ -10,7 +10,7 @@ from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import moved_covariance, yaw_of
 from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry, upright_poses
 
-Planar = Float[np.ndarray, "*n 3"]
+Planar = Float[np.ndarray, "... 3"]
 """Poses in the plane: x, y, yaw."""
 
 SEEN = np.array([0, 1, 5])

@@ -77,7 +77,7 @@ def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, m
     page = Parsed(loops_page(known, optimized=optimized))
     assert [headline for headline, _ in page.images].count("Corrected") == 1
     said = page.texts["Corrected"]
-    assert "2 of 3 loops; the others do not fit" in said and "optimized 0.00 m" in said
+    assert "Trajectory corrected by 2 of 3 loops: moved by 0.00 m at most" in said and "optimized 0.00 m" in said
     assert "RMSE" not in Parsed(loops_page(found, optimized=optimized)).texts["Corrected"]
     monkeypatch.setattr(figures, "can_draw", lambda: False)
     assert "optimized 0.00 m" in Parsed(loops_page(known, optimized=optimized)).texts["Corrected"]

@@ -76,7 +76,7 @@ def test_agreement_goes_both_ways_and_with_itself():
     loops = [loop_of(poses, i, i - 200, tuple(rng.normal(scale=[2, 2, 0.1]))) for i in range(205, 285, 5)]
     pairs = agree(loops, drifted(poses, rng))
     assert pairs.diagonal().all()
-    assert (pairs == pairs.T).mean() > 0.95  # the lever is that of one of the two
+    assert (pairs == pairs.T).mean() > 0.9  # the lever is that of one of the two
     np.testing.assert_array_equal(agree(loops, poses, loops[:3]), agree(loops, poses)[:, :3])
 
 

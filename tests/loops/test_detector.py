@@ -9,7 +9,8 @@ import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen, labelled, square_image
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.loops.find import MIN_OVERLAP, find_loops
+from sglpr_jax.loops.find import find_loops
+from sglpr_jax.loops.joint import MIN_OVERLAP
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.verification import Alignment
@@ -67,7 +68,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
     done = []
     found = find_loops(drive, params, odometry=poses, registered=True, on_progress=done.append)
     assert done == list(range(1, len(drive) + 1)) and found.frames == len(drive)
-    assert len(found.loops) + len(found.refused) == len(streamed[0].supported)
+    assert len(found.loops) + len(found.rejected) == len(streamed[0].supported) + len(streamed[0].rejected)
     assert str(found).startswith(f"{len(found.loops)} loops in 240 of 240 frames of 08")
     for loop in found.loops:
         error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query

@@ -15,6 +15,7 @@ from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.joint import check_odometry
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import check_level
@@ -79,7 +80,9 @@ def test_odometry_in_the_lidars_axes_agrees_with_the_loops_drifting_as_it_may(fo
 
 def test_odometry_in_other_axes_is_told(found, there_and_back):
     forward_is_y = there_and_back @ transform(0.0, 0.0, np.pi / 2)
-    words = r"08: expected odometry that most loops agree with, found \d\d of \d\d loops .* check the frame and the"
+    words = (
+        r"08: the odometry contradicts the loops of \d\d of \d\d frames; .* in other axes, check the file: x forward"
+    )
     with pytest.warns(DataWarning, match=words):
         assert len(found(forward_is_y).loops) < N / 2
 
@@ -97,18 +100,22 @@ def test_odometry_in_the_cameras_axes_is_told_by_its_way_too(there_and_back):
 
 
 def test_a_few_loops_tell_nothing():
-    find._check_odometry("08", {1, 2, 3, 4}, [], [])
-    find._check_odometry("08", set(), [], [])
+    for frames in ({1, 2, 3, 4}, set()):
+        check_odometry("08", frames, [], [], np.tile(np.eye(4), (5, 1, 1)), CONFIG)
 
 
-def test_wrong_loops_found_first_do_not_keep_the_true_ones_out(params, there_and_back, monkeypatch):
+def test_loops_that_contradict_the_odometry_are_rejected_and_do_not_keep_the_true_ones_out(
+    params, there_and_back, monkeypatch
+):
     """A few frames before the first revisit look like ten frames further on, again and again."""
     alike = range(N - 8, N)
     detector = searched(params, there_and_back, there_and_back, wrong={i: i - 30 for i in alike})
-    wrong = {loop.query for loop in detector.loops} & set(alike)
-    true = {loop.query for loop in detector.loops} - wrong
-    assert len(wrong) >= 7 and len(true) >= N - len(wrong) - 1
+    true = {loop.query for loop in detector.loops}
+    wrong = {one.loop.query for one in detector.rejected}
+    assert len(wrong) >= 7 and wrong <= set(alike) and not true & wrong and len(true) >= N - 1
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
     monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
     whole = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG)
-    assert {loop.query for loop in whole.refused} == wrong and len(whole.loops) >= N - 1
+    assert {one.loop.query for one in whole.rejected} == wrong and len(whole.loops) >= N - 1
+    assert {one.reason for one in whole.rejected} == {"contradicts the odometry"}
+    assert str(whole).endswith(f"{len(wrong)} pairs rejected (contradicts the odometry: {len(wrong)})")

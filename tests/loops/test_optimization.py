@@ -57,7 +57,7 @@ def test_the_error_of_a_drifted_drive_falls(twice_around, odometry, loops):
     true = twice_around[:, :3, 3]
     before = trajectory_error(odometry, true)
     found = optimized(odometry, loops)
-    assert found.believed.all() and len(found.believed) == len(loops)
+    assert found.inliers.all() and len(found.inliers) == len(loops)
     assert before > 2 and trajectory_error(found.poses, true) < 0.4 * before
     np.testing.assert_allclose(found.poses[0], odometry[0], atol=1e-6)
     for loop in loops:
@@ -69,7 +69,7 @@ def test_wrong_loops_do_not_bend_it(twice_around, odometry, loops):
     true = twice_around[:, :3, 3]
     wrong = tuple(Loop(100 + k, 20 + k, transform(1.0, 0.0, 0.1), COVARIANCE, 1.0) for k in range(3))
     found = optimized(odometry, (*wrong, *loops))
-    assert not found.believed[:3].any() and found.believed[3:].all()
+    assert not found.inliers[:3].any() and found.inliers[3:].all()
     assert trajectory_error(found.poses, true) == pytest.approx(
         trajectory_error(optimized(odometry, loops).poses, true), abs=0.05
     )
@@ -86,7 +86,7 @@ def test_of_a_recording_the_frames_that_were_looked_at(odometry, loops, tmp_path
         optimize_trajectory(FoundLoops(of_images(images), 90, early, (), None))
     none = optimize_trajectory(FoundLoops(of_images(images), 90, (), (), odometry))
     np.testing.assert_array_equal(none.poses, odometry[:90])
-    assert none.believed.shape == (0,)
+    assert none.inliers.shape == (0,)
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(ImportError, match=r"gtsam: pip install 'sglpr-jax\[gtsam\]'"):
         optimize_trajectory(found)

@@ -62,7 +62,7 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
     """The trajectory before and after the correction and, if true positions are known, the error of each."""
     assert found.odometry is not None
     both = {"odometry": found.odometry[: found.frames], "optimized": optimized.poses}
-    about = f"The {optimized}."
+    about = f"{str(optimized)[0].upper()}{str(optimized)[1:]}."
     true = found.recording.positions
     if true is not None and found.frames > 2:
         errors = (f"{name} {trajectory_error(poses, true[: found.frames]):.2f} m" for name, poses in both.items())

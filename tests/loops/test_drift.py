@@ -1,0 +1,109 @@
+"""A loop is as many sigmas from the odometry as the drift along the path that explains it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.drift import DriftModel, deviations, position_deviations, step_deviations
+from sglpr_jax.loops.graph_files import read_g2o, write_g2o
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.upright import upright_from_lidar
+
+from .drives import along, drifted, town, true_loops
+
+SHARP = dataclasses.replace(DriftModel(), position_m=1e-3, yaw_deg=1e-3)
+
+
+def exact(poses: np.ndarray, query: int, match: int) -> Loop:
+    return Loop(query, match, inverse(poses[match]) @ poses[query], np.zeros((6, 6)), 1.0)
+
+
+@settings(deadline=None, max_examples=30)
+@given(percent=st.floats(-1.5, 1.5), degrees=st.floats(-1, 1), start=st.integers(0, 600), length=st.integers(30, 320))
+def test_drift_of_constant_rate_is_at_most_its_multiple_of_the_model(percent, degrees, start, length):
+    poses = town()
+    odometry = drifted(poses, percent=percent, deg_per_100m=degrees)
+    (found,) = deviations([exact(poses, start + length, start)], odometry, drift=SHARP)
+    assert found <= 1.1 * np.hypot(percent / 1.0, degrees / 0.5) + 0.05
+
+
+def test_by_hand_straight_on():
+    """After 100 m: 1 % along, a quarter of it across, .5 degrees, and the constants."""
+    odometry = along([(0, 0), (101, 0)])
+    pose = odometry[100] @ transform(3.0, 0.0, 0.0)
+    ahead = Loop(100, 0, pose, np.zeros((6, 6)), 1.0)
+    np.testing.assert_allclose(deviations([ahead], odometry), 3 / np.hypot(1.0, 0.5), rtol=1e-6)
+    unsure = dataclasses.replace(ahead, covariance=np.diag([4.0, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(deviations([unsure], odometry), 3 / np.sqrt(1 + 0.25 + 4), rtol=1e-6)
+    turned = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, np.pi / 2), np.diag([0, 4.0, 0, 0, 0, 0]), 1.0)
+    ahead_is_its_right = dataclasses.replace(
+        turned, match_from_query=turned.match_from_query @ transform(0.0, -3.0, 0.0)
+    )
+    both = deviations([turned, ahead_is_its_right], odometry)
+    np.testing.assert_allclose(both[1] ** 2 - both[0] ** 2, 9 / 5.25, rtol=0.01)
+
+
+def test_positions_drift_along_and_by_the_turns_before():
+    positions = along([(0, 0), (101, 0)])[:, :3, 3]
+    found = position_deviations(positions, 100)
+    assert found[100] == 0 and (np.diff(found) < 0).all()
+    lever = np.radians(0.5) * 100 / np.sqrt(3)
+    assert found[0] == pytest.approx(np.sqrt(1 + 0.25**2 + lever**2), rel=1e-3)
+    np.testing.assert_allclose(position_deviations(positions[::-1], 0), found[::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [(0.0, 20.0, 0.0), (180.0, 0.0, 0.0)], ids=["nods", "upside down"])
+def test_of_a_tilted_sensor_the_deviations_are_the_same(degrees):
+    poses = town()
+    odometry, loops = drifted(poses, percent=1, deg_per_100m=0.5), true_loops(poses, every=20)
+    rotation = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    mounting = Mounting(1.73, tuple(rotation.T[:, 2].tolist()))
+    upright = upright_from_lidar(mounting)
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = upright[:3, :3].T
+    tilted = [
+        dataclasses.replace(
+            loop,
+            match_from_query=inverse(upright) @ loop.match_from_query @ upright,
+            covariance=turned @ loop.covariance @ turned.T,
+        )
+        for loop in loops
+    ]
+    found = deviations(tilted, inverse(upright) @ odometry @ upright, mounting=mounting)
+    np.testing.assert_allclose(found, deviations(loops, odometry), rtol=1e-6)
+
+
+def test_far_from_the_origin_and_of_nothing():
+    poses = town()
+    odometry, loops = drifted(poses, percent=1, deg_per_100m=0.5), true_loops(poses, every=20)
+    far = odometry.copy()
+    far[:, :2, 3] += [4.5e5, 5.4e6]
+    np.testing.assert_allclose(deviations(loops, far), deviations(loops, odometry), rtol=1e-4)
+    assert deviations([], odometry).shape == (0,)
+
+
+def test_the_steps_of_a_graph_add_up_to_the_model_after_100_m(tmp_path):
+    for step in (0.5, 2.0):
+        metres, radians = step_deviations(along([(0, 0), (100 + step, 0)], step), DriftModel())
+        assert np.sqrt(np.sum(metres**2)) == pytest.approx(1, rel=0.05)
+        assert np.degrees(np.sqrt(np.sum(radians**2))) == pytest.approx(0.5, rel=0.1)
+    metres, radians = step_deviations(np.tile(np.eye(4), (3, 1, 1)), DriftModel())
+    assert (metres > 0).all() and (radians > 0).all()
+    poses = along([(0, 0), (3, 0)])
+    write_g2o(tmp_path / "a.g2o", [], poses, drift=DriftModel(0.1, 0.05))
+    information = read_g2o(tmp_path / "a.g2o").edges[0][3]
+    assert information[0, 0] == pytest.approx(1 / (1.0 + 2.5e-5), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["metres_per_metre", "degrees_per_metre", "position_m", "max_deviation"])
+@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+def test_an_impossible_drift_is_an_error(name, value):
+    with pytest.raises(ValueError, match=f"expected {name} >=? ?0, found"):
+        DriftModel(**{name: value})
+    assert str(DriftModel(0.1, 0.05)) == "10 % and 5 degrees per 100 m"

@@ -1,0 +1,134 @@
+"""Odometry rejects wrong loops of places that repeat, and keeps true ones whatever it drifts within the model."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops.detector import DetectorConfig
+from sglpr_jax.loops.drift import DriftModel, deviations
+from sglpr_jax.loops.joint import accepted, check_odometry, stretches
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.optimization import optimized, trajectory_error
+from sglpr_jax.loops.transforms import transform
+
+from .drives import along, drifted, rooms, town, true_loops, wrong_loops
+
+SERPENTINE = along([(0, 0), (150, 0), (150, 26), (0, 26), (0, 52), (150, 52), (150, 78), (0, 78)], 2.0)
+
+
+def of_rooms() -> tuple[np.ndarray, list[Loop]]:
+    """Exact odometry of two rooms, and loops that take one for the other."""
+    poses = rooms()
+    return poses, wrong_loops(poses, (-8, 0), range(len(poses) - 60, len(poses) - 1))
+
+
+def of_a_corridor() -> tuple[np.ndarray, list[Loop]]:
+    """Exact odometry of a corridor of 90 m, driven once, with a door every 6 m."""
+    poses = along([(0, 0), (90, 0)], 0.5)
+    return poses, [loop for k in range(5, 12) for loop in wrong_loops(poses, (-6.0 * k, 0), range(12 * k + 12, 180, 9))]
+
+
+def of_a_car_park() -> tuple[np.ndarray, list[Loop]]:
+    """Odometry 1 % too long of a car park, and loops that take each row for the one before."""
+    queries = [i for i, pose in enumerate(SERPENTINE) if pose[1, 3] > 25 and i % 5 == 0]
+    return drifted(SERPENTINE, percent=1, deg_per_100m=0), wrong_loops(SERPENTINE, (0, -26), queries)
+
+
+@pytest.mark.parametrize("scene", [of_rooms, of_a_corridor, of_a_car_park])
+def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene):
+    odometry, wrong = scene()
+    assert len(wrong) >= 50 and deviations(wrong, odometry).min() > 8
+    kept, rejected = accepted(wrong, odometry)
+    assert not kept and {one.reason for one in rejected} == {"contradicts the odometry"}
+    found = optimized(odometry, tuple(wrong))
+    np.testing.assert_array_equal(found.poses, odometry)
+    assert not found.inliers.any() and str(found).startswith(f"trajectory not corrected: {len(wrong)} loops need")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_true_loops_are_kept_and_correct_the_drift(seed):
+    true = town()
+    odometry = drifted(true, percent=1, deg_per_100m=0.5, noise=1.0, seed=seed)
+    loops = true_loops(true, every=6)
+    assert len(loops) >= 52 and deviations(loops, odometry).max() < 1.7
+    kept, rejected = accepted(loops, odometry)
+    assert kept == loops and not rejected
+    found = optimized(odometry, tuple(kept))
+    assert found.inliers.all() and found.deviation < 2
+    before, after = (trajectory_error(poses, true[:, :3, 3]) for poses in (odometry, found.poses))
+    assert after < 0.5 * before
+    moved = np.linalg.norm(found.poses[:, :3, 3] - odometry[:, :3, 3], axis=1)
+    assert found.moved_m == moved.max() and found.moved_rms_m == pytest.approx(np.sqrt(np.mean(moved**2)))
+    assert f"moved by {moved.max():.2f} m at most, " in str(found) and "sigmas of the stated drift" in str(found)
+
+
+def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
+    true = town()
+    loops = true_loops(true, every=6)
+    wrong = dataclasses.replace(loops[-5], match_from_query=loops[-5].match_from_query @ transform(6.0, 0.0, 0.0))
+    odometry = drifted(true, percent=1, deg_per_100m=0.5)
+    kept, rejected = accepted([*loops, wrong], odometry)
+    assert kept == loops and [(one.loop, one.reason) for one in rejected] == [(wrong, "contradicts other loops")]
+
+
+def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_can_be_stated():
+    true = town()
+    odometry, loops = drifted(true, percent=10, deg_per_100m=5), true_loops(true, every=3)
+    kept, rejected = accepted(loops, odometry)
+    assert not kept
+    with pytest.warns(DataWarning, match="Either places repeat, or the odometry drifts by about") as told:
+        check_odometry("08", {loop.query for loop in loops}, kept, rejected, odometry, DetectorConfig())
+    message = str(told[0].message)
+    assert (
+        "the odometry contradicts the loops of 106 of 106 frames" in message
+        and "106 of 106 loops would then be consistent" in message
+    )
+    percent, degrees = map(
+        float,
+        re.search(r"--drift-percent (\S+) --drift-deg-per-100m (\S+)\.$", message.split(" If the poses")[0]).groups(),
+    )
+    assert 5 < percent < 20 and 2 < degrees < 10
+    drift = DriftModel(percent / 100, degrees / 100)
+    kept, _ = accepted(loops, odometry, drift=drift)
+    assert len(kept) > 0.98 * len(loops)
+    found = optimized(odometry, tuple(kept), drift=drift)
+    assert trajectory_error(found.poses, true[:, :3, 3]) < 0.3 * trajectory_error(odometry, true[:, :3, 3])
+
+
+def test_a_few_wrong_loops_among_many_true_ones_are_no_reason_to_doubt_the_odometry():
+    true = town()
+    loops = true_loops(true, every=6)
+    wrong = [Loop(300 + i, 100 + i, np.eye(4), loops[0].covariance, 1.0) for i in range(20)]
+    kept, rejected = accepted([*wrong, *loops], true)
+    assert kept == loops and len(rejected) == 20
+    check_odometry("08", {one.query for one in (*loops, *wrong)}, kept, rejected, true, DetectorConfig())
+
+
+def test_loops_in_a_row_are_one_part_of_the_drive():
+    poses = along([(0, 0), (600, 0)])
+    at = [*range(300, 320), *range(400, 402), *range(500, 510)]
+    loops = [Loop(query, query - 300, np.eye(4), np.eye(6), 1.0) for query in at]
+    assert stretches(loops, poses) == 2 and stretches([], poses) == 0
+    same_match = [Loop(query, 100 + i, np.eye(4), np.eye(6), 1.0) for i, query in enumerate(at)]
+    assert stretches(same_match, poses) == 1
+
+
+@pytest.mark.parametrize(("wrong", "right"), [(4, 48), (10, 0)])
+def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_taken(wrong, right):
+    """Loops 8 m off agree with the odometry of a long path and with each other, but not beside the true loops."""
+    true = town()
+    loops = true_loops(true, every=6)
+    aside = [
+        dataclasses.replace(one, match_from_query=one.match_from_query @ transform(0.0, 8.0, 0.0))
+        for one in loops[-wrong:]
+    ]
+    assert deviations(aside, true).max() < 1
+    found = optimized(true, (*loops[:-wrong], *aside))
+    assert found.inliers.sum() == right and not found.inliers[-wrong:].any()
+    assert found.deviation < 1 and found.moved_m < 1
+    if not right:
+        np.testing.assert_array_equal(found.poses, true)
+        assert str(found).startswith("trajectory not corrected: 53 loops need more than 4 sigmas of the stated drift")
