@@ -32,7 +32,7 @@ from sglpr_jax.sim.sceneries.ways import REVISITS, Revisit
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import HDL64E, SENSORS
 
-ROUTES: dict[Revisit, tuple[str, ...]] = {"none": ("01", "04", "03"), "same": ("06", "00"), "opposite": ("08",)}
+ROUTES: dict[Revisit, tuple[str, ...]] = {"none": ("01", "04"), "same": ("06", "00"), "opposite": ("08",)}
 """Routes of the towns; the seed chooses."""
 HIDDEN_DEG = (60.0, 300.0, 91.0)
 """Azimuths that a sensor of 120 degrees does not see, and the elevation below which they are hidden."""

@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from sglpr_jax.sim.dataset import write_dataset, write_sessions
     from sglpr_jax.sim.drive import PlanarPath, TimedPoses, plan_scan_path, poses_on, read_path
     from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
+    from sglpr_jax.sim.repeating import simulate_repeating
     from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
     from sglpr_jax.sim.sessions import Session, plan_sessions
     from sglpr_jax.sim.simulation import Simulated, simulate
@@ -29,6 +30,7 @@ _HOME_OF = {
     "scan": "sensor",
     "simulate": "simulation",
     "simulate_recording": "recording",
+    "simulate_repeating": "repeating",
     "write_dataset": "dataset",
     "write_sessions": "dataset",
 }
@@ -59,6 +61,7 @@ __all__ = [
     "scan",
     "simulate",
     "simulate_recording",
+    "simulate_repeating",
     "write_dataset",
     "write_sessions",
 ]

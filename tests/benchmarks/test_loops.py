@@ -78,3 +78,15 @@ def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
     closures.print_table("a line", {"maps": maps, "scans": scans}, drive)
     table = capsys.readouterr().out
     assert "0.500" in table and "maps" in table
+
+
+def test_drives_where_places_repeat_are_rendered_once(tmp_path):
+    options = ("--sceneries", "walls", "town", "--revisits", "none", "--sensors", "vlp16", "--scans", "12")
+    options = (*options, "--azimuth-steps", "90", "--out", str(tmp_path))
+    lines = printed("repeating_scans.py", *options).splitlines()
+    assert [line.split(":")[0] for line in lines] == ["1/2 walls-none-vlp16-1.npz", "2/2 town-none-vlp16-1.npz"]
+    with np.load(tmp_path / "walls-none-vlp16-1.npz") as kept:
+        assert kept["descriptors"].shape == (12, 256) and kept["images"].dtype == np.uint8
+        assert kept["world_from_lidar"].shape == (12, 4, 4) and kept["times"].shape == (12,)
+        assert (str(kept["scenery"]), int(kept["seed"]), float(kept["other_m"])) == ("walls", 1, 20.0)
+    assert printed("repeating_scans.py", *options) == ""

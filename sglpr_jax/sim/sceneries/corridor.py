@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from sglpr_jax.sim.raw_ids import BUILDING, OTHER_GROUND
 from sglpr_jax.sim.sceneries.site import Site, Spot, block, even_ground
-from sglpr_jax.sim.sceneries.ways import STEP_M, rounded
+from sglpr_jax.sim.sceneries.ways import STEP_M, Line, rounded
 from sglpr_jax.sim.things import Thing
 
 Place = Float[np.ndarray, "2"]
@@ -18,14 +18,7 @@ THICK_M = 0.6
 def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """One straight corridor, or four that meet at right angles around a core, with a door every 5 to 7 metres."""
     half, height, pitch, recess = rng.uniform(1.0, 1.4), rng.uniform(2.4, 3.0), rng.uniform(5, 7), rng.uniform(0.1, 0.3)
-    if closed:
-        size = np.array([0.5 + rng.uniform(0, 0.15), 0.0]) * length_m / 2
-        size[1] = length_m / 2 - size[0]
-        corners = np.array([(0.0, 0.0), (size[0], 0.0), size, (0.0, size[1])])
-        line = rounded(corners, corner_m=0.5, closed=True)
-    else:
-        corners = np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
-        line = np.stack([np.arange(0, length_m, STEP_M), np.zeros(len(np.arange(0, length_m, STEP_M)))], axis=1)
+    line, corners = _around(rng, length_m) if closed else _straight(length_m)
     starts = corners if closed else corners[:1]
     spots = []
     for start, stop in zip(starts, np.roll(corners, -1, axis=0), strict=False):
@@ -34,6 +27,20 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     (long, wide), (x, y) = (high - low + 4).tolist(), ((low + high) / 2).tolist()
     ceiling = Spot((block(BUILDING, long, wide, 0.3, bottom=height),), x, y)
     return Site(line, [*spots, ceiling], even_ground(OTHER_GROUND))
+
+
+def _straight(length_m: float) -> tuple[Line, Line]:
+    """A straight way, and the ends of its corridor."""
+    x = np.arange(0, length_m, STEP_M)
+    return np.stack([x, np.zeros(len(x))], axis=1), np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
+
+
+def _around(rng: np.random.Generator, length_m: float) -> tuple[Line, Line]:
+    """A closed way around a rectangular core, and the corners of its corridors."""
+    long = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
+    wide = length_m / 2 - long
+    corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
+    return rounded(corners, corner_m=0.5, closed=True), corners
 
 
 def _walls(

@@ -15,6 +15,7 @@ PIECE_S = 1.5
 
 
 def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Four lanes between rails with posts, walls of equal panels, lamps and gantries; hills at most 1.5 % steep."""
     whole, driven = road(rng, length_m, closed)
     rail, wall, panel = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
     fence = _both(block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1))
