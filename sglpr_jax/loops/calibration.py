@@ -19,7 +19,7 @@ from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
-from sglpr_jax.loops.rivals import rival_share
+from sglpr_jax.loops.rivals import distance_share, rival_share
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
@@ -143,4 +143,5 @@ class _Places:
         share = rival_share(peaks.some(slice(1, None)), float(peak.correlation), [])
         fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))
         distance = float(np.linalg.norm(finder.index.descriptors[row].astype(np.float64) - query.descriptor))
-        return Evidence.of(distance, fitted.correlation, fitted.second, share)
+        apart = np.linalg.norm(finder.index.descriptors[rows[1:]] - query.descriptor, axis=1)
+        return Evidence.of(distance, distance_share(distance, apart, []), fitted.correlation, fitted.second, share)

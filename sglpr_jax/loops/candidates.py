@@ -21,7 +21,7 @@ from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion, MotionConfig
 from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, search
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.rivals import RivalConfig, expected_poses, rival_share, rivals
+from sglpr_jax.loops.rivals import RivalConfig, distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
 from sglpr_jax.loops.verification import Alignment, refined
@@ -219,17 +219,23 @@ class CandidateFinder:
     def _candidate(self, seen: Seen, match: int, distance: float, peak: Peak) -> Candidate:
         query, rules = len(self.index), self.config.rivals
         alignment = jax.device_get(refined(seen.image, self.images[match], peak, config=self.verification))
-        share = np.nan
+        shares = np.nan, np.nan
         if peak.correlation >= self.config.min_rival_correlation:
             usable = ~np.array(self.empty, bool)
             known = self.index.descriptors
             rows = rivals(seen.descriptor, known, match, self.motion, usable, config=rules)
             found = self.search(seen.image, [self.images[row] for row in rows], rules.of_query + rules.of_match)
             match_from_query = transform(float(peak.x), float(peak.y), float(peak.yaw))
-            by_query = expected_poses(self.motion, query, rows, np.eye(4), config=rules)
-            by_match = expected_poses(self.motion, match, rows, match_from_query, config=rules)
-            share = rival_share(found, float(peak.correlation), [by_query, by_match], config=rules)
-        evidence = Evidence.of(distance, alignment.correlation, alignment.second, share)
+            expected = [
+                expected_poses(self.motion, query, rows, np.eye(4), config=rules),
+                expected_poses(self.motion, match, rows, match_from_query, config=rules),
+            ]
+            apart = np.linalg.norm(known[rows] - seen.descriptor, axis=1)
+            shares = (
+                distance_share(distance, apart, expected, config=rules),
+                rival_share(found, float(peak.correlation), expected, config=rules),
+            )
+        evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
         return Candidate(query, match, alignment, evidence)
 
     def search(self, image: UInt8[np.ndarray, "n n"], matches: Sequence[UInt8[np.ndarray, "n n"]], size: int) -> Peak:

@@ -25,26 +25,11 @@ BLOCK = 64
 class ConsistencyConfig:
     """Thresholds for the consistency of two loops."""
 
-    neighbours: int = 3
-    """Number of consecutive frames whose loops are compared with each other."""
-    support: int = 2
-    """Minimum number of these loops, including the loop itself, that show the same place."""
-    frames_a_frame: float = 3.0
-    """Without odometry, matches of queries k frames apart are at most this factor times k + 1 frames apart."""
     position_m: float = 0.5
     yaw_deg: float = 1.5
     """Standard deviations of a circle of two loops in addition to their covariances, in metres and degrees."""
     deviations: float = 3.0
     """Two loops are consistent if their circle closes within this number of standard deviations."""
-
-
-def agree_in_order(
-    loops: Sequence[Loop], *, config: ConsistencyConfig = ConsistencyConfig()
-) -> Bool[np.ndarray, "n n"]:
-    """Pairs of loops that are consistent without odometry: the match moves as the query does, in either direction."""
-    query, match = frames_of(loops)
-    on = np.abs(query[:, None] - query[None])
-    return np.abs(match[:, None] - match[None]) <= config.frames_a_frame * (on + 1)
 
 
 def agree(

@@ -6,16 +6,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
+from scipy.special import expit, logit
 
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Compared, Seen
 from sglpr_jax.loops.choices import MIN_PROBABILITY
-from sglpr_jax.loops.consistency import ConsistencyConfig, agree, agree_in_order
+from sglpr_jax.loops.consistency import ConsistencyConfig, agree
 from sglpr_jax.loops.drift import DriftModel, deviations
 from sglpr_jax.loops.given import given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.pose_search import VerificationConfig
-from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
+from sglpr_jax.loops.probability import LoopModel, default_model
+from sglpr_jax.loops.sequence import SequenceConfig, added_log_odds, agree_in_motion, agree_in_order
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.models.params import Params
 
@@ -33,6 +35,7 @@ class DetectorConfig:
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
+    sequence: SequenceConfig = SequenceConfig()
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""
 
@@ -111,42 +114,48 @@ class LoopDetector:
         """
         candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared)
         self.candidates += candidates
-        if candidates:
-            probabilities = self.model.probability(Evidence.stack([one.evidence for one in candidates]))
-            best = int(np.argmax(probabilities))
-            if probabilities[best] >= min(self.config.min_neighbour_probability, self.config.min_probability):
-                self._waiting.append(self._loop(candidates[best], float(probabilities[best])))
-        first = len(self) - self.config.consistency.neighbours
+        for one in candidates:
+            log_odds = float(self.model.log_odds(one.evidence))
+            least = min(self.config.min_neighbour_probability, self.config.min_probability)
+            if log_odds >= logit(least):
+                self._waiting.append(self._loop(one, float(expit(log_odds))))
+        first = len(self) - 1 - self.config.sequence.frames
         self._waiting = [loop for loop in self._waiting if loop.query >= first]
         new = self._confirmed() if self._waiting else []
         self.loops += new
         return new
 
     def _confirmed(self) -> list[Loop]:
-        """Probable loops of the last frames that neighbours and, where there is odometry, other loops speak for."""
-        rules = self.config.consistency
+        """Loops of the last frames that the sequential test accepts and, with odometry, the drift and other loops."""
+        rules, motion = self.config.sequence, self.finder.motion
         odometry = np.stack(self.finder.odometry) if self.finder.odometry else None
-        found = self._supported(agree_in_order(self._waiting, config=rules))
-        self.by_scans |= {loop.query for loop in found}
+        self.by_scans |= {loop.query for loop in self._accepted(agree_in_order(self._waiting, config=rules))}
+        found = self._accepted(agree_in_motion(self._waiting, motion, self.finder.mounting, config=rules))
         if odometry is not None:
-            found = self._supported(agree(self._waiting, odometry, **self._rules))
             found = self._within_drift(found, odometry)
-        known = {loop.query for loop in self.supported[-rules.neighbours :]}
+        recent = 2 * rules.frames
+        known = {loop.query for loop in self.supported[-recent:]}
         self.supported += [loop for loop in found if loop.query not in known]
-        done = {loop.query for loop in self.loops[-rules.neighbours :]}
+        done = {loop.query for loop in self.loops[-recent:]}
         return [loop for loop in found if loop.query not in done and (odometry is None or self._agrees(loop, odometry))]
 
-    def _supported(self, pairs: Bool[np.ndarray, "n n"]) -> list[Loop]:
-        """The probable loops of the last frames with which enough of these agree; `pairs` says which do."""
-        enough = pairs.sum(axis=1) >= self.config.consistency.support
-        probable = [loop.probability >= self.config.min_probability for loop in self._waiting]
-        return [loop for loop, fits in zip(self._waiting, enough & probable, strict=True) if fits]
+    def _accepted(self, agreeing: Bool[np.ndarray, "n n"]) -> list[Loop]:
+        """The loops of the last frames that are probable enough, given those that agree with them."""
+        rules = self.config.sequence
+        own = logit(np.array([loop.probability for loop in self._waiting]))
+        log_odds = added_log_odds(self._waiting, own, agreeing, self.finder.motion, config=rules)
+        enough = (agreeing.sum(axis=1) >= rules.support) & (log_odds >= logit(self.config.min_probability))
+        return [
+            dataclasses.replace(loop, probability=float(expit(value)))
+            for loop, value, fits in zip(self._waiting, log_odds, enough, strict=True)
+            if fits
+        ]
 
     def _within_drift(self, loops: list[Loop], odometry: Float[np.ndarray, "n 4 4"]) -> list[Loop]:
         """The loops that the drift of the odometry explains. The others are rejected."""
         drift, mounting = self.config.drift, self.finder.mounting
         fits = deviations(loops, odometry, drift=drift, mounting=mounting) <= drift.max_deviation
-        known = {one.loop.query for one in self.rejected[-self.config.consistency.neighbours :]}
+        known = {one.loop.query for one in self.rejected[-2 * self.config.sequence.frames :]}
         against = [loop for loop, fit in zip(loops, fits, strict=True) if not fit and loop.query not in known]
         self.rejected += [Rejected(loop, "contradicts the odometry") for loop in against]
         return [loop for loop, fit in zip(loops, fits, strict=True) if fit]

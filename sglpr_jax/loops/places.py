@@ -21,7 +21,7 @@ from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.pose_search import Peak, VerificationConfig, search
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
-from sglpr_jax.loops.rivals import RivalConfig, rival_share
+from sglpr_jax.loops.rivals import RivalConfig, distance_share, rival_share
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.upright import check_level, upright_from_lidar
@@ -146,8 +146,8 @@ class PlaceMap:
         pairs = []
         for k, (row, distance) in enumerate(zip(rows.tolist(), distances.tolist(), strict=True)):
             alignment = jax.device_get(refined(image, self.images[row], peaks.one(k), config=settings))
-            share = self._rival_share(descriptor, image, row, peaks.one(k))
-            evidence = Evidence.of(distance, alignment.correlation, alignment.second, share)
+            shares = self._rival_shares(descriptor, image, row, distance, peaks.one(k))
+            evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
             mountings = {"query_mounting": mounting, "match_mounting": self.mounting(row)}
             probability = float(model.probability(evidence))
             loop = planar_loop(len(self), row, alignment, probability=probability, **mountings)
@@ -189,20 +189,24 @@ class PlaceMap:
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
             yield descriptor.tobytes(), pose.tobytes()
 
-    def _rival_share(
-        self, descriptor: Float[np.ndarray, " d"], image: UInt8[np.ndarray, "h h"], match: int, peak: Peak
-    ) -> float:
-        """How well the query fits other places of the map, as a share of how well it fits the match."""
-        if peak.correlation < CandidateConfig().min_rival_correlation:
-            return np.nan
+    def _rival_shares(
+        self,
+        descriptor: Float[np.ndarray, " d"],
+        image: UInt8[np.ndarray, "h h"],
+        match: int,
+        distance: float,
+        peak: Peak,
+    ) -> tuple[float, float]:
+        """Distance and correlation of the match, compared with those of other places of the map (`loops.rivals`)."""
         rows = self._rivals(descriptor, match)
-        if not len(rows):
-            return np.nan
+        if peak.correlation < CandidateConfig().min_rival_correlation or not len(rows):
+            return np.nan, np.nan
         found = jax.device_get(search(image, self.images[np.resize(rows, RIVALS)])).some(slice(len(rows)))
         upright = self.world_from_place @ inverse(upright_from_lidar(self.mounting(match)))
         query = upright[match] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
-        expected = inverse(upright[rows]) @ query, np.full(len(rows), RivalConfig().agree_m)
-        return rival_share(found, float(peak.correlation), [expected])
+        expected = [(inverse(upright[rows]) @ query, np.full(len(rows), RivalConfig().agree_m))]
+        apart = np.linalg.norm(self.index.descriptors[rows] - descriptor, axis=1)
+        return distance_share(distance, apart, expected), rival_share(found, float(peak.correlation), expected)
 
     def _rivals(self, descriptor: Float[np.ndarray, " d"], match: int) -> Int[np.ndarray, " k"]:
         """Places that look like a query, away from its match and from each other."""

@@ -51,7 +51,7 @@ AnyArray = Array | np.ndarray
 
 
 class Peak(NamedTuple):
-    """The best pose of a query in the frame of a match, to half a merged cell."""
+    """The best pose of a query in the frame of a match, to a fraction of a merged cell."""
 
     x: Float[AnyArray, "*b"]
     y: Float[AnyArray, "*b"]
@@ -188,11 +188,30 @@ def _inverse_transforms(size: int, reach: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _peak(found: Float[Array, "d t r"], cell_m: float, config: VerificationConfig) -> Peak:
-    down, turn, right = jnp.unravel_index(jnp.argmax(found), found.shape)
-    elsewhere = jnp.where(_near(found.shape, (down, turn, right), cell_m, config), 0.0, found)
+    at = jnp.unravel_index(jnp.argmax(found), found.shape)
+    elsewhere = jnp.where(_near(found.shape, at, cell_m, config), 0.0, found)
+    down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
     reach, step = cells(config.max_shift_m, cell_m), np.float32(2 * np.pi / config.turns)
-    x, y = (right - reach) * cell_m, (reach - down) * cell_m
-    return Peak(x, y, turn * step, found[down, turn, right], jnp.maximum(jnp.max(elsewhere), 0))
+    x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
+    return Peak(x, y, yaw, found[at], jnp.maximum(jnp.max(elsewhere), 0))
+
+
+def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
+    """Where the peak lies between the cells along each axis: that of the parabola through three values."""
+    offsets = []
+    for axis, at in enumerate(peak):
+        size = found.shape[axis]
+        before, after = at - 1, at + 1
+        if axis != 1:  # rotations wrap around, shifts end
+            before, after = jnp.maximum(before, 0), jnp.minimum(after, size - 1)
+        low, best, high = (
+            found[tuple(where if k == axis else other for k, other in enumerate(peak))]
+            for where in (before % size, at, after % size)
+        )
+        bend = low - 2 * best + high
+        offset = (low - high) / (2 * jnp.where(bend < 0, bend, -1e9))
+        offsets.append(jnp.clip(offset, -0.5, 0.5))
+    return offsets
 
 
 def _near(

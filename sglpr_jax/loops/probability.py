@@ -20,6 +20,7 @@ DEFAULTS = Path(__file__).with_name("probability.json")
 """Models fitted in the simulator, by the hash of the weights; "" is for all others. See docs/decisions/loops.md."""
 KNOTS: Mapping[str, tuple[float, ...]] = {
     "distance": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
+    "distance_share": (0.3, 0.5, 0.7, 0.9, 1.1),
     "correlation": (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
     "second": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "rival": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
@@ -36,17 +37,20 @@ class Evidence(NamedTuple):
 
     distance: Float[np.ndarray, "*n"]
     """Distance of the descriptors."""
+    distance_share: Float[np.ndarray, "*n"]
+    """The same as a share of the distance to the nearest rival's (`loops.rivals`); NaN if there are no rivals."""
     correlation: Float[np.ndarray, "*n"]
     """Correlation of the images."""
     second: Float[np.ndarray, "*n"]
     """Second peak of the correlation, as a share of the best."""
     rival: Float[np.ndarray, "*n"]
-    """Correlation with the best rival, as a share of the match's (`loops.rivals`); NaN if there are no rivals."""
+    """Correlation with the best rival, as a share of the match's; NaN if there are no rivals."""
 
     @classmethod
-    def of(cls, distance: float, correlation: Any, second: Any, rival: float) -> "Evidence":
+    def of(cls, distance: float, distance_share: float, correlation: Any, second: Any, rival: float) -> "Evidence":
         """Evidence of one pair."""
-        return cls(*(np.asarray(value, np.float64) for value in (distance, correlation, second, rival)))
+        values = (distance, distance_share, correlation, second, rival)
+        return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
     def stack(cls, pairs: Sequence["Evidence"]) -> "Evidence":

@@ -32,6 +32,8 @@ class RivalConfig:
     agree_share: float = 0.05
     """A fit agrees with the motion up to this distance, in metres, plus this share of the travelled distance."""
     agree_deg: float = 20.0
+    overlap_m: float = 15.0
+    """Scans nearer than this see much of the same, in metres."""
 
 
 def rivals(
@@ -95,6 +97,25 @@ def rival_share(
         explained |= (apart <= tolerance_m) & (rotation <= np.radians(config.agree_deg))
     counted = np.where(explained, np.asarray(peaks.second), np.asarray(peaks.correlation))
     return float(counted.max() / max(match_correlation, 1e-6))
+
+
+def distance_share(
+    distance: float,
+    rival_distances: Float[np.ndarray, " k"],
+    expected: Sequence[tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]],
+    *,
+    config: RivalConfig = RivalConfig(),
+) -> float:
+    """Return the descriptor distance of a query to its match, as a share of that to the nearest rival.
+
+    Rivals that are known to see much of what the query sees do not count; NaN without others. For `expected` see
+    `rival_share`.
+    """
+    overlaps = np.zeros(len(rival_distances), bool)
+    for poses, tolerance_m in expected:
+        overlaps |= np.isfinite(tolerance_m) & (np.hypot(poses[:, 0, 3], poses[:, 1, 3]) < config.overlap_m)
+    apart = rival_distances[~overlaps]
+    return float(distance / max(apart.min(), 1e-6)) if len(apart) else np.nan
 
 
 def expected_poses(
