@@ -1,77 +1,94 @@
-"""Fit the models of loops that ship with the package: how probable a pair is, by what simulated towns showed.
+"""Fit the models of loops that ship with the package: how probable it is that two scans show one place.
 
-    python benchmarks/fit_loops.py --weights rings
+    python benchmarks/repeating_scans.py --seeds 1 2 --out build/fit
+    python benchmarks/fit_loops.py build/fit --weights sglpr rings
 
-Every town is driven through by a LiDAR of 64 beams; of each scan the nearest three descriptors are verified. Pairs up
-to 10 m apart are loops, those beyond 20 m are none.
+Every drive is searched by the loop detector's finder, one candidate a scan. A pair is a loop if its scans are at most
+half as far apart as frames of other places (`other_m`, at most 10 m), and none beyond that. All drives count alike,
+so that the towns do not drown the tunnels. The drives of a few sceneries are left out, to judge the model by them.
 """
 
-import dataclasses
+import functools
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import tyro
-from jaxtyping import Bool
-from rich.progress import track
+from jaxtyping import Bool, Float
 
 import sglpr_jax
+from sglpr_jax.data.record import Record
 from sglpr_jax.files import write_json
-from sglpr_jax.loops.candidates import CandidateFinder, labelled
-from sglpr_jax.loops.probability import DEFAULTS, OF_IMAGES, Evidence, fit
-from sglpr_jax.models.params import Params
-from sglpr_jax.sim.recording import simulate_recording
-from sglpr_jax.sim.sensor import HDL64E
+from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.probability import ALL, DEFAULTS, OF_IMAGES, Evidence, fit
+from sglpr_jax.models.weights import weights_hash
 
-TOWNS = ("00:11", "08:12", "06:13", "02:14", "05:15", "08:16")
-"""Routes and seeds of the towns."""
+LEFT_OUT = ("garage", "highway", "rooms_equal", "vineyard", "warehouse", "gardens", "lanes")
+"""Sceneries that have no part in the fit."""
+LOOP_M = 10.0
+PAIRS = 300.0
+"""Every drive counts as this number of pairs."""
+
+
+class Pairs(NamedTuple):
+    """Candidates of one drive that are known to be loops or not."""
+
+    evidence: Float[np.ndarray, "n k"]
+    is_loop: Bool[np.ndarray, " n"]
 
 
 def main(
+    drives: Path,
     *,
-    weights: tuple[str, ...] = ("rings",),
-    towns: tuple[str, ...] = TOWNS,
-    scans: int = 600,
-    azimuth_steps: int = 900,
+    weights: tuple[str, ...] = ("sglpr", "rings"),
+    left_out: tuple[str, ...] = LEFT_OUT,
+    workers: int = 1,
     out: Path = DEFAULTS,
 ) -> None:
     """Fit and write the models.
 
     Args:
-        weights: for each of these a model of all evidence; the first one's pairs make that of the images alone too.
-        towns: routes and seeds, ROUTE:SEED.
-        scans: of each town.
-        azimuth_steps: firings of the sensor per turn.
+        drives: folder of `repeating_scans.py`, described by `sglpr`.
+        weights: a model of all evidence for each; the first one's pairs make that of the images alone too.
+        left_out: sceneries that have no part in the fit.
+        workers: number of processes.
         out: the file to write.
     """
+    files = [path for path in sorted(drives.glob("*.npz")) if path.stem.split("-")[0] not in left_out]
     models = {}
     for name in weights:
-        params = sglpr_jax.load(name)
-        evidence, is_loop = pairs(params, towns, scans, azimuth_steps)
-        about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of simulated towns {', '.join(towns)}, "
-        made_with = about + f"{scans} scans of 64 x {azimuth_steps}; benchmarks/fit_loops.py --weights {name}"
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            found = list(pool.map(functools.partial(pairs, weights=name), files))
+        evidence = Evidence(*np.concatenate([one.evidence for one in found]).T)
+        is_loop = np.concatenate([one.is_loop for one in found])
+        shares = np.concatenate([np.full(len(one.is_loop), PAIRS / max(len(one.is_loop), 1)) for one in found])
+        sceneries = ", ".join(dict.fromkeys(path.stem.split("-")[0] for path in files))
+        about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(files)} simulated drives ({sceneries})"
+        made_with = f"{about}; benchmarks/fit_loops.py --weights {name}"
         if not models:
-            models[""] = fit(evidence, is_loop, names=OF_IMAGES, made_with=made_with)
-        key = CandidateFinder(params).index.weights_hash
-        models[key] = fit(evidence, is_loop, made_with=made_with)
+            models[""] = fit(evidence, is_loop, names=OF_IMAGES, weights=shares, made_with=made_with)
+        key = weights_hash(sglpr_jax.load(name))
+        models[key] = fit(evidence, is_loop, weights=shares, made_with=made_with)
         print(f"{name}: {models[key]}")
     write_json(out, {name: model.to_json() for name, model in models.items()})
 
 
-def pairs(
-    params: Params, towns: tuple[str, ...], scans: int, azimuth_steps: int
-) -> tuple[Evidence, Bool[np.ndarray, " n"]]:
-    """The evidence of all candidates of all towns, and which are loops."""
-    sensor = dataclasses.replace(HDL64E, azimuth_steps=azimuth_steps)
-    found = []
-    for town in towns:
-        route, seed = town.split(":")
-        drive = simulate_recording(route, scans=scans, sensor=sensor, seed=int(seed))
-        finder, candidates = CandidateFinder(params), []
-        for i in track(range(len(drive)), description=town):
-            candidates += finder.add(drive.record(i, labels=False), time=float(drive.times[i]))
-        found.append(labelled(candidates, drive.positions))
-    evidence, is_loop = zip(*found, strict=True)
-    return Evidence(*(np.concatenate(values) for values in zip(*evidence, strict=True))), np.concatenate(is_loop)
+def pairs(path: Path, *, weights: str) -> Pairs:
+    """The evidence of the candidates of one drive, and which are loops."""
+    with np.load(path) as file:
+        images, descriptors, poses, times, other_m = (
+            file[name] for name in ("images", "descriptors", "world_from_lidar", "times", "other_m")
+        )
+    finder, found = CandidateFinder(sglpr_jax.load(weights)), []
+    for i, (image, descriptor) in enumerate(zip(images, descriptors, strict=True)):
+        seen = Seen(descriptor, image, None) if weights == "sglpr" else finder.seen(Record(image=image))
+        for one in finder.add_seen(seen, time=float(times[i])):
+            found.append((*one.evidence, np.linalg.norm(poses[one.query, :3, 3] - poses[one.match, :3, 3])))
+    rows = np.array(found, np.float64).reshape(-1, len(ALL) + 1)
+    loop, other = rows[:, -1] <= min(LOOP_M, float(other_m) / 2), rows[:, -1] > other_m
+    return Pairs(rows[loop | other, :-1], loop[loop | other])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Loop closures of a stream: each scan as it comes, and the loops that it closes."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sglpr_jax.loops.choices import MIN_PROBABILITY
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree
 from sglpr_jax.loops.drift import DriftModel, deviations
 from sglpr_jax.loops.given import given_pose, given_record, given_time
-from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
+from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
 from sglpr_jax.loops.pose_search import VerificationConfig
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.sequence import SequenceConfig, added_log_odds, agree_in_motion, agree_in_order
@@ -36,6 +37,8 @@ class DetectorConfig:
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     sequence: SequenceConfig = SequenceConfig()
+    motion_drift: DriftModel = DriftModel(metres_per_metre=0.03, degrees_per_metre=0.06)
+    """Drift of the motion that stands in for odometry (`loops.motion`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""
 
@@ -115,29 +118,41 @@ class LoopDetector:
         candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared)
         self.candidates += candidates
         for one in candidates:
-            log_odds = float(self.model.log_odds(one.evidence))
-            least = min(self.config.min_neighbour_probability, self.config.min_probability)
-            if log_odds >= logit(least):
-                self._waiting.append(self._loop(one, float(expit(log_odds))))
+            self._consider(one)
         first = len(self) - 1 - self.config.sequence.frames
+        returned = {loop.query for loop in self.loops[-2 * self.config.sequence.frames :]}
+        for loop in self._waiting:
+            if loop.query < first and loop.query not in returned and loop.probability >= self.config.min_probability:
+                self._reject([loop], "too few neighbours")
         self._waiting = [loop for loop in self._waiting if loop.query >= first]
         new = self._confirmed() if self._waiting else []
         self.loops += new
         return new
 
+    def _consider(self, one: Candidate) -> None:
+        """Let a candidate wait for its neighbours, unless it is improbable."""
+        log_odds, least = float(self.model.log_odds(one.evidence)), self.config.min_neighbour_probability
+        loop = self._loop(one, float(expit(log_odds)))
+        if log_odds >= logit(min(least, self.config.min_probability)):
+            self._waiting.append(loop)
+        elif self.model.but_for_repetition(one.evidence) >= logit(self.config.min_probability):
+            self._reject([loop], "repeats")
+
+    def _reject(self, loops: Sequence[Loop], reason: Reason) -> None:
+        known = {one.loop.query for one in self.rejected[-2 * self.config.sequence.frames :]}
+        self.rejected += [Rejected(loop, reason) for loop in loops if loop.query not in known]
+
     def _confirmed(self) -> list[Loop]:
         """Loops of the last frames that the sequential test accepts and, with odometry, the drift and other loops."""
         rules, motion = self.config.sequence, self.finder.motion
-        odometry = np.stack(self.finder.odometry) if self.finder.odometry else None
         self.by_scans |= {loop.query for loop in self._accepted(agree_in_order(self._waiting, config=rules))}
         found = self._accepted(agree_in_motion(self._waiting, motion, self.finder.mounting, config=rules))
-        if odometry is not None:
-            found = self._within_drift(found, odometry)
+        found = self._within_drift(found)
         recent = 2 * rules.frames
         known = {loop.query for loop in self.supported[-recent:]}
         self.supported += [loop for loop in found if loop.query not in known]
         done = {loop.query for loop in self.loops[-recent:]}
-        return [loop for loop in found if loop.query not in done and (odometry is None or self._agrees(loop, odometry))]
+        return [loop for loop in found if loop.query not in done and self._agrees(loop)]
 
     def _accepted(self, agreeing: Bool[np.ndarray, "n n"]) -> list[Loop]:
         """The loops of the last frames that are probable enough, given those that agree with them."""
@@ -151,13 +166,19 @@ class LoopDetector:
             if fits
         ]
 
-    def _within_drift(self, loops: list[Loop], odometry: Float[np.ndarray, "n 4 4"]) -> list[Loop]:
-        """The loops that the drift of the odometry explains. The others are rejected."""
-        drift, mounting = self.config.drift, self.finder.mounting
-        fits = deviations(loops, odometry, drift=drift, mounting=mounting) <= drift.max_deviation
-        known = {one.loop.query for one in self.rejected[-2 * self.config.sequence.frames :]}
-        against = [loop for loop, fit in zip(loops, fits, strict=True) if not fit and loop.query not in known]
-        self.rejected += [Rejected(loop, "contradicts the odometry") for loop in against]
+    def _within_drift(self, loops: list[Loop]) -> list[Loop]:
+        """The loops that the drift of the odometry or, without it, of the motion explains. The others are rejected."""
+        if not loops:
+            return []
+        motion, mounting, segments = self.finder.motion, self.finder.mounting, self.finder.motion.segments
+        if self.finder.odometry:
+            poses, drift, reason = np.stack(self.finder.odometry), self.config.drift, "contradicts the odometry"
+        else:
+            poses, drift, reason = motion.odometry(mounting), self.config.motion_drift, "contradicts the motion"
+        apart = deviations(loops, poses, drift=drift, mounting=mounting)
+        known = np.array([segments[loop.query] == segments[loop.match] for loop in loops])
+        fits = (apart <= drift.max_deviation) | ~known
+        self._reject([loop for loop, fit in zip(loops, fits, strict=True) if not fit], reason)
         return [loop for loop, fit in zip(loops, fits, strict=True) if fit]
 
     @property
@@ -165,11 +186,14 @@ class LoopDetector:
         config = self.config
         return {"mounting": self.finder.mounting, "drift": config.drift, "config": config.consistency}
 
-    def _agrees(self, loop: Loop, odometry: Float[np.ndarray, "n 4 4"]) -> bool:
-        """Whether it agrees with half of the loops about it or more.
+    def _agrees(self, loop: Loop) -> bool:
+        """Whether, with odometry, a loop agrees with at least half of the loops about it.
 
-        Those that were held back count, too: else a few wrong loops, found first, would keep out all true ones.
+        Loops that were held back count, too. Otherwise a few wrong loops, found first, would keep out all true ones.
         """
+        if not self.finder.odometry:
+            return True
+        odometry = np.stack(self.finder.odometry)
         way = travelled(odometry)
         about = [
             other

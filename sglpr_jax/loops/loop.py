@@ -15,7 +15,14 @@ UNSEEN_HEIGHT_M = 0.5
 UNSEEN_TILT_DEG = 2.0
 """Standard deviations of height, pitch and roll, which an image from above does not show."""
 
-Reason = Literal["contradicts the odometry", "contradicts other loops", "little overlap"]
+Reason = Literal[
+    "repeats",
+    "too few neighbours",
+    "contradicts the motion",
+    "contradicts the odometry",
+    "contradicts other loops",
+    "little overlap",
+]
 """Why a pair that looked like a loop closure was rejected."""
 
 

@@ -10,8 +10,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.upright import upright_from_lidar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +75,10 @@ class Motion:
         known = np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
         poses = np.stack([self.poses[row] for row in rows]) if len(rows) else np.zeros((0, 4, 4))
         return inverse(poses) @ self.poses[frame], known
+
+    def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:
+        """The poses of the LiDAR, tilted as its mounting says."""
+        return np.stack(self.poses) @ upright_from_lidar(mounting)
 
     def near_last(self, travelled_m: float) -> Bool[np.ndarray, " n"]:
         """Which frames are known to be less than a travelled distance before the last frame."""

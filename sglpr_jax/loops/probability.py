@@ -62,6 +62,9 @@ ALL = Evidence._fields
 OF_IMAGES = ("correlation", "second", "rival")
 """The numbers that mean the same whatever weights made the descriptors."""
 
+OF_REPETITION = ("distance_share", "second", "rival")
+"""The numbers that say whether other poses and places fit as well."""
+
 
 class Curve(NamedTuple):
     """A piecewise linear function, constant outside its knots."""
@@ -96,6 +99,12 @@ class LoopModel:
         """What each number adds to the log odds."""
         values = evidence._asdict()
         return {name: curve(np.asarray(values[name], np.float64)) for name, curve in self.curves.items()}
+
+    def but_for_repetition(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
+        """The log odds if nothing else fitted as well as the match does."""
+        parts = self.contributions(evidence)
+        best = {name: max(self.curves[name].values) for name in OF_REPETITION if name in parts}
+        return np.asarray(self.bias + sum((parts | best).values()))
 
     def to_json(self) -> dict[str, Any]:
         """The value that `from_json` reads."""

@@ -1,0 +1,158 @@
+"""Find loops where places repeat: wrong loops, recall and reliability by scenery, without and with odometry.
+
+    python benchmarks/repeating_scans.py --seeds 11 12 --out build/test
+    python benchmarks/repeating.py build/test
+    python benchmarks/repeating.py build/test --odometry --sensors vlp16
+
+Reads the drives that `repeating_scans.py` has rendered. A loop is wrong if its scans are farther apart than the
+scenery's `other_m`: 20 m outdoors, 4 to 9 m indoors. Revisits are scans within half of that (at most 5 m) of one
+that is 30 s older. Odometry is that of the true poses with drift (`loops.drifted`). Results are kept beside the
+drives, in `found.jsonl` or `found-odometry.jsonl`; with the same model and settings, a drive is searched once.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, Float
+from loops import drifted
+from rich.console import Console
+from rich.table import Table
+
+import sglpr_jax
+from sglpr_jax.loops.candidates import Seen
+from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.joint import accepted
+from sglpr_jax.loops.loop import Loop
+
+REVISIT_M, AGE_S = 5.0, 30.0
+SURE = 0.99
+
+
+def main(
+    drives: Path,
+    *,
+    odometry: bool = False,
+    sceneries: tuple[str, ...] = (),
+    sensors: tuple[str, ...] = (),
+    weights: str = "sglpr",
+    workers: int = 1,
+) -> None:
+    """Search the drives and print the tables.
+
+    Args:
+        drives: folder of `repeating_scans.py`.
+        odometry: give the detector drifting odometry.
+        sceneries: those to search; without them all.
+        sensors: likewise.
+        weights: the model that described the scans.
+        workers: number of processes.
+    """
+    found = drives / ("found-odometry.jsonl" if odometry else "found.jsonl")
+    settings = _settings(weights)
+    files = [path for path in sorted(drives.glob("*.npz")) if _chosen(path, sceneries, sensors)]
+    done = {row["drive"]: row for row in _rows(found) if row["settings"] == settings}
+    left = [path for path in files if path.stem not in done]
+    search = functools.partial(searched, odometry=odometry, weights=weights)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool, found.open("a") as lines:
+        for number, row in enumerate(pool.map(search, left), 1):
+            done[row["drive"]] = row | {"settings": settings}
+            lines.write(json.dumps(done[row["drive"]]) + "\n")
+            lines.flush()
+            print(f"{number}/{len(left)} {row['drive']}: {row['loops']} loops, {row['wrong']} wrong", flush=True)
+    report([done[path.stem] for path in files])
+
+
+def _chosen(path: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> bool:
+    scenery, _, rest = path.stem.split("-", 2)
+    return (not sceneries or scenery in sceneries) and (not sensors or rest.rsplit("-", 1)[0] in sensors)
+
+
+def _settings(weights: str) -> str:
+    """Names the model of the probabilities and all settings of the detector."""
+    detector = LoopDetector(sglpr_jax.load(weights))
+    about = json.dumps([detector.model.to_json(), dataclasses.asdict(detector.config)])
+    return hashlib.sha256(about.encode()).hexdigest()[:16]
+
+
+def _rows(path: Path) -> Iterator[dict[str, Any]]:
+    if path.exists():
+        yield from map(json.loads, path.read_text().splitlines())
+
+
+def searched(path: Path, *, odometry: bool, weights: str) -> dict[str, Any]:
+    """The loops of one drive, judged by the true poses."""
+    with np.load(path) as file:
+        drive = {name: file[name] for name in file.files}
+    poses, times = drive["world_from_lidar"], drive["times"]
+    given = drifted(poses, seed=int(drive["seed"])) if odometry else None
+    detector = LoopDetector(sglpr_jax.load(weights))
+    for i, (descriptor, image) in enumerate(zip(drive["descriptors"], drive["images"], strict=True)):
+        pose = None if given is None else given[i]
+        detector.add_seen(Seen(descriptor, image, None), time=float(times[i]), odometry=pose)
+    loops = detector.loops if given is None else accepted(detector.supported, given)[0]
+    other_m = float(drive["other_m"])
+    revisited = revisits(poses[:, :3, 3], times, min(REVISIT_M, other_m / 2))
+    apart = distances([(loop.query, loop.match) for loop in loops], poses)
+    right = {loop.query for loop, metres in zip(loops, apart, strict=True) if metres <= other_m}
+    pairs = distances([(one.query, one.match) for one in detector.candidates], poses)
+    sure = np.array([float(detector.model.probability(one.evidence)) >= SURE for one in detector.candidates], bool)
+    return {
+        "drive": path.stem,
+        **{name: str(drive[name]) for name in ("scenery", "revisit", "sensor", "seed")},
+        "scans": len(poses),
+        "loops": len(loops),
+        "wrong": int((apart > other_m).sum()),
+        "sure_of_wrong": _surest(loops, apart > other_m),
+        "revisits": int(revisited.sum()),
+        "found": int(sum(frame in right for frame in np.flatnonzero(revisited))),
+        "sure_pairs": int((sure & ((pairs <= other_m / 2) | (pairs > other_m))).sum()),
+        "sure_loops": int((sure & (pairs <= other_m / 2)).sum()),
+    }
+
+
+def _surest(loops: Sequence[Loop], wrong: Bool[np.ndarray, " n"]) -> float:
+    return max((loop.probability for loop, is_wrong in zip(loops, wrong, strict=True) if is_wrong), default=0.0)
+
+
+def revisits(positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " n"], near_m: float) -> np.ndarray:
+    """Which scans come near one that is `AGE_S` older."""
+    found = np.zeros(len(positions), bool)
+    for i, (position, time) in enumerate(zip(positions, times, strict=True)):
+        old = positions[times <= time - AGE_S]
+        found[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
+    return found
+
+
+def distances(pairs: Sequence[tuple[int, int]], poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " k"]:
+    """Metres between the scans of each pair."""
+    frames = np.array(pairs, np.int64).reshape(-1, 2)
+    return np.linalg.norm(poses[frames[:, 0], :3, 3] - poses[frames[:, 1], :3, 3], axis=1)
+
+
+def report(rows: Sequence[dict[str, Any]]) -> None:
+    """Print a table by scenery for each kind of drive, and what it comes to."""
+    for revisit in dict.fromkeys(row["revisit"] for row in rows):
+        table = Table(
+            "scenery", "scans", "loops", "wrong", "recall", f"pairs >= {SURE}", "of which loops", title=revisit
+        )
+        chosen = [row for row in rows if row["revisit"] == revisit]
+        for scenery in (*dict.fromkeys(row["scenery"] for row in chosen), "all"):
+            some = [row for row in chosen if scenery in ("all", row["scenery"])]
+            total = {name: sum(row[name] for row in some) for name in some[0] if isinstance(some[0][name], int)}
+            recall = f"{total['found'] / total['revisits']:.3f}" if total["revisits"] else ""
+            counts = (total["scans"], total["loops"], total["wrong"], recall, total["sure_pairs"], total["sure_loops"])
+            table.add_row(scenery, *map(str, counts))
+        Console().print(table)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
