@@ -223,7 +223,8 @@ class CandidateFinder:
         if peak.correlation >= self.config.min_rival_correlation:
             usable = ~np.array(self.empty, bool)
             known = self.index.descriptors
-            rows = rivals(seen.descriptor, known, match, self.motion, usable, config=rules)
+            exclude_s = self.config.exclude_s
+            rows = rivals(seen.descriptor, known, match, self.motion, usable, exclude_s=exclude_s, config=rules)
             found = self.search(seen.image, [self.images[row] for row in rows], rules.of_query + rules.of_match)
             match_from_query = transform(float(peak.x), float(peak.y), float(peak.yaw))
             expected = [

@@ -52,23 +52,31 @@ class Motion:
 
     def add(self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None) -> None:
         """Add a frame at `time` (seconds), by its `pose` from odometry or its peak over the keyframe's image."""
-        n, segment = len(self), self.segments[-1] if self.segments else 0
-        if pose is None and link is not None and self._is_trusted(link):
-            pose = self.poses[self.keyframe] @ transform(float(link.x), float(link.y), float(link.yaw))
-        elif pose is None:
-            pose, segment = np.eye(4), segment + 1
         key = self.keyframe
-        moved, known = (0.0, False) if not n else (self._moved(key, pose), segment == self.segments[key])
-        passed = min(time - self._times[key], self.config.standing_s) if n and known else 0.0
-        if n and not known:
-            passed = self.clock[-1] - self.clock[key] + time - self._times[-1]
-        self.clock.append(self.clock[key] + passed if n else 0.0)
-        self.travelled.append(self.travelled[key] + moved if n and known else self.travelled[-1] if n else 0.0)
-        self.poses.append(pose)
-        self.segments.append(segment)
+        if pose is None and link is not None and self._is_trusted(link):
+            pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
+        if not self.poses:
+            self._append(time, pose, segment=0, travelled=0.0, clock=0.0)
+        elif pose is None:
+            clock = self.clock[-1] + time - self._times[-1]
+            self._append(time, pose, segment=self.segments[-1] + 1, travelled=self.travelled[-1], clock=clock)
+        else:
+            moved, rotation = self._moved(key, pose)
+            clock = self.clock[key] + min(time - self._times[key], self.config.standing_s)
+            travelled = self.travelled[key] + moved
+            self._append(time, pose, segment=self.segments[key], travelled=travelled, clock=clock)
+            if moved <= self.config.keyframe_m and rotation <= np.radians(self.config.keyframe_deg):
+                return
+        self.keyframe = len(self) - 1
+
+    def _append(
+        self, time: float, pose: Float[np.ndarray, "4 4"] | None, *, segment: int, travelled: float, clock: float
+    ) -> None:
         self._times.append(time)
-        if not n or not known or self._is_next_keyframe(key, pose):
-            self.keyframe = n
+        self.poses.append(np.eye(4) if pose is None else pose)
+        self.segments.append(segment)
+        self.travelled.append(travelled)
+        self.clock.append(clock)
 
     def from_frame(self, frame: int, rows: np.ndarray) -> tuple[Float[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
         """The poses of `frame` in the frames of `rows`, and which of them are known."""
@@ -91,9 +99,7 @@ class Motion:
         best = float(link.correlation)
         return best >= self.config.min_correlation and float(link.second) <= self.config.max_second * best
 
-    def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> float:
-        return float(np.linalg.norm(pose[:3, 3] - self.poses[key][:3, 3]))
-
-    def _is_next_keyframe(self, key: int, pose: Float[np.ndarray, "4 4"]) -> bool:
-        rotation = abs(float(yaw_of(inverse(self.poses[key]) @ pose)))
-        return self._moved(key, pose) > self.config.keyframe_m or rotation > np.radians(self.config.keyframe_deg)
+    def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+        """Metres and radians from a keyframe to a pose."""
+        moved = inverse(self.poses[key]) @ pose
+        return float(np.linalg.norm(moved[:3, 3])), abs(float(yaw_of(moved)))

@@ -26,8 +26,9 @@ class RivalConfig:
     """Maximum number from before the query."""
     of_match: int = 4
     """Maximum number from around the match, half before and half after it."""
-    age_s: tuple[float, float] = (8.0, 29.0)
-    """Time between a rival and the query or the match while the sensor moved, in seconds."""
+    age: tuple[float, float] = (0.27, 0.97)
+    """Time between a rival and the query or the match while the sensor moved, as shares of the excluded time: 8 to
+    29 s of 30."""
     agree_m: float = 3.0
     agree_share: float = 0.05
     """A fit agrees with the motion up to this distance, in metres, plus this share of the travelled distance."""
@@ -43,6 +44,7 @@ def rivals(
     motion: Motion,
     usable: Bool[np.ndarray, " n"],
     *,
+    exclude_s: float,
     config: RivalConfig = RivalConfig(),
 ) -> Int[np.ndarray, " k"]:
     """Choose the rivals of a match: of each stretch of time the frame whose descriptor is nearest to the query's.
@@ -53,13 +55,14 @@ def rivals(
       match: Frame of the match.
       motion: Motion of all earlier frames and the query.
       usable: Earlier frames that show something.
+      exclude_s: Minimum age of a match, in seconds.
       config: Number and age of the rivals.
 
     Returns:
       Frames, in order.
     """
     clock, now = np.array(motion.clock[: len(descriptors)]), motion.clock[len(descriptors)]
-    youngest, oldest = config.age_s
+    youngest, oldest = (share * exclude_s for share in config.age)
     starts = (now - oldest, clock[match] - oldest, clock[match] + youngest)
     chosen = []
     for start, count in zip(starts, (config.of_query, config.of_match // 2, config.of_match // 2), strict=True):

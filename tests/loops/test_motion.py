@@ -1,0 +1,51 @@
+"""The motion from frame to frame: by odometry, by registration, and unknown where that cannot be trusted."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.transforms import transform
+
+
+def link(x: float, correlation: float = 0.9, second: float = 0.3) -> Peak:
+    return Peak(*map(np.float32, (x, 0.0, 0.0, correlation, second)))
+
+
+def test_links_to_keyframes_add_up():
+    motion = Motion()
+    for frame in range(10):  # 1 m each; the keyframe is the last frame that was more than 3 m from the one before
+        motion.add(float(frame), link=link(float(frame - motion.keyframe)) if frame else None)
+    np.testing.assert_allclose([pose[0, 3] for pose in motion.poses], np.arange(10.0))
+    np.testing.assert_allclose(motion.travelled, np.arange(10.0))
+    np.testing.assert_allclose(motion.clock, np.arange(10.0))
+    assert motion.keyframe == 8 and set(motion.segments) == {0}
+    poses, known = motion.from_frame(9, np.array([0, 4]))
+    np.testing.assert_allclose(poses[:, 0, 3], [9, 5])
+    assert known.all()
+
+
+@pytest.mark.parametrize("weak", [link(1.0, correlation=0.3, second=0.1), link(1.0, second=0.8)])
+def test_a_link_that_fits_badly_or_elsewhere_begins_a_segment(weak):
+    motion = Motion()
+    for one in (None, link(1.0), weak, link(1.0)):
+        motion.add(float(len(motion)), link=one)
+    assert motion.segments == [0, 0, 1, 1]
+    assert motion.from_frame(3, np.array([0, 2]))[1].tolist() == [False, True]
+    assert motion.clock == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_the_clock_stops_where_the_sensor_stands():
+    motion = Motion()
+    for frame in range(40):
+        motion.add(float(frame), link=link(0.0) if frame else None)
+    assert motion.clock[-1] == motion.config.standing_s and motion.travelled[-1] == 0
+    assert motion.near_last(10.0).all()
+
+
+def test_odometry_is_taken_as_it_is():
+    motion = Motion()
+    for frame in range(30):
+        motion.add(float(frame), pose=transform(0.5 * frame, 0.0, 0.1 * frame))
+    assert motion.travelled[-1] == pytest.approx(14.5) and set(motion.segments) == {0}
+    assert motion.near_last(10.0).sum() == 20
