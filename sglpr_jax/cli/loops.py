@@ -1,4 +1,4 @@
-"""bin/loops: find where a recording comes back to, and write it for a pose graph."""
+"""bin/loops: find the loop closures of a recording and write them for a pose graph."""
 
 import dataclasses
 import sys
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from sglpr_jax.loops.detector import DetectorConfig
 
 UNFINISHED = "unfinished"
-"""The folder, in that of the results, of a run that has not ended."""
+"""Folder of intermediate results, inside the folder of the results, until the run has ended."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopsCommand:
-    """Find the loops of a recording: pairs of scans of one place, how they lie to each other, and how sure that is.
+    """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
-    Writes loops.g2o, loops.jsonl, loops.csv and index.html and, with odometry, trajectory.tum and trajectory.kitti,
+    Writes loops.g2o, loops.jsonl, loops.csv and index.html. With odometry also trajectory.tum and trajectory.kitti,
     with --optimize also the corrected trajectory.
-    Ctrl-C keeps what was found; the same command goes on after it, and after a run that was killed.
+    Ctrl-C keeps the loops found so far. The same command continues after that, and after a run that was killed.
 
     Examples:
       bin/loops my_scans --out found
@@ -37,35 +37,35 @@ class LoopsCommand:
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
-    """A dataset, a bag or a folder of scans, of any layout that is known."""
+    """A dataset, a bag or a folder of scans, in any supported layout."""
     out: Path
-    """The folder to write into."""
+    """Output folder."""
     odometry: Path | None = None
-    """A pose for each scan, drifting as it may, or poses of other times (tum), which are interpolated, or the bag
-    itself. Without it, loops are judged by the scans alone."""
+    """A pose for each scan, or poses at other times (tum), which are interpolated, or the bag itself. Without odometry,
+    loops are found by the scans alone."""
     odometry_format: OdometryFormat = "auto"
-    """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
+    """Files with 12 numbers a line are kitti (camera axes) or lidar (z up), with 8 numbers tum; .g2o is recognised."""
     drift_percent: float = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
     more than four standard deviations are rejected."""
     drift_deg_per_100m: float = DRIFT_DEG_PER_100M
     """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
     weights: str = DEFAULT_WEIGHTS
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     register: bool = False
-    """Make each pose one in 6 degrees of freedom from the full scans, and check their overlap (extra slam)."""
+    """Register the full scans in 6 degrees of freedom and check their overlap (extra slam)."""
     optimize: bool = False
-    """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti; of thousands of frames a
-    minute or two."""
+    """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti. The correction of thousands
+    of frames takes minutes."""
     min_probability: float = MIN_PROBABILITY
-    """Of a loop."""
+    """Minimum probability of a loop."""
     skip_bad: bool = False
-    """Report scans that cannot be read and go on without them."""
+    """Report unreadable scans and skip them."""
 
 
 def loops_of_recording(command: LoopsCommand) -> int:
-    """Do what the command says; returns the exit status."""
+    """Run the command. Returns the exit status."""
     from sglpr_jax.loops.detector import DetectorConfig
     from sglpr_jax.loops.drift import DriftModel
     from sglpr_jax.loops.unfinished import alone  # these bring JAX and more, which --help does not need
@@ -78,7 +78,7 @@ def loops_of_recording(command: LoopsCommand) -> int:
 
 
 def _check(command: LoopsCommand) -> None:
-    """Raise ValueError or ImportError for what is known before the search to end in an error, or in a loss."""
+    """Raises ValueError or ImportError before the search, if it would end in an error or overwrite an input."""
     from sglpr_jax.loops.folder import TRAJECTORIES
     from sglpr_jax.loops.optimization import check_installed
 

@@ -61,7 +61,7 @@ class FoundLoops:
         why = f" ({', '.join(f'{reason}: {count}' for reason, count in counts.most_common())})" if counts else ""
         skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
         left = f", {self.unregistered} not registered" if self.unregistered else ""
-        return f"{found}, {len(self.rejected)} pairs rejected{why}{left}{skipped}"
+        return f"{found}, {len(self.rejected)} rejected{why}{left}{skipped}"
 
 
 def find_loops(

@@ -1,4 +1,4 @@
-"""What was found in a recording, as a folder of files for other programs."""
+"""Export of the loops of a recording as a folder of files for other programs."""
 
 from pathlib import Path
 
@@ -16,12 +16,21 @@ TRAJECTORIES = ("trajectory.tum", "trajectory.kitti", "trajectory-optimized.tum"
 def write_found(
     found: FoundLoops, folder: Path | str, *, optimized: Float[np.ndarray, "n 4 4"] | None = None
 ) -> list[Path]:
-    """Write loops as g2o, JSON lines and csv and, where there is odometry, the trajectory as TUM and KITTI.
+    """Write loops as g2o, JSON lines and csv and, with odometry, the trajectory as TUM and KITTI.
 
-    The trajectory is the odometry as it was given, of the frames that were looked at; `optimized` is the corrected one,
-    in files beside it. Their times are the recording's, or the numbers of the frames. Poses are those of the LiDAR.
-    Other trajectories that lie there under these names stay, which is told. Returns the paths written. Raises
-    WriteError where one cannot be written.
+    The times of trajectories are those of the recording or, without times, the frame numbers. Older trajectories in the
+    folder that this call does not write stay, and a warning names them.
+
+    Arguments:
+      found: Loops of a recording.
+      folder: Output folder.
+      optimized: Corrected pose of the LiDAR at each searched frame.
+
+    Returns:
+      The paths written.
+
+    Raises:
+      WriteError: If a file cannot be written.
     """
     folder = Path(folder)
     odometry = None if found.odometry is None else found.odometry[: found.frames]

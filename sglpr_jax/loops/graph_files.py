@@ -1,6 +1,6 @@
-"""Loops and trajectories in the files that pose-graph programs read: g2o, TUM, KITTI, JSON lines, csv.
+"""Loops and trajectories in the file formats of pose-graph programs: g2o, TUM, KITTI, JSON lines, csv.
 
-Every file is written whole or not at all. Poses are of the LiDAR (x forward, y left, z up) in a frame that stays.
+Files are written atomically. Poses are those of the LiDAR (x forward, y left, z up) in a fixed frame.
 """
 
 import csv
@@ -22,16 +22,16 @@ from sglpr_jax.poses import are_rotations
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 UPPER = np.triu_indices(6)
-"""The 21 numbers of an information matrix, row by row: translation first, then rotation."""
+"""The 21 numbers of an information matrix, row by row, translation before rotation."""
 COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
 
 
 class Graph(NamedTuple):
-    """What a g2o file holds."""
+    """Content of a g2o file."""
 
     poses: dict[int, Float[np.ndarray, "4 4"]]
     edges: list[tuple[int, int, Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]]
-    """From frame, to frame, from_from_to, and the information matrix, translation first."""
+    """First frame, second frame, pose of the second in the first, and information matrix, translation first."""
 
 
 def write_g2o(
@@ -65,10 +65,11 @@ def write_g2o(
 
 
 def read_g2o(path: Path | str) -> Graph:
-    """Read vertices and edges of the kinds that `write_g2o` writes; lines of other kinds are left out.
+    """Read vertices and edges of the kinds that `write_g2o` writes. Other lines are ignored.
 
-    Raises FileNotFoundError, and ValueError naming the first line without the numbers that it needs, or with a vertex
-    that stood there before.
+    Raises:
+      FileNotFoundError: If there is no such file.
+      ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
     """
     path, graph = Path(path), Graph({}, [])
     if not path.is_file():
@@ -92,7 +93,7 @@ def read_g2o(path: Path | str) -> Graph:
 
 
 def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:
-    """Write `time x y z qx qy qz qw`, a line for each pose, seconds and metres."""
+    """Write a line `time x y z qx qy qz qw` for each pose, in seconds and metres."""
     lines = (f"{time:.6f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
     write_text(Path(path), "".join(lines))
 
@@ -112,7 +113,7 @@ def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
 
 
 def read_kitti(path: Path | str, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
-    """Read 12 numbers a line, in KITTI's axes, or, without `camera`, with z up. Errors are those of `read_tum`."""
+    """Read 12 numbers a line, in KITTI's axes or, without `camera`, with z up. Raises the errors of `read_tum`."""
     rows = read_poses(Path(path))
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows
@@ -120,7 +121,7 @@ def read_kitti(path: Path | str, *, camera: bool = True) -> Float[np.ndarray, "n
 
 
 def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Sequence[str] | None = None) -> None:
-    """Write a JSON object a line, with the frames' `ids` beside their numbers where they are given."""
+    """Write a JSON object a line, with the `ids` of the frames if they are given."""
     write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids))}\n" for loop in loops))
 
 
@@ -134,7 +135,7 @@ def read_loops_jsonl(path: Path | str) -> list[Loop]:
 
 
 def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
-    """Write a table: frames, match_from_query as x y z and quaternion, probability, overlap (empty where not known)."""
+    """Write a table: frames, match_from_query as x y z and quaternion, probability, overlap (empty if unknown)."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -190,14 +191,14 @@ def _quaternions(values: Float[np.ndarray, "n 4"], where: Path | str) -> Float[n
 
 
 def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
-    """Numbers of frames; ValueError where they are none."""
+    """Frame numbers. Raises ValueError if a value is negative or not an integer."""
     if (values < 0).any() or (values != np.round(values)).any():
         raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
     return tuple(int(value) for value in values)
 
 
 def _check_loop(query: int, match: int, shares: Sequence[float], where: str) -> None:
-    """Raise ValueError where the match is not the earlier frame, or probability or overlap is none."""
+    """Raises ValueError if the match is not the earlier frame, or if a share is outside [0, 1]."""
     if not match < query:
         raise ValueError(f"{where}: expected a match before the query, found {match} and {query}")
     if not all(0 <= share <= 1 for share in shares):

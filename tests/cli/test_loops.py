@@ -7,7 +7,9 @@ import pytest
 
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops import find
-from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, read_tum, write_kitti, write_tum
+from sglpr_jax.loops.detector import DetectorConfig
+from sglpr_jax.loops.drift import DriftModel
+from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_jsonl, read_tum, write_kitti, write_tum
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights_file import load
 
@@ -15,15 +17,14 @@ from .conftest import SCANS, assert_one_line_error
 
 FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "index.html"}
 TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
+TWICE = DetectorConfig(drift=DriftModel(0.02, 0.01))
 OPTIMIZED = {"trajectory-optimized.tum", "trajectory-optimized.kitti"}
 
 
 @pytest.fixture
 def odometry(town, tmp_path) -> np.ndarray:
-    """Poses of the sensor of 08, standing upright, at its true positions."""
-    poses = np.tile(np.eye(4), (SCANS, 1, 1))
-    poses[:, :3, 3] = open_recording(town, "08").positions
-    return poses
+    """True poses of the sensor of 08."""
+    return read_kitti(town / "sequences/08/poses.txt")
 
 
 @pytest.mark.slow
@@ -31,13 +32,14 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
     write_kitti(tmp_path / "odometry.txt", odometry)
     out = tmp_path / "found"
     options = ("--odometry", tmp_path / "odometry.txt", "--odometry-format", "kitti", "--out", out, "--optimize")
-    ended = command("loops", town, "--seq", "08", *options)
+    drift = ("--drift-percent", "2", "--drift-deg-per-100m", "1")
+    ended = command("loops", town, "--seq", "08", *options, *drift)
     assert ended.status == 0, ended.error
     assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES | {
         "trajectory-optimized.tum",
         "trajectory-optimized.kitti",
     }
-    expected = find.find_loops(open_recording(town, "08"), load("sglpr"), odometry=odometry)
+    expected = find.find_loops(open_recording(town, "08"), load("sglpr"), odometry=odometry, config=TWICE)
     found = read_loops_jsonl(out / "loops.jsonl")
     assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
     assert ended.out.splitlines()[0] == str(expected)
@@ -126,6 +128,7 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     ended = command(*run, tmp_path / "short.txt", "--odometry-format", "kitti")
     assert_one_line_error(ended, "short.txt: expected 40 poses, one for each scan of 08, found 7")
     assert_one_line_error(command(*run, short, "--min-probability", "nan"), "min_probability from 0 to 1, found nan")
+    assert_one_line_error(command(*run, short, "--drift-percent", "-1"), "metres_per_metre >= 0, found -0.01")
     assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line and their axes named, kitti")
     assert_one_line_error(command(*run, flat, "--odometry-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")

@@ -9,6 +9,7 @@ import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen, labelled, square_image
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.drift import DriftModel
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import MIN_OVERLAP
 from sglpr_jax.loops.probability import Evidence, LoopModel
@@ -97,7 +98,7 @@ def test_odometry_far_off_leaves_a_candidate_out_and_margins_are_of_other_places
         finder = CandidateFinder(params, config=NOW)
         finder.add(Record(points=match), odometry=np.eye(4))
         assert len(finder.add(Record(points=query), odometry=transform(metres, 0.0, 0.0))) == there
-    finder = CandidateFinder(params, config=NOW)
+    finder = CandidateFinder(params, config=NOW, drift=DriftModel(metres_per_metre=0.1))
     for k, cloud in enumerate((match, drive.points(0), query)):
         found = finder.add(Record(points=cloud), odometry=transform((0.0, 21.0, 2.0)[k], 0.0, 0.0))
     distances = np.linalg.norm(finder.index.descriptors[:2] - finder.index.descriptors[2], axis=1)

@@ -118,4 +118,4 @@ def test_loops_that_contradict_the_odometry_are_rejected_and_do_not_keep_the_tru
     whole = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG)
     assert {one.loop.query for one in whole.rejected} == wrong and len(whole.loops) >= N - 1
     assert {one.reason for one in whole.rejected} == {"contradicts the odometry"}
-    assert str(whole).endswith(f"{len(wrong)} pairs rejected (contradicts the odometry: {len(wrong)})")
+    assert str(whole).endswith(f"{len(wrong)} rejected (contradicts the odometry: {len(wrong)})")

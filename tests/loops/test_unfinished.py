@@ -10,7 +10,7 @@ from recordings import with_points
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import find, unfinished
+from sglpr_jax.loops import find, joint, unfinished
 from sglpr_jax.loops.candidates import CandidateConfig
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.find import find_loops
@@ -190,7 +190,7 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
         done.append(None)
         return Registration(initial, np.eye(6), 0.9)
 
-    monkeypatch.setattr(find, "register", registered)
+    monkeypatch.setattr(joint, "register", registered)
     monkeypatch.setattr(find, "check_installed", lambda: None)
     options = {"odometry": odometry, "config": CONFIG, "registered": True, "kept_in": tmp_path / "kept"}
     stopped = find_loops(recording, params, **options, should_stop=lambda: len(done) >= 2)

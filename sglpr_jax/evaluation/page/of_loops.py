@@ -1,4 +1,4 @@
-"""The page of the loops of a recording: where they are, what they look like, and how sure each is."""
+"""HTML page of the loops of a recording: trajectory, matched images, probabilities."""
 
 from pathlib import Path
 
@@ -22,13 +22,13 @@ SHOWN_ROWS = 40
 
 
 def write_loops_page(found: FoundLoops, folder: Path, *, optimized: OptimizedTrajectory | None = None) -> Path:
-    """Write the page into `folder`, whole or not at all; without matplotlib (extra `viz`) it has no pictures."""
+    """Write the page into `folder`, atomically. Without matplotlib (extra `viz`) it has no pictures."""
     write_text(folder / PAGE, loops_page(found, optimized=optimized))
     return folder / PAGE
 
 
 def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> str:
-    """The page as HTML that stands alone; with an `optimized` trajectory it shows that beside the odometry."""
+    """Self-contained HTML of the page. With an `optimized` trajectory it shows the trajectory before and after."""
     about = "with odometry" if found.odometry is not None else "without odometry"
     sections = [Section("Where", _where(found))]
     if optimized is not None and found.frames:
@@ -74,7 +74,7 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
 
 
 def _sure(found: FoundLoops) -> str:
-    """How many of the pairs of each probability are loops, where true positions are known."""
+    """Share of loops among the pairs of each probability, if true positions are known."""
     if found.recording.positions is None or found.model is None:
         return missing("How many of the pairs are loops is not known: the recording has no poses to judge by.")
     bins = reliability_of(found.candidates, found.model, found.recording.positions)
@@ -115,7 +115,7 @@ def _title(loop: Loop) -> str:
 
 
 def _table(found: FoundLoops) -> str:
-    """The least sure loops, which are those to look at."""
+    """Table of the loops with the lowest probabilities."""
     if not found.loops:
         return missing("No loops.")
     header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
