@@ -208,7 +208,10 @@ class CandidateFinder:
         key = self.motion.keyframe
         linked = pose is None and len(self.images) > 0 and not self.empty[key]
         matches = [self.images[row] for row in ([*rows, key] if linked else rows)]
-        peaks = self.search(seen.image, matches, self.config.candidates + linked)
+        priors = np.full((len(matches), 3), np.nan)
+        if linked:
+            priors[-1] = self.motion.prior(clock)
+        peaks = self.search(seen.image, matches, self.config.candidates + linked, priors)
         link = peaks.one(len(rows)) if linked else None
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
@@ -239,12 +242,21 @@ class CandidateFinder:
         evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
         return Candidate(query, match, alignment, evidence)
 
-    def search(self, image: UInt8[np.ndarray, "n n"], matches: Sequence[UInt8[np.ndarray, "n n"]], size: int) -> Peak:
+    def search(
+        self,
+        image: UInt8[np.ndarray, "n n"],
+        matches: Sequence[UInt8[np.ndarray, "n n"]],
+        size: int,
+        priors: Float[np.ndarray, "k 3"] | None = None,
+    ) -> Peak:
         """The poses of an image over those of some matches; `size` of them are compared, so that it compiles once."""
         if not matches:
             return NO_PEAKS
-        padded = np.stack([matches[k % len(matches)] for k in range(size)])
-        return jax.device_get(search(image, padded, config=self.verification)).some(slice(len(matches)))
+        chosen = np.arange(size) % len(matches)
+        expected = np.full((size, 3), np.nan) if priors is None else priors[chosen]
+        padded = np.stack([matches[k] for k in chosen.tolist()])
+        found = jax.device_get(search(image, padded, expected.astype(np.float32), config=self.verification))
+        return found.some(slice(len(matches)))
 
     def _mounting_of(self, seen: Seen | None) -> Mounting | None:
         return self.mounting if seen is None else seen.mounting

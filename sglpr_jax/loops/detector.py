@@ -37,7 +37,7 @@ class DetectorConfig:
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     sequence: SequenceConfig = SequenceConfig()
-    motion_drift: DriftModel = DriftModel(metres_per_metre=0.03, degrees_per_metre=0.06)
+    motion_drift: DriftModel = DriftModel(metres_per_metre=0.02, degrees_per_metre=0.05)
     """Drift of the motion that stands in for odometry (`loops.motion`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""

@@ -15,6 +15,9 @@ from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import upright_from_lidar
 
+MOST_STEPS = 3.0
+"""After a longer gap, as a multiple of the last one, the pose of the next frame is not expected anywhere."""
+
 
 @dataclasses.dataclass(frozen=True)
 class MotionConfig:
@@ -22,8 +25,13 @@ class MotionConfig:
 
     min_correlation: float = 0.4
     """Minimum correlation of the two images."""
+    max_ridge: float = 0.8
+    """Maximum ratio of the ridge to the peak, beyond which the images do not tell how far the sensor moved."""
     max_second: float = 0.8
-    """Maximum ratio of the second peak to the best one."""
+    max_second_expected: float = 1.5
+    """Maximum ratio of the second peak to the best one, without and with an expected pose."""
+    max_coasting: int = 3
+    """Maximum number of frames in a row that are not trusted and continue the motion before them."""
     keyframe_m: float = 3.0
     keyframe_deg: float = 20.0
     """A frame farther from the keyframe than this, in metres or degrees, is the next keyframe."""
@@ -46,15 +54,23 @@ class Motion:
         """Seconds, without those in which the sensor stood still."""
         self.keyframe = 0
         self._times: list[float] = []
+        self._coasted = 0
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def add(self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None) -> None:
         """Add a frame at `time` (seconds), by its `pose` from odometry or its peak over the keyframe's image."""
-        key = self.keyframe
-        if pose is None and link is not None and self._is_trusted(link):
+        key, coasts = self.keyframe, False
+        if (
+            pose is None
+            and link is not None
+            and self._is_trusted(link, expected=bool(np.isfinite(self.prior(time)).all()))
+        ):
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
+        elif pose is None and self._coasted < self.config.max_coasting:
+            pose, coasts = self._expected(time), True
+        self._coasted = self._coasted + 1 if coasts else 0
         if not self.poses:
             self._append(time, pose, segment=0, travelled=0.0, clock=0.0)
         elif pose is None:
@@ -65,9 +81,26 @@ class Motion:
             clock = self.clock[key] + min(time - self._times[key], self.config.standing_s)
             travelled = self.travelled[key] + moved
             self._append(time, pose, segment=self.segments[key], travelled=travelled, clock=clock)
-            if moved <= self.config.keyframe_m and rotation <= np.radians(self.config.keyframe_deg):
+            if moved <= self.config.keyframe_m and rotation <= np.radians(self.config.keyframe_deg) and not coasts:
                 return
         self.keyframe = len(self) - 1
+
+    def prior(self, time: float) -> Float[np.ndarray, " 3"]:
+        """The expected x, y and yaw over the keyframe at `time`, at constant velocity; NaN if that is not known."""
+        expected = self._expected(time)
+        if expected is None:
+            return np.full(3, np.nan)
+        moved = inverse(self.poses[self.keyframe]) @ expected
+        return np.array([moved[0, 3], moved[1, 3], yaw_of(moved)])
+
+    def _expected(self, time: float) -> Float[np.ndarray, "4 4"] | None:
+        if len(self) < 2 or self.segments[-1] != self.segments[-2] or self._times[-1] <= self._times[-2]:
+            return None
+        steps = (time - self._times[-1]) / (self._times[-1] - self._times[-2])
+        if not 0 < steps <= MOST_STEPS:
+            return None
+        last = inverse(self.poses[-2]) @ self.poses[-1]
+        return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
 
     def _append(
         self, time: float, pose: Float[np.ndarray, "4 4"] | None, *, segment: int, travelled: float, clock: float
@@ -95,9 +128,11 @@ class Motion:
         known = np.array(self.segments) == self.segments[-1]
         return np.asarray(known & (self.travelled[-1] - np.array(self.travelled) < travelled_m))
 
-    def _is_trusted(self, link: Peak) -> bool:
-        best = float(link.correlation)
-        return best >= self.config.min_correlation and float(link.second) <= self.config.max_second * best
+    def _is_trusted(self, link: Peak, *, expected: bool) -> bool:
+        best, config = float(link.correlation), self.config
+        most = config.max_second_expected if expected else config.max_second
+        fits = best >= config.min_correlation and float(link.second) <= most * best
+        return fits and float(link.ridge) <= config.max_ridge * best
 
     def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
         """Metres and radians from a keyframe to a pose."""

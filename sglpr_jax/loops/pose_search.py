@@ -8,6 +8,7 @@ which is faster than a whole one.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -42,6 +43,11 @@ class VerificationConfig:
     second_m: float = 3.0
     second_deg: float = 15.0
     """Minimum distance of the second peak from the best one, in metres or in degrees."""
+    ridge_m: float = 6.0
+    """Maximum distance at which a peak of the same rotation belongs to the ridge of the best one, in metres."""
+    prior_m: float = 2.0
+    prior_deg: float = 10.0
+    """Maximum distance of a pose from the expected one, where there is one."""
 
 
 DEFAULT = VerificationConfig()
@@ -62,6 +68,9 @@ class Peak(NamedTuple):
     """1 for equal images, about 0 for unrelated ones."""
     second: Float[AnyArray, "*b"]
     """Highest correlation at any other pose (`second_m`, `second_deg`)."""
+    ridge: Float[AnyArray, "*b"]
+    """Highest correlation at `second_m` to `ridge_m` from the best pose, at about its rotation: high where the
+    surroundings do not tell how far the sensor moved, as between walls."""
 
     def one(self, k: int) -> "Peak":
         """The k-th of several."""
@@ -72,22 +81,25 @@ class Peak(NamedTuple):
         return Peak(*(values[rows] for values in self))
 
 
-NO_PEAKS = Peak(*[np.zeros(0, np.float32)] * 5)
+NO_PEAKS = Peak(*[np.zeros(0, np.float32)] * len(Peak._fields))
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def search(
     query: Num[Array | np.ndarray, "h w"],
     matches: Num[Array | np.ndarray, "k h w"],
+    priors: Float[Array | np.ndarray, "k 3"] | None = None,
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Peak:
     """Return the best pose of a query in the frame of each of k matches.
 
     Arguments:
-      query: a square image of counts in the orientation of eq. 1, with an even number of cells per side.
-      matches: images of the same size.
-      config: the search range.
+      query: A square image of counts in the orientation of eq. 1, with an even number of cells per side.
+      matches: Images of the same size.
+      priors: Expected x, y (metres) and yaw (radians) of the query for each match, near which the pose is searched; a
+        row of NaN has none.
+      config: The search range.
 
     Returns:
       Peaks with a leading axis of k.
@@ -100,11 +112,13 @@ def search(
     rotated = rotations(merged(prepared(query, config), config.coarse), jnp.asarray(angles))
     spectra = jnp.moveaxis(spectrum(rotated, cell_m, config), 1, 0)
 
-    def one(match: Num[Array, "h w"]) -> Peak:
-        there = spectrum(merged(prepared(match, config), config.coarse)[None], cell_m, config)
-        return _peak(_correlations(spectra, there[0], cell_m, config), cell_m, config)
+    def one(match: tuple[Num[Array, "h w"], Float[Array, " 3"]]) -> Peak:
+        image, prior = match
+        there = spectrum(merged(prepared(image, config), config.coarse)[None], cell_m, config)
+        return _peak(_correlations(spectra, there[0], cell_m, config), prior, cell_m, config)
 
-    return jax.lax.map(one, jnp.asarray(matches))
+    priors = np.full((len(matches), 3), np.nan, np.float32) if priors is None else priors
+    return jax.lax.map(one, (jnp.asarray(matches), jnp.asarray(priors, jnp.float32)))
 
 
 def prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
@@ -187,13 +201,18 @@ def _inverse_transforms(size: int, reach: int) -> tuple[np.ndarray, np.ndarray]:
     return rows.astype(np.float32), columns.astype(np.float32)
 
 
-def _peak(found: Float[Array, "d t r"], cell_m: float, config: VerificationConfig) -> Peak:
-    at = jnp.unravel_index(jnp.argmax(found), found.shape)
-    elsewhere = jnp.where(_near(found.shape, at, cell_m, config), 0.0, found)
-    down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
+def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], cell_m: float, config: VerificationConfig) -> Peak:
     reach, step = cells(config.max_shift_m, cell_m), np.float32(2 * np.pi / config.turns)
+    x, y, yaw = prior  # of which NaN leaves everything
+    expected = reach - y / cell_m, yaw / step, reach + x / cell_m
+    near_prior = _near(found.shape, expected, config.prior_m / cell_m, config.prior_deg)
+    at = jnp.unravel_index(jnp.argmax(jnp.where(near_prior | jnp.isnan(x), found, -1.0)), found.shape)
+    near = _near(found.shape, at, config.second_m / cell_m, config.second_deg)
+    about = _near(found.shape, at, config.ridge_m / cell_m, config.second_deg)
+    second, ridge = (jnp.max(jnp.where(where, found, 0.0)) for where in (~near, about & ~near))
+    down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
     x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
-    return Peak(x, y, yaw, found[at], jnp.maximum(jnp.max(elsewhere), 0))
+    return Peak(x, y, yaw, found[at], second, ridge)
 
 
 def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
@@ -215,10 +234,11 @@ def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> 
 
 
 def _near(
-    shape: tuple[int, ...], peak: tuple[Int[Array, ""], ...], cell_m: float, config: VerificationConfig
+    shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""]], most_cells: float, most_deg: float
 ) -> Bool[Array, "d t r"]:
-    """Which poses belong to the best peak."""
-    down, turn, right = (jnp.abs(jnp.arange(n) - at) for n, at in zip(shape, peak, strict=True))
-    turn = jnp.minimum(turn, shape[1] - turn) * (360 / shape[1]) <= config.second_deg
-    down, right = (apart * cell_m <= config.second_m for apart in (down, right))
+    """Which poses are near one."""
+    down, turn, right = (jnp.abs(jnp.arange(n) - at) for n, at in zip(shape, pose, strict=True))
+    turn = jnp.mod(turn, shape[1])
+    turn = jnp.minimum(turn, shape[1] - turn) * (360 / shape[1]) <= most_deg
+    down, right = (apart <= most_cells + 1e-6 for apart in (down, right))
     return down[:, None, None] & turn[None, :, None] & right[None, None, :]

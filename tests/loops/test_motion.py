@@ -8,8 +8,8 @@ from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import transform
 
 
-def link(x: float, correlation: float = 0.9, second: float = 0.3) -> Peak:
-    return Peak(*map(np.float32, (x, 0.0, 0.0, correlation, second)))
+def link(x: float, correlation: float = 0.9, second: float = 0.3, ridge: float = 0.2) -> Peak:
+    return Peak(*map(np.float32, (x, 0.0, 0.0, correlation, second, ridge)))
 
 
 def test_links_to_keyframes_add_up():

@@ -18,7 +18,7 @@ def straight(frames: int, step_m: float = 1.0) -> Motion:
 
 def peaks(x: list[float], correlation: list[float], second: list[float]) -> Peak:
     zeros = np.zeros(len(x))
-    return Peak(np.array(x), zeros, zeros, np.array(correlation), np.array(second))
+    return Peak(np.array(x), zeros, zeros, np.array(correlation), np.array(second), zeros)
 
 
 def test_rivals_come_from_before_the_query_and_around_the_match():
