@@ -7,16 +7,23 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Seen, labelled, square_image
+from sglpr_jax.loops.candidates import (
+    Candidate,
+    CandidateConfig,
+    CandidateFinder,
+    Compared,
+    Seen,
+    labelled,
+    square_image,
+)
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.loops.drift import DriftModel
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import MIN_OVERLAP
-from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.verification import Alignment
 
-NOW = CandidateConfig(exclude_frames=0)
+NOW = CandidateConfig(exclude_frames=0, min_travelled_m=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -87,23 +94,26 @@ def test_images_and_scans_are_the_same_to_it(drive, params, revisit):
     assert (found[0].query, found[0].match) == (1, 0)
     for one, other in zip(found[0].alignment, same[0].alignment, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5)
-    assert found[0].alignment.correlation > 0.4 and np.isnan(found[0].evidence.margin)
+    assert found[0].alignment.correlation > 0.4 and np.isnan(found[0].evidence.rival)
     np.testing.assert_array_equal(scans.images[0], square_image(Record(points=points)))
     assert scans.images[0].shape == (152, 152)
 
 
-def test_odometry_far_off_leaves_a_candidate_out_and_margins_are_of_other_places(drive, params, revisit):
+def test_odometry_far_off_leaves_a_candidate_out(drive, params, revisit):
     query, match = (drive.points(frame) for frame in revisit)
-    for metres, there in ((5.0, 1), (90.0, 0)):
+    for metres, there in ((12.0, 1), (90.0, 0)):
         finder = CandidateFinder(params, config=NOW)
         finder.add(Record(points=match), odometry=np.eye(4))
         assert len(finder.add(Record(points=query), odometry=transform(metres, 0.0, 0.0))) == there
-    finder = CandidateFinder(params, config=NOW, drift=DriftModel(metres_per_metre=0.1))
-    for k, cloud in enumerate((match, drive.points(0), query)):
-        found = finder.add(Record(points=cloud), odometry=transform((0.0, 21.0, 2.0)[k], 0.0, 0.0))
-    distances = np.linalg.norm(finder.index.descriptors[:2] - finder.index.descriptors[2], axis=1)
-    assert found[0].match == 0
-    assert found[0].evidence.margin == pytest.approx(distances[1] - distances[0], rel=1e-4)
+
+
+def test_a_frame_near_which_the_sensor_stayed_is_no_candidate(drive, params, revisit):
+    config = CandidateConfig(exclude_frames=0)
+    for metres, there in ((3.0, 0), (12.0, 1)):
+        finder = CandidateFinder(params, config=config)
+        for step in (0.0, metres, metres):
+            found = finder.add(Record(points=drive.points(revisit[0])), odometry=transform(step, 0.0, 0.0))
+        assert len(found) == there
 
 
 def test_candidates_with_true_positions_are_labelled():
@@ -115,31 +125,53 @@ def test_candidates_with_true_positions_are_labelled():
 
 
 def _candidate(query: int, match: int):
-    return Candidate(query, match, None, Evidence(float(query), 0.0, 0.0, 0.0))
+    return Candidate(query, match, None, Evidence(float(query), 0.0, 0.0, 0.0, 0.0))
 
 
-def test_one_probable_frame_is_no_loop_two_in_a_row_are(drive, params, revisit):
-    """A model that calls everything a loop, so that what counts is the order of frames."""
-    always = LoopModel({"distance": 0.0}, {"distance": 0.0}, {"distance": 1.0}, 10.0, "everything")
-    config = DetectorConfig(candidates=NOW)
-    detector = LoopDetector(params, model=always, config=config)
-    places = (revisit[1], revisit[1] + 1, revisit[0] - 1, revisit[0])
-    returned = [detector.add(drive.points(frame)) for frame in places]
-    assert [len(found) for found in returned[:2]] == [0, 0]
-    assert detector.loops and all(loop.probability > 0.99 for loop in detector.loops)
+def model_of(log_odds: float) -> LoopModel:
+    """A model that says the same of every pair."""
+    return LoopModel({"distance": Curve((0.0,), (0.0,))}, log_odds, "by hand")
 
 
-def test_a_least_probability_below_that_of_neighbours_is_theirs_too(params):
-    third = LoopModel({"distance": 0.0}, {"distance": 0.0}, {"distance": 1.0}, float(np.log(0.5)), "1 of 3")
-    alignment = Alignment(*np.zeros(3), np.eye(3), 0.8, 0.3)
-    for least, there in ((0.2, 2), (0.4, 0)):
-        config = DetectorConfig(min_probability=least, candidates=NOW)
-        detector = LoopDetector(params, model=third, config=config)
-        seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
-        for query in range(4):
-            pair = Candidate(query, query - 2, alignment, Evidence.of(1.0, 0.0, 0.8, 0.3))
-            detector.add_seen(seen, candidates=[pair] if query >= 2 else [])
-        assert len(detector.loops) == there
+def streamed_pairs(params, matches: dict[int, int], model: LoopModel, **options) -> LoopDetector:
+    """The detector after 20 frames 5 m apart, some of which have a match where the query is said to be."""
+    detector = LoopDetector(params, model=model, config=DetectorConfig(candidates=NOW, **options))
+    seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
+    poses = [transform(5.0 * frame, 0.0, 0.0) for frame in range(10)]
+    poses += [transform(45.0 - 5.0 * frame, 1.0, np.pi) for frame in range(10)]
+    for query, pose in enumerate(poses):
+        pairs = []
+        if query in matches:
+            true = inverse(poses[matches[query]]) @ pose
+            alignment = Alignment(*true[:2, 3], yaw_of(true), np.diag([0.1, 0.1, 0.01]), 0.8, 0.3)
+            pairs = [Candidate(query, matches[query], alignment, Evidence.of(1.0, 0.5, 0.8, 0.3, 0.3))]
+        detector.add_seen(seen, odometry=pose, compared=Compared(pairs, None))
+    return detector
+
+
+def test_one_probable_frame_is_no_loop_two_that_agree_are(params):
+    alone = streamed_pairs(params, {15: 4}, model_of(6.0))
+    assert alone.loops == [] and [one.reason for one in alone.rejected] == []
+    two = streamed_pairs(params, {12: 7, 13: 6}, model_of(6.0))
+    assert [(loop.query, loop.match) for loop in two.loops] == [(12, 7), (13, 6)]
+    assert all(loop.probability > 0.999 for loop in two.loops)
+
+
+def test_neighbours_make_a_less_probable_pair_a_loop(params):
+    assert streamed_pairs(params, {12: 7, 13: 6}, model_of(3.5)).loops  # .97 each
+    assert not streamed_pairs(params, {12: 7, 13: 6}, model_of(2.0)).loops
+
+
+def test_pairs_that_other_places_fit_as_well_are_rejected_with_that_reason(params):
+    repeats = Curve((0.5, 1.0), (12.0, 0.0))
+    model = LoopModel({"distance": Curve((0.0,), (0.0,)), "rival": repeats}, -6.0, "by hand")
+    detector = LoopDetector(params, model=model, config=DetectorConfig(candidates=NOW))
+    seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
+    alignment = Alignment(*np.zeros(3), np.eye(3), 0.9, 0.3)
+    for rival, reasons in ((1.0, ["repeats"]), (np.nan, ["repeats"] * 2), (0.5, ["repeats"] * 2)):
+        pair = Candidate(len(detector), 0, alignment, Evidence.of(0.1, 0.5, 0.9, 0.3, rival))
+        detector.add_seen(seen, compared=Compared([pair], None))
+        assert [one.reason for one in detector.rejected] == reasons
 
 
 @pytest.mark.parametrize("name", ["min_probability", "min_neighbour_probability"])

@@ -13,17 +13,17 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, Seen
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, Compared, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.joint import check_odometry
-from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.loops.verification import Alignment
 
 N = 40
-ALWAYS = LoopModel({"distance": 0.0}, {"distance": 0.0}, {"distance": 1.0}, 10.0, "everything")
-CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=0))
+ALWAYS = LoopModel({"distance": Curve((0.0,), (0.0,))}, 10.0, "everything")
+CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=0, min_travelled_m=0.0))
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +53,8 @@ def searched(
         if match < query:
             true = np.eye(4) if query in wrong else inverse(poses[match]) @ poses[query]
             alignment = Alignment(*true[:2, 3], yaw_of(true), np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
-            pairs = [Candidate(query, match, alignment, Evidence.of(1.0, 0.0, 0.8, 0.3))]
-        detector.add_seen(seen, odometry=pose, candidates=pairs)
+            pairs = [Candidate(query, match, alignment, Evidence.of(1.0, 0.5, 0.8, 0.3, 0.3))]
+        detector.add_seen(seen, odometry=pose, compared=Compared(pairs, None))
     return detector
 
 

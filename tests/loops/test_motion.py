@@ -25,14 +25,27 @@ def test_links_to_keyframes_add_up():
     assert known.all()
 
 
-@pytest.mark.parametrize("weak", [link(1.0, correlation=0.3, second=0.1), link(1.0, second=0.8)])
-def test_a_link_that_fits_badly_or_elsewhere_begins_a_segment(weak):
+WEAK = (link(1.0, correlation=0.3, second=0.1), link(1.0, second=1.4), link(1.0, ridge=0.8))
+
+
+@pytest.mark.parametrize("weak", WEAK)
+def test_a_few_links_that_cannot_be_trusted_continue_the_motion(weak):
     motion = Motion()
-    for one in (None, link(1.0), weak, link(1.0)):
+    for one in (None, link(1.0), weak, weak, weak, weak, link(1.0)):
         motion.add(float(len(motion)), link=one)
-    assert motion.segments == [0, 0, 1, 1]
-    assert motion.from_frame(3, np.array([0, 2]))[1].tolist() == [False, True]
-    assert motion.clock == [0.0, 1.0, 2.0, 3.0]
+    assert motion.segments == [0, 0, 0, 0, 0, 1, 1]
+    np.testing.assert_allclose([pose[0, 3] for pose in motion.poses[:5]], np.arange(5.0))
+    assert motion.from_frame(6, np.array([0, 5]))[1].tolist() == [False, True]
+    assert motion.clock == list(map(float, range(7)))
+
+
+def test_another_peak_is_no_matter_where_the_pose_is_expected():
+    motion = Motion()
+    for one in (None, link(1.0, second=0.7), link(2.0, second=1.2)):
+        motion.add(float(len(motion)), link=one)
+    assert motion.segments == [0, 0, 0]
+    np.testing.assert_allclose(motion.prior(3.0), [3.0, 0.0, 0.0], atol=1e-9)
+    assert np.isnan(motion.prior(9.0)).all()  # too long after
 
 
 def test_the_clock_stops_where_the_sensor_stands():
