@@ -118,7 +118,7 @@ def simulated(drive: Drive, lidar: Sensor, scans: int) -> SimulatedRecording:
 
 def revisits(recording: SimulatedRecording, count: int, rng: np.random.Generator) -> Int[np.ndarray, "n 2"]:
     """Pairs of query and match: of half the queries the nearest earlier scan, of the others one of any distance."""
-    positions, times = recording.positions, recording.poses.times
+    positions, times = recording.poses.world_from_lidar[:, :3, 3], recording.poses.times
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
     apart[(apart > APART_M) | (times[:, None] - times[None] < APART_S)] = np.inf
     queries = np.sort(rng.permutation(np.flatnonzero(np.isfinite(apart).any(axis=1)))[:count])

@@ -5,6 +5,8 @@ the peak stands on, and small fixed errors. The constants were fitted on simulat
 (`benchmarks/covariance.py`).
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +23,7 @@ FLAT_M = 10.0
 RIDGE_DROP = 0.04
 """Scale of the likelihood along the weak axis. It falls by a factor of e where the correlation, divided by the area
 that both images share, falls by this fraction of the peak."""
-RIDGE_STEP_M, RIDGE_START_M = 0.5, 1.5
+RIDGE_STEP_M, RIDGE_START_M = 1.0, 1.5
 """Spacing of the samples along the weak axis, and the distance up to which the curvature alone describes the peak."""
 RIDGE_BAND = 0.25
 """Highest frequency of these samples, in cycles per cell. Higher ones cost time and change nothing."""
@@ -37,7 +39,7 @@ def peak_covariance(
     *,
     occupied: Int[Array, ""],
     apart_m: Float[Array, ""],
-    ridge: Float[Array, "2 2"],
+    ridge: Float[Array, "3 3"],
 ) -> Float[Array, "3 3"]:
     """Return the covariance of (x, y, yaw) at a peak, in metres and radians.
 
@@ -54,29 +56,32 @@ def peak_covariance(
     strengths, directions = jnp.linalg.eigh(curvature)
     spread = noise / (jnp.maximum(strengths, 0) + noise / FLAT_M**2)
     peak = (directions * spread[None]) @ directions.T
-    others = jnp.trace(ridge) * np.array([RIDGE_ACROSS, RIDGE_ACROSS, RIDGE_YAW], np.float32) ** 2
+    others = jnp.trace(ridge[:2, :2]) * np.array([RIDGE_ACROSS, RIDGE_ACROSS, RIDGE_YAW], np.float32) ** 2
     least = np.array([LEAST_POSITION_M, LEAST_POSITION_M, np.radians(LEAST_YAW_DEG)], np.float32) ** 2
-    return peak + jnp.pad(ridge, (0, 1)) + jnp.diag(others + least)
+    return peak + ridge + jnp.diag(others + least)
 
 
 def ridge_covariance(
-    product: Complex[Array, "s f"],
-    at: Float[Array, " 2"],
+    products: Complex[Array, "t s f"],
+    pose: Float[Array, " 3"],
+    yaws: Float[Array, " t"],
     curvature: Float[Array, "3 3"],
     *,
     cell_m: float,
     reach_m: float,
     max_shift_m: float,
-) -> Float[Array, "2 2"]:
-    """Return the covariance of (x, y) along the weak axis of a peak, as far as the correlation stays high there.
+) -> Float[Array, "3 3"]:
+    """Return the covariance of (x, y, yaw) along the weak axis of a peak, as far as the correlation stays high there.
 
     Along a wall the correlation falls only because the two images share less area. A pattern that moves with the sensor
-    can leave a small peak on top of such a ridge. Samples beyond a dip belong to another peak and count no more than
-    the dip.
+    can leave a small peak on top of such a ridge. Along a bend the ridge turns with the distance, so the best of
+    several rotations counts. Samples beyond a dip belong to another peak and count no more than the dip.
 
     Arguments:
-      product: the Fourier transform of the correlation, of real images (`rfft2`).
-      at: x (right) and y (up) of the peak, in metres.
+      products: for each rotation of the query, the Fourier transform (`rfft2`) of the correlation; that of the peak
+        first.
+      pose: x (right) and y (up) of the peak in metres, and its yaw.
+      yaws: the rotations, in radians.
       curvature: minus the Hessian of the correlation at the peak, over x, y and yaw.
       cell_m: the edge of a cell.
       reach_m: the radius of the images.
@@ -84,22 +89,26 @@ def ridge_covariance(
     """
     steps = int(max_shift_m / RIDGE_STEP_M)
     along = np.arange(-steps, steps + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
-    weak = _weak_axis(curvature)
-    points = at[None] + along[:, None] * weak[None]
-    heights = _heights(product, points, cell_m) / _shared_area(jnp.hypot(points[:, 0], points[:, 1]), reach_m)
-    share = heights / jnp.maximum(heights[steps], 1e-6)
+    turned = jnp.asarray(yaws - pose[2]).at[0].set(0.0)
+    heading = _weak_axis(curvature) + turned / 2  # the chord of an arc
+    moved = along[None, :, None] * jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)[:, None]
+    points = pose[None, None, :2] + moved
+    area = _shared_area(jnp.hypot(points[..., 0], points[..., 1]), reach_m)
+    heights = jax.vmap(functools.partial(_heights, cell_m=cell_m))(products, points) / area
+    share = heights.max(0) / jnp.maximum(heights[0, steps], 1e-6)
     share = jnp.concatenate([jax.lax.cummin(share[steps::-1])[::-1], jax.lax.cummin(share[steps:])[1:]])
-    inside = (jnp.abs(points).max(1) <= max_shift_m + RIDGE_STEP_M) | (along == 0)
+    best = heights.argmax(0)
+    apart = jnp.concatenate([moved[best, np.arange(len(along))], turned[best][:, None]], axis=1)
+    inside = (jnp.abs(points[0]).max(1) <= max_shift_m + RIDGE_STEP_M) | (along == 0)
     weight = jnp.where(inside, jnp.exp(-jnp.maximum(1 - share, 0) / RIDGE_DROP), 0)
-    square = np.where(np.abs(along) >= RIDGE_START_M, along**2, 0)
-    return (weight * square).sum() / weight.sum() * jnp.outer(weak, weak)
+    outside = (np.abs(along) >= RIDGE_START_M).astype(np.float32)
+    return jnp.einsum("k,ki,kj->ij", weight * outside, apart, apart) / weight.sum()
 
 
-def _weak_axis(curvature: Float[Array, "3 3"]) -> Float[Array, " 2"]:
-    """The direction in the plane along which the correlation changes least, the best yaw taken everywhere."""
+def _weak_axis(curvature: Float[Array, "3 3"]) -> Float[Array, ""]:
+    """The angle of the direction in the plane along which the correlation changes least, the best yaw taken there."""
     planar = curvature[:2, :2] - jnp.outer(curvature[:2, 2], curvature[2, :2]) / jnp.maximum(curvature[2, 2], 1e-4)
-    strong = jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2
-    return jnp.stack([-jnp.sin(strong), jnp.cos(strong)])
+    return jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
 
 
 def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m: float) -> Float[Array, " k"]:
@@ -114,7 +123,7 @@ def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m
     return ((rows @ kept) * columns).real @ twice
 
 
-def _shared_area(apart_m: Float[Array, " k"], reach_m: float) -> Float[Array, " k"]:
+def _shared_area(apart_m: Float[Array, "*b"], reach_m: float) -> Float[Array, "*b"]:
     """The share of a circle of radius `reach_m` that lies in another circle at this distance."""
     ratio = jnp.minimum(apart_m / (2 * reach_m), 0.95)
     return (jnp.arccos(ratio) - ratio * jnp.sqrt(1 - ratio**2)) * np.float32(2 / np.pi)

@@ -72,6 +72,8 @@ class Alignment(NamedTuple):
 DEFAULT = VerificationConfig()
 TURN_STEPS = 4
 """Steps of the second search to each side in angle."""
+RIDGE_TURNS = (0, 2, 6, 8)
+"""Those of these angles at which a ridge that bends is looked for."""
 SHIFT_STEPS = 5
 """Steps of half a cell of the second search to each side in x and y."""
 
@@ -210,9 +212,11 @@ def _refined(
     pose = jnp.stack([xs[middle[0]], ys[middle[1]], yaws[middle[2]]]) + offset * sizes
     correlation = value + gradient @ offset + offset @ hessian @ offset / 2
     curvature = -hessian / (sizes[:, None] * sizes[None])
+    turns = jnp.concatenate([middle[2][None] + jnp.round(offset[2]).astype(int), np.array(RIDGE_TURNS)])
     ridge = ridge_covariance(
-        product[middle[2] + jnp.round(offset[2]).astype(int)],
-        pose[:2],
+        product[turns],
+        pose,
+        yaws[turns],
         curvature,
         cell_m=cell_m,
         reach_m=config.reach_m,

@@ -126,7 +126,7 @@ def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
     squares = []
     for query, match in pairs:
         found, true = align(images[query], images[match]), inverse(poses[match]) @ poses[query]
-        error = difference(pose_of(found), [*true[:2, 3], yaw_of(true)])
+        error = difference(pose_of(found), np.array([*true[:2, 3], float(yaw_of(true))]))
         squares.append(error @ np.linalg.inv(np.asarray(found.covariance, np.float64)) @ error)
     assert len(squares) >= 20
     assert 0.5 < np.median(squares) / 2.37 < 2  # the median of a chi-square of 3 degrees of freedom
