@@ -148,7 +148,12 @@ def _registered(
     for i, loop in enumerate(loops):
         if should_stop():
             return [*kept, *loops[i:]], rejected
-        found = register(recording.points(loop.query), recording.points(loop.match), initial=loop.match_from_query)
+        found = register(
+            recording.points(loop.query),
+            recording.points(loop.match),
+            initial=loop.match_from_query,
+            initial_covariance=loop.covariance,
+        )
         values = {"match_from_query": found.match_from_query, "covariance": found.covariance, "overlap": found.overlap}
         loop = dataclasses.replace(loop, **values)
         if found.overlap >= MIN_OVERLAP:

@@ -4,16 +4,13 @@ import dataclasses
 from typing import Literal
 
 import numpy as np
+from jax import Array
 from jaxtyping import Float
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, yaw_of
 from sglpr_jax.loops.upright import lidar_pose, upright_from_lidar
 from sglpr_jax.loops.verification import Alignment
-
-UNSEEN_HEIGHT_M = 0.5
-UNSEEN_TILT_DEG = 2.0
-"""Standard deviations of height, pitch and roll, which an image from above does not show."""
 
 Reason = Literal[
     "repeats",
@@ -24,6 +21,12 @@ Reason = Literal[
     "little overlap",
 ]
 """Why a pair that looked like a loop closure was rejected."""
+UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M = 0.03, 0.018
+UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M = 1.2, 0.07
+"""Standard deviations of what an image from above does not show, of two scans at one spot and per metre between them:
+height, and pitch and roll. They hold for vehicles: simulated towns and outskirts, and KITTI's poses."""
+DEGENERATE_M = 1.0
+"""A pose with a larger standard deviation of its position is degenerate, in metres."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,6 +57,40 @@ class Loop:
         """The inverse of the covariance."""
         return np.linalg.inv(self.covariance)
 
+    @property
+    def is_degenerate(self) -> bool:
+        """Whether the position in the plane has a standard deviation of more than `DEGENERATE_M`."""
+        return is_degenerate(self.covariance)
+
+
+def unseen_covariance(apart_m: float) -> Float[np.ndarray, "6 6"]:
+    """Covariance of height, roll and pitch between two upright scans this far apart in the plane; zero elsewhere.
+
+    Springs and bumps tilt both vehicles. A tilted vehicle, or a hill, raises what is far away.
+    """
+    height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
+    tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
+    return np.diag([0.0, 0.0, height, tilt, tilt, 0.0]) ** 2
+
+
+def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
+    """Largest standard deviation of the position in the plane, over all directions, in metres.
+
+    Arguments:
+      covariance: of (x, y, yaw), as `Alignment` has it, or of all 6 degrees of freedom, as `Loop` has it.
+    """
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance, np.float64)[:2, :2])[-1], 0)))
+
+
+def is_degenerate(covariance: Float[np.ndarray | Array, "n n"], *, threshold_m: float = DEGENERATE_M) -> bool:
+    """Whether a pose is unknown along some direction of the plane, as along a plain wall.
+
+    Arguments:
+      covariance: see `position_deviation`.
+      threshold_m: the largest standard deviation of a pose that is known.
+    """
+    return position_deviation(covariance) > threshold_m
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rejected:
@@ -83,7 +120,7 @@ def planar_loop(
       match_mounting: Mounting of the match's sensor.
     """
     upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
-    covariance = np.diag([0.0, 0, UNSEEN_HEIGHT_M, *[np.radians(UNSEEN_TILT_DEG)] * 2, 0]) ** 2
+    covariance = unseen_covariance(float(np.hypot(alignment.x, alignment.y)))
     seen = np.array([0, 1, 5])
     to_query = np.eye(3)
     to_query[:2, :2] = upright[:2, :2].T  # the alignment's covariance is in the match's frame

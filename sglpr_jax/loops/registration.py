@@ -7,11 +7,12 @@ the share of the space of one scan that the other one fills too, the overlap.
 import importlib
 from dataclasses import dataclass
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from sglpr_jax.loops.registration_covariance import NEIGHBOURS, matched_points, registration_covariance
 from sglpr_jax.loops.transforms import transformed
 
 
@@ -29,9 +30,9 @@ class RegistrationConfig:
     overlap_voxel_m: float = 1.0
     overlap_reach_m: float = 40.0
     """Points farther from both sensors do not count in the overlap."""
-    min_position_m: float = 0.02
-    min_rotation_deg: float = 0.1
-    """Standard deviations that no covariance goes below: GICP's are those of noise alone."""
+    min_position_m: float = 0.002
+    min_rotation_deg: float = 0.005
+    """Standard deviations added to every covariance, in metres and degrees."""
 
 
 class Registration(NamedTuple):
@@ -49,13 +50,20 @@ def register(
     match: Float32[np.ndarray, "m 3"],
     *,
     initial: Float[np.ndarray, "4 4"] | None = None,
+    initial_covariance: Float[np.ndarray, "6 6"] | None = None,
     config: RegistrationConfig = RegistrationConfig(),
 ) -> Registration:
-    """Lay the scan of a query over that of a match, both in metres in the LiDAR frame.
+    """Register the scan of a query to that of a match, both in metres in the LiDAR frame.
 
-    `initial` is a first `match_from_query`, right to a metre and some degrees; without it KISS-Matcher finds one from
-    nothing, which takes half a second. Raises ImportError where the extra `slam` is not installed, ValueError for scans
-    of fewer than 100 finite points.
+    Arguments:
+      initial: a first guess of `match_from_query`, within a metre and some degrees. Without it KISS-Matcher finds one,
+        which takes half a second.
+      initial_covariance: covariance of the first guess, of a small motion of the query in its own frame. The result
+        keeps it along a direction in which the scans slide on each other, as in a tunnel.
+
+    Raises:
+      ImportError: the extra `slam` is not installed.
+      ValueError: a scan has fewer than 100 finite points.
 
     Example:
       found = register(recording.points(52), recording.points(4501))
@@ -64,8 +72,8 @@ def register(
     gicp = _library("small_gicp")
     query, match = _finite(query, "query"), _finite(match, "match")
     initial = coarse_pose(query, match, voxel_m=config.voxel_m) if initial is None else initial
-    target, tree = gicp.preprocess_points(match.astype(np.float64), downsampling_resolution=config.fine_voxel_m)
-    source, _ = gicp.preprocess_points(query.astype(np.float64), downsampling_resolution=config.fine_voxel_m)
+    target, tree = _preprocessed(match, config)
+    source, _ = _preprocessed(query, config)
     found = gicp.align(
         target,
         source,
@@ -76,8 +84,12 @@ def register(
         max_iterations=config.iterations,
     )
     pose = np.asarray(found.T_target_source)
-    spread = found.error / max(found.num_inliers, 1)  # per point, in units of GICP's own covariances
-    return Registration(pose, _covariance(found.H, spread, config), overlap(query, match, pose, config=config))
+    order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp has the rotation first
+    information = np.asarray(found.H)[order][:, order]
+    matched = matched_points(target, tree, source, pose, max_apart_m=config.max_apart_m)
+    covariance = registration_covariance(information, matched, pose, initial_covariance)
+    least = np.repeat([config.min_position_m, np.radians(config.min_rotation_deg)], 3) ** 2
+    return Registration(pose, covariance + np.diag(least), overlap(query, match, pose, config=config))
 
 
 def coarse_pose(
@@ -119,13 +131,10 @@ def _voxels(cloud: Float[np.ndarray, "n 3"], config: RegistrationConfig) -> Int[
     return np.unique((z * side + y) * side + x)
 
 
-def _covariance(
-    information: Float[np.ndarray, "6 6"], spread: float, config: RegistrationConfig
-) -> Float[np.ndarray, "6 6"]:
-    """From GICP's information matrix, rotation first."""
-    order = np.array([3, 4, 5, 0, 1, 2])
-    least = np.repeat([config.min_position_m, np.radians(config.min_rotation_deg)], 3) ** 2
-    return np.linalg.pinv(information)[order][:, order] * spread + np.diag(least)
+def _preprocessed(cloud: Float32[np.ndarray, "n 3"], config: RegistrationConfig) -> tuple[Any, Any]:
+    """The thinned cloud with the covariances of its surface, and its tree."""
+    points, size = cloud.astype(np.float64), config.fine_voxel_m
+    return _library("small_gicp").preprocess_points(points, downsampling_resolution=size, num_neighbors=NEIGHBOURS)
 
 
 def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray, "n 3"]:

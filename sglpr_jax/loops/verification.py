@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Num
 
+from sglpr_jax.loops.peak_covariance import peak_covariance, ridge_covariance
 from sglpr_jax.loops.pose_search import DEFAULT, Peak, VerificationConfig, prepared, rotations, search, spectrum, twice
 
 
@@ -24,7 +25,11 @@ class Alignment(NamedTuple):
     yaw: Float[Array, "*b"]
     """How it is turned there, radians, counter-clockwise, from -pi to pi."""
     covariance: Float[Array, "*b 3 3"]
-    """Of x, y and yaw, from the curvature of the peak; it knows nothing of another peak."""
+    """Covariance of x, y (metres) and yaw (radians), in the match's frame.
+
+    It follows the shape of the peak: metres along a plain wall, centimetres across. It does not include the chance that
+    another peak is the right one; see `second`.
+    """
     correlation: Float[Array, "*b"]
     """At the peak: 1 for equal images, about 0 for images that have nothing to do with each other."""
     second: Float[Array, "*b"]
@@ -37,10 +42,10 @@ class Alignment(NamedTuple):
 
 TURN_STEPS = 4
 """Steps of the second search to each side in angle."""
+RIDGE_TURNS = (0, 2, 6, 8)
+"""Those of these angles at which a ridge that bends is looked for."""
 SHIFT_STEPS = 5
 """Steps of half a cell of the second search to each side in x and y."""
-LEAST_CURVATURE = 1e-4
-"""Of the correlation, per square metre or radian; a flatter peak says nothing of its place."""
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -70,12 +75,9 @@ def refined(
     """The alignment at the peak that `search` has found, on whole cells. Errors are those of `search`."""
     second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepared(query, config), prepared(match, config)
-    pose, correlation, curvature = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
-    occupied = jnp.minimum((query > 0).sum(), (match > 0).sum())
-    blurred_cells = 1 + 2 * np.pi * (config.blur_m / config.resolution_m) ** 2
-    noise = 2 * (1 - correlation) / jnp.maximum(occupied / blurred_cells, 1)
+    pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
     yaw = jnp.mod(pose[2] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return Alignment(pose[0], pose[1], yaw, _covariance(curvature, noise), correlation, second)
+    return Alignment(pose[0], pose[1], yaw, covariance, correlation, second)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -94,7 +96,7 @@ def align_all(
 def _refined(
     query: Float[Array, "m m"], match: Float[Array, "m m"], start: Float[Array, " 3"], config: VerificationConfig
 ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, "3 3"]]:
-    """The peak near the pose `start`: (x, y, yaw), the correlation there, and its curvature, minus the Hessian."""
+    """The peak near the pose `start`: (x, y, yaw), the correlation there, and the covariance of the pose."""
     cell_m, step_rad = config.resolution_m, np.float32(np.radians(config.refine_deg) / TURN_STEPS)
     yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * step_rad
     product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotations(query, yaws), cell_m, config))
@@ -111,7 +113,25 @@ def _refined(
     sizes = jnp.array([cell_m / 2, cell_m / 2, step_rad])
     pose = jnp.stack([xs[middle[0]], ys[middle[1]], yaws[middle[2]]]) + offset * sizes
     correlation = value + gradient @ offset + offset @ hessian @ offset / 2
-    return pose, correlation, -hessian / (sizes[:, None] * sizes[None])
+    curvature = -hessian / (sizes[:, None] * sizes[None])
+    turns = jnp.concatenate([middle[2][None] + jnp.round(offset[2]).astype(int), np.array(RIDGE_TURNS)])
+    ridge = ridge_covariance(
+        product[turns],
+        pose,
+        yaws[turns],
+        curvature,
+        cell_m=cell_m,
+        reach_m=config.reach_m,
+        max_shift_m=config.max_shift_m,
+    )
+    covariance = peak_covariance(
+        curvature,
+        correlation,
+        occupied=jnp.minimum((query > 0).sum(), (match > 0).sum()),
+        apart_m=jnp.hypot(pose[0], pose[1]),
+        ridge=ridge,
+    )
+    return pose, correlation, covariance
 
 
 def _waves(shifts: Float[Array, " k"], frequencies: Float[np.ndarray, " f"]) -> Complex[Array, "k f"]:
@@ -127,13 +147,3 @@ def _parabola(block: Float[Array, "3 3 3"]) -> tuple[Float[Array, ""], Float[Arr
     fitted = jnp.asarray(np.linalg.pinv(np.stack(columns, 1)), jnp.float32) @ block.reshape(27)
     half = jnp.zeros((3, 3)).at[tuple(np.array(pairs).T)].set(fitted[4:])
     return fitted[0], fitted[1:4], half + half.T
-
-
-def _covariance(curvature: Float[Array, "3 3"], noise: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Of (x, y, yaw): that of least squares on images of unit length, whose squared difference is 2 (1 - correlation).
-
-    Along directions without curvature it is large.
-    """
-    strengths, directions = jnp.linalg.eigh(curvature)
-    spread = jnp.maximum(noise, 1e-6) / jnp.maximum(strengths, LEAST_CURVATURE)
-    return (directions * spread[None]) @ directions.T

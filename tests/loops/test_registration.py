@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.loops.find import MIN_OVERLAP
+from sglpr_jax.loops.loop import is_degenerate, position_deviation
 from sglpr_jax.loops.registration import coarse_pose, overlap, register
 from sglpr_jax.loops.transforms import inverse, transform, transformed
 
@@ -46,6 +47,30 @@ def test_a_first_guess_is_refined(pair):
     found = register(query, match, initial=expected @ transform(0.3, -0.2, np.radians(2)))
     metres, degrees = error_of(found.match_from_query, expected)
     assert metres < 0.1 and degrees < 0.3
+
+
+def test_errors_are_as_large_as_the_covariance_says(pair):
+    query, match, expected = pair
+    found = register(query, match, initial=expected @ transform(0.1, -0.1, 0.01))
+    apart = inverse(expected) @ found.match_from_query
+    error = np.concatenate([apart[:3, 3], Rotation.from_matrix(apart[:3, :3]).as_rotvec()])
+    assert 0.3 < error @ np.linalg.inv(found.covariance) @ error < 16.8  # 99 % of a chi-square of 6 degrees of freedom
+    assert not is_degenerate(found.covariance) and position_deviation(found.covariance) < 0.05
+
+
+def test_between_plain_walls_the_first_guess_stays_unknown_along_them():
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-40, 40, 20000)
+    sides = np.stack([along, rng.choice([-4.0, 5.0], 20000), rng.uniform(-1, 3, 20000)], axis=1)
+    floor = np.stack([along, rng.uniform(-4, 5, 20000), np.full(20000, -1.7)], axis=1)
+    walls = np.concatenate([sides, floor])
+    query, match = ((walls + 0.01 * rng.normal(size=walls.shape)).astype(np.float32) for _ in range(2))
+    guess = np.diag([4.0, 0.1, 0.1, 0.02, 0.02, 0.02]) ** 2
+    for initial_covariance, expected in ((guess, 4.0), (None, 3.0)):
+        found = register(query, match, initial=np.eye(4), initial_covariance=initial_covariance)
+        deviations = np.sqrt(np.diag(found.covariance))
+        assert deviations[0] == pytest.approx(expected, rel=0.2) and deviations[1] < 0.1 and deviations[2] < 0.1
+        assert is_degenerate(found.covariance)
 
 
 @pytest.mark.slow

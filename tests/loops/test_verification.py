@@ -1,5 +1,7 @@
 """The pose between two images: that of a brute-force search by scipy, and the one that the images were made from."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage, signal
 
+from sglpr_jax.loops.candidates import square_image
+from sglpr_jax.loops.loop import is_degenerate, position_deviation
+from sglpr_jax.loops.transforms import inverse, yaw_of
+from sglpr_jax.loops.upright import upright_poses
 from sglpr_jax.loops.verification import DEFAULT, VerificationConfig, _parabola, align, align_all
 
 from .scenes import difference, place, relative, seen_from
@@ -86,6 +92,45 @@ def test_errors_are_not_larger_than_the_covariance_says_nor_far_smaller():
     errors = np.stack([difference(p, q) for p, q in zip(np.stack(found[:3], 1), poses, strict=True)])
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(found.covariance), errors)
     assert 0.1 < np.median(squares) < 2.4  # 2.4 where the covariance is exact; these images are better than real ones
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-40, 40, (6000, 1))
+    walls = np.concatenate([along, rng.choice([-5.0, 6.0], (6000, 1))], axis=1)
+    images = [seen_from(walls, (x, 0.2, yaw), seed=k) for k, x in enumerate((0.0, 1.5))]
+    covariance = np.asarray(align(*images, config=dataclasses.replace(SMALL, max_shift_m=12.0)).covariance)
+    direction = np.array([np.cos(yaw), -np.sin(yaw)])  # of the walls, in the frame of the match
+    across = np.array([np.sin(yaw), np.cos(yaw)])
+    assert np.sqrt(direction @ covariance[:2, :2] @ direction) >= 2
+    assert np.sqrt(across @ covariance[:2, :2] @ across) <= 0.3
+    assert is_degenerate(covariance) and position_deviation(covariance) >= 2
+
+
+def test_in_a_town_the_place_is_known(drive, revisit):
+    query, match = (square_image(drive.record(frame)) for frame in revisit)
+    found = align(query, match)
+    assert position_deviation(found.covariance) <= 0.15 and not is_degenerate(found.covariance)
+    assert np.sqrt(found.covariance[2, 2]) <= np.radians(0.5)
+
+
+@pytest.mark.slow
+def test_errors_in_a_town_are_as_large_as_the_covariance_says(drive):
+    poses = upright_poses(drive.poses.world_from_lidar, drive.mounting)
+    apart = np.linalg.norm(drive.positions[:, None] - drive.positions[None], axis=2)
+    apart[np.subtract.outer(drive.times, drive.times) < 30] = np.inf
+    queries = np.flatnonzero(apart.min(1) < 8)[::2]
+    pairs = [(int(query), int(apart[query].argmin())) for query in queries]
+    images = {frame: square_image(drive.record(frame)) for pair in pairs for frame in pair}
+    squares = []
+    for query, match in pairs:
+        found, true = align(images[query], images[match]), inverse(poses[match]) @ poses[query]
+        error = difference(pose_of(found), np.array([*true[:2, 3], float(yaw_of(true))]))
+        squares.append(error @ np.linalg.inv(np.asarray(found.covariance, np.float64)) @ error)
+    assert len(squares) >= 20
+    assert 0.5 < np.median(squares) / 2.37 < 2  # the median of a chi-square of 3 degrees of freedom
+    assert np.quantile(squares, 0.95) / 7.81 < 2
 
 
 def test_along_a_wall_the_place_is_less_sure_than_across():
