@@ -34,7 +34,7 @@ from sglpr_jax.loops.optimization import optimized, trajectory_error
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.reliability import Bin, reliability_of
 from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.verification import align_all
+from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
@@ -110,9 +110,7 @@ class Images:
             agreed = {(loop.query, loop.match) for loop in kept}
             bonus = [1000.0 * ((one.query, one.match) in agreed) for one in detector.candidates]
             for title, scores in (
-                ("nearest descriptor", [-one.evidence.distance for one in detector.candidates]),
                 ("most probable of three", log_odds),
-                ("highest correlation of three", [one.evidence.correlation for one in detector.candidates]),
                 ("most probable, loops that were kept first", log_odds + bonus),
             ):
                 score_top1(title, recording, detector.candidates, np.asarray(scores))
@@ -138,12 +136,19 @@ class Speed:
         image = finder.seen(records[0]).image
         finder.images += [image] * self.frames
         finder.empty += [False] * self.frames
+        finder.links += [None] * self.frames
+        for frame in range(self.frames):
+            finder.motion.add(frame / 10)
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
-        matches = np.stack([image] * finder.config.candidates)
+        rules = finder.config.rivals
+        sizes = finder.config.candidates + 1, rules.of_query + rules.of_match
+        peak = finder.search(image, [image], 1).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
             ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder.index.recent(500.0))),
-            ("verification", lambda i: jax.block_until_ready(align_all(image, matches))),
+            ("comparison", lambda i: finder.search(image, [image] * sizes[0], sizes[0])),
+            ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),
+            ("rivals", lambda i: finder.search(image, [image] * sizes[1], sizes[1])),
             ("all of it", lambda i: detector.add(records[i % 20], time=float(next(clock)))),
         ):
             work(0)

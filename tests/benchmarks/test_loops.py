@@ -28,24 +28,44 @@ def test_loops_are_scored_on_simulated_drives():
 def test_loops_are_scored_on_images(tmp_path):
     write_dataset(tmp_path, names=("08",), scans=330, sensor=SENSOR, layout="images")
     output = printed("loops.py", "images", "--data", str(tmp_path), "--seqs", "08", "--odometry")
-    assert "nearest descriptor: top-1 F1max" in output and "most probable of three: top-1 F1max" in output
+    assert "most probable of three: top-1 F1max" in output and "kept first: top-1 F1max" in output
 
 
 def test_the_parts_of_a_loop_are_timed():
     output = printed("loops.py", "speed", "--frames", "300", "--repeats", "2", "--azimuth-steps", "90")
-    assert [line.split(":")[0] for line in output.splitlines()][-4:] == [
+    assert [line.split(":")[0] for line in output.splitlines()][-6:] == [
         "image and descriptor",
         "query",
-        "verification",
+        "comparison",
+        "refinement",
+        "rivals",
         "all of it",
     ]
 
 
-def test_models_of_loops_are_fitted_and_written(tmp_path):
-    output = printed("fit_loops.py", *SMALL, "--out", str(tmp_path / "models.json"))
-    assert "rings: LoopModel" in output
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """A drive through a town that comes back, and one along walls that does not, as the detector keeps them."""
+    folder = tmp_path_factory.mktemp("drives")
+    options = ("--sceneries", "walls", "town", "--sensors", "vlp16", "--scans", "90", "--azimuth-steps", "200")
+    printed("repeating_scans.py", *options, "--revisits", "same", "--out", str(folder))
+    return folder
+
+
+def test_models_of_loops_are_fitted_and_written(rendered, tmp_path):
+    output = printed("fit_loops.py", str(rendered), "--weights", "sglpr", "--out", str(tmp_path / "models.json"))
+    assert "sglpr: LoopModel" in output
     found = json.loads((tmp_path / "models.json").read_text())
-    assert len(found) == 2 and set(found[""]["weights"]) == {"correlation", "second"}
+    assert len(found) == 2 and set(found[""]["curves"]) == {"correlation", "second", "rival"}
+    assert "2 simulated drives (town, walls)" in found[""]["made_with"]
+
+
+def test_loops_are_counted_by_scenery_and_drives_are_searched_once(rendered):
+    for options in ((), ("--odometry",)):
+        output = printed("repeating.py", str(rendered), *options)
+        assert "2/2 walls-same-vlp16-1" in output and "recall" in output
+        again = printed("repeating.py", str(rendered), *options, "--sceneries", "walls")
+        assert "/2" not in again and "town" not in again and "walls" in again
 
 
 def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
