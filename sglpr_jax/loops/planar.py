@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop import DEGENERATE_M, Loop
 from sglpr_jax.loops.transforms import moved_covariance, yaw_of
 from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry, upright_poses
 
@@ -28,11 +28,21 @@ def planar_odometry(odometry: Float[np.ndarray, "n 4 4"], mounting: Mounting | N
 
 
 def planar_loops(loops: Sequence[Loop], mounting: Mounting | None) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
-    """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries."""
+    """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries.
+
+    No direction has a standard deviation of more than `DEGENERATE_M`: a pose that may lie anywhere along a wall would
+    otherwise agree with every other pose along it.
+    """
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
     covariances = np.array([loop.covariance for loop in loops], np.float64).reshape(-1, 6, 6)
     covariances = moved_covariance(covariances, upright_from_lidar(mounting))
-    return planar(upright_poses(poses, mounting)), covariances[:, SEEN[:, None], SEEN]
+    return planar(upright_poses(poses, mounting)), _bounded(covariances[:, SEEN[:, None], SEEN])
+
+
+def _bounded(covariances: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """The same with all variances, in metres and radians squared, bounded."""
+    variances, axes = np.linalg.eigh(covariances)
+    return (axes * np.minimum(variances, DEGENERATE_M**2)[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
 def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
