@@ -10,7 +10,7 @@ import tyro
 from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, OdometryFormat
+from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, Degenerate, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
@@ -24,8 +24,8 @@ UNFINISHED = "unfinished"
 class LoopsCommand:
     """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
-    Writes loops.g2o, loops.jsonl, loops.csv and index.html. With odometry also trajectory.tum and trajectory.kitti,
-    with --optimize also the corrected trajectory.
+    Writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons) and index.html. With
+    odometry also trajectory.tum and trajectory.kitti, with --optimize also the corrected trajectory.
     Ctrl-C keeps the loops found so far. The same command continues after that, and after a run that was killed.
 
     Examples:
@@ -60,6 +60,9 @@ class LoopsCommand:
     of frames takes minutes."""
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a loop."""
+    degenerate: Degenerate = "keep"
+    """Loops whose position has a standard deviation of more than 1 m along one direction, as between plain walls:
+    `keep` writes them with that information matrix, `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
 
@@ -94,6 +97,7 @@ def _check(command: LoopsCommand) -> None:
 
 def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
     from sglpr_jax.evaluation.page.of_loops import write_loops_page
+    from sglpr_jax.loops.explanation import why_few_queries, why_none, why_rejected
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.folder import write_found
     from sglpr_jax.loops.optimization import optimize_trajectory
@@ -105,11 +109,8 @@ def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
         recording, odometry = source.open(command.recording), None
     else:
         recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
-    if recording.times is None and len(recording) <= config.candidates.exclude_frames:
-        warn(
-            f"{recording.name}: without times the last {config.candidates.exclude_frames} scans are neighbours, and "
-            f"there are {len(recording)}: no loop can be found; name --times"
-        )
+    if too_recent := why_few_queries(recording, config.candidates):
+        warn(f"{recording.name}: {too_recent}")
     params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(
@@ -123,10 +124,12 @@ def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
             should_stop=stop,
             on_progress=show,
         )
+    if command.degenerate == "drop":
+        found = found.without_degenerate()
     corrected = optimize_trajectory(found) if command.optimize else None
     paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses)
     paths.append(write_loops_page(found, command.out, optimized=corrected))
-    print(found)
+    print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
     if corrected is not None:
         print(corrected)
     print(f"{command.out}: {', '.join(path.name for path in paths)}")

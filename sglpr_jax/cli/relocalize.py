@@ -11,8 +11,10 @@ from rich.table import Table
 
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
+from sglpr_jax.fields import Size
 from sglpr_jax.loops.choices import CANDIDATES
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.same_place import NEGATIVE_M
 
 if TYPE_CHECKING:
     from sglpr_jax.loops.places import Relocated
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 @dataclasses.dataclass(frozen=True)
 class RelocalizeCommand:
     """Find the pose of a scan in a map that bin/map wrote, with its probability, by each of the places most like it.
+
+    Answers more than 20 m apart share the probability: if several places fit equally well, none of them is probable.
 
     Examples:
       bin/relocalize my_scans/000003.bin --map town.safetensors
@@ -33,8 +37,9 @@ class RelocalizeCommand:
     """The map."""
     out: Path | None = None
     """A JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
-    candidates: int = CANDIDATES
-    """How many places are looked at."""
+    candidates: Size = CANDIDATES
+    """Maximum number of answers: the scan is compared with this many places of the map. Answers more than 20 m apart
+    exclude each other, and their probabilities add up to 1 at most."""
     weights: str = DEFAULT_WEIGHTS
     """The weights that made the map."""
     format: ScanFormat = "auto"
@@ -71,7 +76,9 @@ def _as_json(found: "Relocated") -> dict:
 
 def _table(scan: Path, found: "list[Relocated]") -> Table:
     title = escape(f"{scan.name} in the map")  # rich takes what stands in brackets for a style
-    table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title)
+    shared = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
+    caption = shared if len(found) > 1 else None
+    table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)
     for one in found:
         pose = one.world_from_query
         yaw = math.degrees(math.atan2(pose[1, 0], pose[0, 0]))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 DOTS_PER_INCH = 150
+LOOP_COLOUR, WRONG_COLOUR = "#2b5fc4", "#d62728"
 MOST_INSIDE = 4
 """So many lines are named inside the axes; more names would cover the lines."""
 
@@ -219,16 +220,27 @@ def _add_class_legend(figure: "matplotlib.figure.Figure", labels: Taxonomy, clas
     figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 8), frameon=False)
 
 
-def loops(positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]]) -> "matplotlib.figure.Figure":
-    """Draw a trajectory from above and a line between the two frames of each loop."""
+def loops(
+    positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
+) -> "matplotlib.figure.Figure":
+    """Draw a trajectory from above and a line between the two frames of each loop.
+
+    Arguments:
+      positions: Position of each frame, in metres.
+      pairs: Query and match of each loop, except those known to be wrong.
+      wrong: Query and match of each loop known to be wrong, drawn in red.
+    """
     across, along = np.ptp(positions[:, :2], axis=0)
     figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
     axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
     axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
-    for query, match in pairs:
-        axes.plot(*positions[[query, match], :2].T, color="#d62728", linewidth=1)
-    seen = positions[[query for query, _ in pairs], :2]
-    axes.scatter(*seen.T, s=9, color="#d62728", linewidths=0, label=f"loops ({len(pairs)})", zorder=3)
+    for name, some, colour, layer in (("loops", pairs, LOOP_COLOUR, 3), ("wrong", wrong, WRONG_COLOUR, 4)):
+        if name == "wrong" and not some:
+            continue
+        for query, match in some:
+            axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
+        seen = positions[[query for query, _ in some], :2]
+        axes.scatter(*seen.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(some)})", zorder=layer)
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
@@ -265,15 +277,34 @@ def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.
     return figure
 
 
-def loops_in_time(found: Sequence[tuple[int, int, float]], frames: int) -> "matplotlib.figure.Figure":
-    """Draw which frame comes back to which: (query, match, probability) of each loop, the less sure ones lighter."""
+def loops_in_time(
+    found: Sequence[tuple[int, int, float]],
+    frames: int,
+    *,
+    wrong: Sequence[tuple[int, int]] = (),
+    rejected: Sequence[tuple[int, int]] = (),
+) -> "matplotlib.figure.Figure":
+    """Draw the match of each query, in frames.
+
+    Arguments:
+      found: Query, match and probability of each loop. Less probable loops are lighter.
+      frames: Number of frames.
+      wrong: Query and match of each loop known to be wrong, drawn as red crosses.
+      rejected: Query and match of each rejected pair, drawn as small grey dots below the loops.
+    """
     figure = _figure(5.0, 4.2)
     axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))
     axes.plot([0, frames], [0, frames], color="0.8", linewidth=1)
+    if rejected:
+        axes.scatter(*np.array(rejected).T, s=5, color="0.7", linewidths=0, label=f"rejected ({len(rejected)})")
     if found:
         query, match, probability = np.array(found).T
         dots = axes.scatter(query, match, s=8, c=probability, cmap="viridis", vmin=0.9, vmax=1, linewidths=0)
         figure.colorbar(dots, label="probability")
+    if wrong:
+        axes.scatter(*np.array(wrong).T, s=24, marker="x", color=WRONG_COLOUR, label=f"wrong ({len(wrong)})")
+    if wrong or rejected:
+        axes.legend(loc="upper left", framealpha=0.95)
     axes.grid(color="0.92")
     return figure
 

@@ -7,6 +7,8 @@ from typing import Literal
 
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """kitti, lidar: 12 numbers a line, in KITTI's camera axes or z up; tum: time, position, quaternion; g2o: vertices."""
+Degenerate = Literal["keep", "drop"]
+"""Loops whose position is uncertain by more than 1 m along one direction, as between walls: kept or rejected."""
 MIN_PROBABILITY = 0.99
 """Of a loop that is returned."""
 SPACING_M = 1.0

@@ -2,8 +2,7 @@
 
 import dataclasses
 import functools
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.candidates import Candidate, Compared, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.drift import DriftModel
+from sglpr_jax.loops.explanation import counted, listed
 from sglpr_jax.loops.given import check_is, given_poses
 from sglpr_jax.loops.joint import check_odometry, settled
 from sglpr_jax.loops.loop import Loop, Rejected
@@ -47,8 +47,15 @@ class FoundLoops:
     """Model of the probabilities."""
     unregistered: int = 0
     """Number of loops that were not registered because the search was stopped."""
-    drift: DriftModel = DriftModel()
-    """Drift model of the odometry."""
+    config: DetectorConfig = DetectorConfig()
+    """Settings of the search."""
+    empty: int = 0
+    """Number of searched scans that show next to nothing."""
+
+    @property
+    def drift(self) -> DriftModel:
+        """Drift model of the odometry."""
+        return self.config.drift
 
     @property
     def whole(self) -> bool:
@@ -56,12 +63,19 @@ class FoundLoops:
         return self.frames == len(self.recording) and not self.unregistered
 
     def __str__(self) -> str:
-        found = f"{len(self.loops)} loops in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
-        counts = Counter(one.reason for one in self.rejected)
-        why = f" ({', '.join(f'{reason}: {count}' for reason, count in counts.most_common())})" if counts else ""
+        degenerate = sum(loop.is_degenerate for loop in self.loops)
+        loops = f"{len(self.loops)} loops{f' ({degenerate} degenerate)' if degenerate else ''}"
+        found = f"{loops} in {self.frames} of {len(self.recording)} frames of {self.recording.name}"
+        why = f" ({listed(counted(self.rejected))})" if self.rejected else ""
         skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
         left = f", {self.unregistered} not registered" if self.unregistered else ""
         return f"{found}, {len(self.rejected)} rejected{why}{left}{skipped}"
+
+    def without_degenerate(self) -> "FoundLoops":
+        """Rejects the loops whose position is uncertain by more than 1 m along one direction (`is_degenerate`)."""
+        kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
+        others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
+        return dataclasses.replace(self, loops=kept, rejected=_in_order([*self.rejected, *others]))
 
 
 def find_loops(
@@ -144,7 +158,8 @@ def find_loops(
     loops, rejected = settled(
         recording, detector.supported, odometry, config, registered=registered, should_stop=should_stop
     )
-    rejected = [*detector.rejected, *rejected]
+    supported = {loop.query for loop in detector.supported}  # which `settled` has accepted or rejected
+    rejected = _in_order([*rejected, *(one for one in detector.rejected if one.loop.query not in supported)])
     if odometry is not None:
         check_odometry(
             recording.name, detector.by_scans, loops, rejected, odometry, config, mounting=recording.mounting
@@ -153,14 +168,19 @@ def find_loops(
         recording,
         len(detector),
         tuple(loops),
-        tuple(rejected),
+        rejected,
         odometry,
         skipped=skipped,
         candidates=tuple(detector.candidates),
         model=detector.model,
         unregistered=sum(loop.overlap is None for loop in loops) if registered else 0,
-        drift=config.drift,
+        config=config,
+        empty=sum(detector.finder.empty) - len(skipped),
     )
+
+
+def _in_order(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
+    return tuple(sorted(rejected, key=lambda one: (one.loop.query, one.loop.match)))
 
 
 def _recall(

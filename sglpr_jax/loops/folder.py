@@ -7,19 +7,27 @@ from jaxtyping import Float
 
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_loops_csv, write_loops_jsonl, write_tum
+from sglpr_jax.loops.graph_files import (
+    write_g2o,
+    write_kitti,
+    write_loops_csv,
+    write_loops_jsonl,
+    write_rejected_jsonl,
+    write_tum,
+)
 
 GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
+REJECTED = "rejected.jsonl"
 TRAJECTORIES = ("trajectory.tum", "trajectory.kitti", "trajectory-optimized.tum", "trajectory-optimized.kitti")
 
 
 def write_found(
     found: FoundLoops, folder: Path | str, *, optimized: Float[np.ndarray, "n 4 4"] | None = None
 ) -> list[Path]:
-    """Write loops as g2o, JSON lines and csv and, with odometry, the trajectory as TUM and KITTI.
+    """Write loops as g2o, JSON lines and csv, rejected pairs as JSON lines and, with odometry, the trajectory.
 
-    The times of trajectories are those of the recording or, without times, the frame numbers. Older trajectories in the
-    folder that this call does not write stay, and a warning names them.
+    Trajectories are written as TUM and KITTI. Their times are those of the recording or, without times, the frame
+    numbers. Older trajectories in the folder that this call does not write stay, and a warning names them.
 
     Arguments:
       found: Loops of a recording.
@@ -37,7 +45,8 @@ def write_found(
     write_g2o(folder / GRAPH, found.loops, odometry, drift=found.drift)
     write_loops_jsonl(folder / LINES, found.loops, found.recording.ids)
     write_loops_csv(folder / TABLE, found.loops)
-    names = [GRAPH, LINES, TABLE]
+    write_rejected_jsonl(folder / REJECTED, found.rejected, found.recording.ids)
+    names = [GRAPH, LINES, TABLE, REJECTED]
     times = found.recording.times
     clock = np.arange(found.frames, dtype=np.float64) if times is None else times[: found.frames]
     for stem, poses in (("trajectory", odometry), ("trajectory-optimized", optimized)):

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, check_times, numbers_of, read_poses, read_rows
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.drift import DriftModel, step_deviations
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
 from sglpr_jax.poses import are_rotations
 
@@ -125,6 +125,16 @@ def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Sequence[str
     write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids))}\n" for loop in loops))
 
 
+def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Sequence[str] | None = None) -> None:
+    """Write a JSON object a line: frames, `ids` if they are given, reason, probability, overlap, match_from_query."""
+    lines = []
+    for one in rejected:
+        pose = one.loop.match_from_query.tolist()
+        row = {**_named(one.loop, ids), "reason": one.reason, **_shares(one.loop), "match_from_query": pose}
+        lines.append(f"{json.dumps(row)}\n")
+    write_text(Path(path), "".join(lines))
+
+
 def read_loops_jsonl(path: Path | str) -> list[Loop]:
     """Read what `write_loops_jsonl` wrote. Raises FileNotFoundError, and ValueError naming the first wrong line."""
     path = Path(path)
@@ -210,16 +220,18 @@ def _numbers(values: Float[np.ndarray, " n"]) -> str:
 
 
 def _as_json(loop: Loop, ids: Sequence[str] | None) -> dict:
+    pose, covariance = loop.match_from_query.tolist(), loop.covariance.tolist()
+    return {**_named(loop, ids), "match_from_query": pose, "covariance": covariance, **_shares(loop)}
+
+
+def _named(loop: Loop, ids: Sequence[str] | None) -> dict:
+    """Frames of a loop, and their ids if they are given."""
     named = {} if ids is None else {"query_id": ids[loop.query], "match_id": ids[loop.match]}
-    return {
-        "query": loop.query,
-        "match": loop.match,
-        **named,
-        "match_from_query": loop.match_from_query.tolist(),
-        "covariance": loop.covariance.tolist(),
-        "probability": loop.probability,
-        "overlap": loop.overlap,
-    }
+    return {"query": loop.query, "match": loop.match, **named}
+
+
+def _shares(loop: Loop) -> dict:
+    return {"probability": loop.probability, "overlap": loop.overlap}
 
 
 def _from_json(line: bytes, where: str) -> Loop:

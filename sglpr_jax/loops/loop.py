@@ -19,6 +19,7 @@ Reason = Literal[
     "contradicts the odometry",
     "contradicts other loops",
     "little overlap",
+    "degenerate",
 ]
 """Why a pair that looked like a loop closure was rejected."""
 UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M = 0.03, 0.018

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from sglpr_jax.files import in_short
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index_rows import (
+    MOST,
     Found,
     check_asked,
     check_weights,
@@ -120,7 +121,7 @@ class FleetIndex:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
-        if exclude is not None or k < 1:
+        if exclude is not None or not 1 <= k <= MOST:
             check_asked(k, exclude, places=len(self) if exclude is None else min(len(self), exclude.size))
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 COLUMNS = ("descriptors", "times", "positions")
+MOST = 2**20
+"""Maximum number of answers to a query, unless an index has more places."""
 
 
 class Found(NamedTuple):
@@ -78,9 +80,11 @@ def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
 
 
 def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, places: int) -> None:
-    """Raise ValueError for a k below 1 and flags that are not one for each place."""
+    """Raise ValueError for a k below 1 or above `MOST` and the number of places, and for flags of another length."""
     if k < 1:
         raise ValueError(f"expected k of 1 or more, found {k}")
+    if k > max(MOST, places):
+        raise ValueError(f"expected k up to {max(MOST, places)}, found {k}")
     if exclude is not None and exclude.shape != (places,):
         raise ValueError(f"expected one flag for each of {places} places to exclude, found {exclude.shape}")
 

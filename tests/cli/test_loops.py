@@ -10,12 +10,13 @@ from sglpr_jax.loops import find
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.drift import DriftModel
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_jsonl, read_tum, write_kitti, write_tum
+from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights_file import load
 
 from .conftest import SCANS, assert_one_line_error
 
-FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "index.html"}
+FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "rejected.jsonl", "index.html"}
 TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
 TWICE = DetectorConfig(drift=DriftModel(0.02, 0.01))
 OPTIMIZED = {"trajectory-optimized.tum", "trajectory-optimized.kitti"}
@@ -93,6 +94,32 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
     assert ("the same command goes on from here" in ended.error) == bool(status)
 
 
+def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):
+    """And a degenerate loop is kept, or rejected with `--degenerate drop`."""
+    unsure = Loop(35, 1, np.eye(4), np.diag([4.0, 0.01, 1, 1, 1, 1]), 0.995)
+
+    def some(recording, params, **options):
+        return find.FoundLoops(recording, SCANS, (unsure,), (Rejected(unsure, "repeats"),), None)
+
+    monkeypatch.setattr(find, "find_loops", some)
+    run = ("loops", town, "--seq", "08", "--out", tmp_path / "found")
+    kept = command(*run)
+    repeats = "rejected, repeats (1): Another place, or another pose, fits about as well."
+    assert kept.status == 0, kept.error
+    assert kept.out.splitlines()[:2] == [
+        "1 loops (1 degenerate) in 40 of 40 frames of 08, 1 rejected (repeats: 1)",
+        repeats,
+    ]
+    assert len(read_g2o(tmp_path / "found" / "loops.g2o").edges) == 1
+    lines = command(*run, "--degenerate", "drop").out.splitlines()
+    assert lines[0] == "0 loops in 40 of 40 frames of 08, 2 rejected (repeats: 1, degenerate: 1)"
+    assert "2 pairs looked like loops, and all were rejected (repeats: 1, degenerate: 1)." in lines
+    assert repeats in lines and any(line.startswith("rejected, degenerate (1): The position") for line in lines)
+    assert read_g2o(tmp_path / "found" / "loops.g2o").edges == []
+    rows = map(json.loads, (tmp_path / "found" / "rejected.jsonl").read_text().splitlines())
+    assert [row["reason"] for row in rows] == ["repeats", "degenerate"]
+
+
 @pytest.mark.slow
 def test_bad_scans_are_told_and_skipped(command, town, tmp_path):
     folder = tmp_path / "town"
@@ -164,7 +191,8 @@ def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_
 def test_a_short_recording_without_times_is_told_why_it_has_no_loops(command, town, odometry, tmp_path):
     scans = shutil.copytree(town / "sequences" / "08" / "velodyne", tmp_path / "scans")
     ended = command("loops", scans, "--out", tmp_path / "found")
-    assert ended.status == 0 and "without times the last 290 scans are neighbours, and there are 40" in ended.error
+    words = "40 frames without times: pairs less than 290 frames apart are not considered; give --times."
+    assert ended.status == 0 and f"warning: scans: {words}" in ended.error and words in ended.out.splitlines()
     times = open_recording(town, "08").times + 1.6e9
     write_tum(tmp_path / "odometry.tum", odometry, times)
     ended = command("loops", scans, "--out", tmp_path / "timed", "--odometry", tmp_path / "odometry.tum")

@@ -195,6 +195,19 @@ def test_brackets_in_a_name_are_no_style(capsys):
     assert "[red]sunday/000003" in shown and "[bold]scan.bin in the map" in shown
 
 
+def test_answers_that_share_the_probability_say_so(capsys, command, tmp_path):
+    far = np.eye(4)
+    far[0, 3] = 55.0
+    answers = [
+        Relocated(f"08/{i:06d}", pose, Loop(2, i, pose, np.eye(6), 0.5)) for i, pose in enumerate((np.eye(4), far))
+    ]
+    for few, words in ((answers, True), (answers[:1], False)):
+        Console(width=140).print(_table(Path("scan.bin"), few))
+        assert ("Answers more than 20 m apart share the probability" in capsys.readouterr().out) == words
+    ended = command("relocalize", "scan.bin", "--map", tmp_path / "map", "--candidates", "1000000000")
+    assert_one_line_error(ended, "--candidates: expected a number from 1 up to 1048576, found 1000000000")
+
+
 def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command, places_file, tmp_path):
     scan = tmp_path / "dot.bin"
     np.array([5, 0, 0, 1], np.float32).tofile(scan)

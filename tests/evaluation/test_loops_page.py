@@ -10,7 +10,7 @@ from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page.of_loops import loops_page, write_loops_page
 from sglpr_jax.loops.candidates import Candidate
 from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.optimization import OptimizedTrajectory
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.transforms import transform
@@ -39,7 +39,29 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert len(Parsed(loops_page(dataclasses.replace(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
     assert loops_page(none).count("No loops.") == 2
+    assert "lasts 7 s: pairs less than 30 s apart" in Parsed(loops_page(none)).texts["Why no loops"]
+    assert "Why no loops" not in Parsed(loops_page(found)).texts
     assert "No scan was looked at." in loops_page(dataclasses.replace(none, frames=0))
+
+
+def test_rejected_pairs_are_counted_by_reason(found):
+    assert "No pair was rejected." in Parsed(loops_page(found)).texts["Rejected"]
+    pair = found.loops[0]
+    rejected = (Rejected(pair, "little overlap"), Rejected(pair, "repeats"), Rejected(pair, "repeats"))
+    page = Parsed(loops_page(dataclasses.replace(found, rejected=rejected)))
+    said = page.texts["Rejected"]
+    assert said.index("repeats") < said.index("little overlap") and "Another place, or another pose" in said
+    assert "Rejected pairs are grey." in page.texts["Where"]
+
+
+def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found, known):
+    page = Parsed(loops_page(known))
+    assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Where"]
+    table = page.texts["Loops"]
+    assert "true distance [m]" in table and "94.0" in table
+    assert table.index("000007") < table.index("000005") < table.index("000006")
+    unknown = Parsed(loops_page(found)).texts
+    assert "wrong (red)" not in unknown["Where"] and "true distance" not in unknown["Loops"]
 
 
 def test_stopped_before_the_first_scan_there_is_nothing_corrected(found):

@@ -1,6 +1,7 @@
 """The folder of what was found holds what each program reads, of the frames that were looked at."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from sglpr_jax.files import WriteError
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_csv, read_loops_jsonl, read_tum
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.transforms import transform
 
 
@@ -40,13 +41,34 @@ def test_all_files_are_of_the_frames_looked_at(found, tmp_path):
 def test_other_trajectories_stay_which_is_told(found, tmp_path):
     out = tmp_path / "out"
     written = {path.name: path.read_bytes() for path in write_found(found, out, optimized=found.odometry[:5])}
-    assert len(written) == 7
+    assert len(written) == 8
     with pytest.warns(DataWarning, match=r"out: trajectory-optimized.tum, trajectory-optimized.kitti lay there before"):
-        assert len(write_found(found, out)) == 5
+        assert len(write_found(found, out)) == 6
     with pytest.warns(DataWarning, match=r"out: trajectory.tum, .* lay there before"):
-        assert len(write_found(dataclasses.replace(found, odometry=None), out)) == 3
+        assert len(write_found(dataclasses.replace(found, odometry=None), out)) == 4
     for name in written.keys() - {"loops.g2o"}:
         assert (out / name).read_bytes() == written[name]
+
+
+def test_rejected_pairs_have_a_file_of_their_own(found, tmp_path):
+    write_found(found, tmp_path)
+    assert (tmp_path / "rejected.jsonl").read_bytes() == b""
+    pair = Loop(5, 1, transform(2.0, 0.0, 0.0), np.eye(6), 0.25)
+    write_found(dataclasses.replace(found, rejected=(Rejected(pair, "repeats"),)), tmp_path)
+    assert [loop.query for loop in read_loops_jsonl(tmp_path / "loops.jsonl")] == [4]
+    (line,) = (tmp_path / "rejected.jsonl").read_text().splitlines()
+    assert json.loads(line) == {
+        "query": 5,
+        "match": 1,
+        "query_id": "000005",
+        "match_id": "000001",
+        "reason": "repeats",
+        "probability": 0.25,
+        "overlap": None,
+        "match_from_query": pair.match_from_query.tolist(),
+    }
+    with pytest.raises(ValueError, match=r"rejected.jsonl, line 1: expected a loop as JSON"):
+        read_loops_jsonl(tmp_path / "rejected.jsonl")
 
 
 def test_a_file_that_cannot_be_written_is_named(found, tmp_path):

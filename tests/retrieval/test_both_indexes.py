@@ -93,6 +93,8 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(new: New):
         index.query(np.full(WIDTH, np.nan, np.float32))
     with pytest.raises(ValueError, match="k of 1 or more"):
         index.query(draw(1), 0)
+    with pytest.raises(ValueError, match="expected k up to 1048576, found 1000000000"):
+        index.query(draw(1), 10**9)
     with pytest.raises(ValueError, match="one flag for each of 5"):
         index.query(draw(1), exclude=np.zeros(6, bool))
     assert len(index) == 5

@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 STYLE = """
-body { max-width: 72rem; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff;
+body { max-width: 120rem; margin: 2rem auto; padding: 0 1rem; color: #222; background: #fff;
   font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; }
 h1 { font-size: 1.6rem; margin-bottom: 0; }
 h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd; }
+p { max-width: 72rem; }
 .about, .missing, figcaption { color: #666; }
 .missing { font-style: italic; }
 .wide { overflow-x: auto; }
@@ -29,7 +30,7 @@ th, td { padding: 0.35rem 0.7rem; text-align: left; vertical-align: top; border-
   white-space: pre-line; overflow-wrap: break-word; }
 th { background: #f5f5f5; }
 td.number { font-variant-numeric: tabular-nums; white-space: pre; }
-figure { margin: 0.8rem 0; display: inline-block; vertical-align: top; }
+figure { margin: 0.8rem 1.6rem 0.8rem 0; max-width: 100%; display: inline-block; vertical-align: top; }
 figure img { max-width: 100%; }
 .pairs { display: flex; flex-wrap: wrap; gap: 1.2rem 2rem; }
 .pairs figure { width: 21rem; margin: 0; }
@@ -69,6 +70,11 @@ def html_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, numbers:
     return f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>\n</table></div>'
 
 
+def paragraph(text: str) -> str:
+    """Return a paragraph of plain text."""
+    return f"<p>{escape(text)}</p>"
+
+
 def missing(text: str) -> str:
     """Return a line that says what a section would need."""
     return f'<p class="missing">{escape(text)}</p>'
@@ -80,7 +86,8 @@ def figure_html(figure: "matplotlib.figure.Figure", name: str, *, caption: str =
     figure.savefig(stream, format="png", dpi=DOTS_PER_INCH)
     width = round(figure.get_figwidth() * 96)  # a CSS pixel is 1/96 of an inch
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f'<figure><img src="{_uri(stream)}" width="{width}" alt="{escape(name)}">{below}</figure>'
+    picture = f'<img src="{_uri(stream)}" width="{width}" alt="{escape(name)}">'
+    return f'<figure style="width: {width}px">{picture}{below}</figure>'  # a long caption does not widen it
 
 
 def bev_html(bev: Num[np.ndarray, "h w"], name: str) -> str:

@@ -1,20 +1,23 @@
-"""HTML page of the loops of a recording: trajectory, matched images, probabilities."""
+"""HTML page of the loops of a recording: trajectory, matched images, probabilities, rejected pairs."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing
+from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing, paragraph
 from sglpr_jax.files import write_text
 from sglpr_jax.loops.candidates import square_image
+from sglpr_jax.loops.explanation import MEANING, counted, why_none
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.optimization import OptimizedTrajectory, trajectory_error
 from sglpr_jax.loops.overlay import overlaid
 from sglpr_jax.loops.reliability import reliability_of
 from sglpr_jax.loops.upright import upright_odometry, upright_poses
+from sglpr_jax.same_place import NEGATIVE_M
 
 PAGE = "index.html"
 SHOWN_PAIRS = 9
@@ -31,9 +34,16 @@ def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = Non
     """Self-contained HTML of the page. With an `optimized` trajectory it shows the trajectory before and after."""
     about = "with odometry" if found.odometry is not None else "without odometry"
     sections = [Section("Where", _where(found))]
+    if reasons := why_none(found):
+        sections.insert(0, Section("Why no loops", "\n".join(map(paragraph, reasons))))
     if optimized is not None and found.frames:
         sections.append(Section("Corrected", _corrected(found, optimized)))
-    sections += [Section("Pairs", _pairs(found)), Section("Loops", _table(found)), Section("Sure of it?", _sure(found))]
+    sections += [
+        Section("Pairs", _pairs(found)),
+        Section("Loops", _table(found)),
+        Section("Rejected", _rejected(found)),
+        Section("Sure of it?", _sure(found)),
+    ]
     return document(f"Loops of {found.recording.name}", f"{found}; {about}.", sections)
 
 
@@ -45,17 +55,44 @@ def _where(found: FoundLoops) -> str:
     positions = found.recording.positions
     if found.odometry is not None:
         positions = upright_odometry(found.odometry, found.recording.mounting)[:, :3, 3]
-    parts = []
+    parts, wrong = [], _frames(wrong_loops(found))
+    right = [pair for pair in _frames(found.loops) if pair not in set(wrong)]
     if positions is not None:
         what = "as the odometry has it" if found.odometry is not None else f"by {found.recording.pose_source}"
-        caption = (
-            f"The trajectory {what}; a line joins the two frames of each loop. Lines across are drift, or mistakes."
-        )
-        drawn = figures.loops(positions[: found.frames], [(one.query, one.match) for one in found.loops])
+        lines = "Long lines are drift, or wrong loops."
+        caption = f"The trajectory {what}. A line joins the two frames of each loop. {_judged(found) or lines}"
+        drawn = figures.loops(positions[: found.frames], right, wrong=wrong)
         parts.append(figure_html(drawn, "The loops on the trajectory", caption=caption))
-    order = figures.loops_in_time([(one.query, one.match, one.probability) for one in found.loops], found.frames)
-    parts.append(figure_html(order, "The loops in time", caption="Which frame comes back to which."))
+    shown = [(one.query, one.match, one.probability) for one in found.loops]
+    rejected = _frames(one.loop for one in found.rejected)
+    order = figures.loops_in_time(shown, found.frames, wrong=wrong, rejected=rejected)
+    caption = "The match of each query. Rejected pairs are grey." if rejected else "The match of each query."
+    parts.append(figure_html(order, "The loops in time", caption=caption))
     return "\n".join(parts)
+
+
+def wrong_loops(found: FoundLoops) -> list[Loop]:
+    """Loops whose frames are more than 20 m apart by the true positions. Empty if these are not known."""
+    return [loop for loop in found.loops if (_apart_m(found, loop) or 0) > NEGATIVE_M]
+
+
+def _apart_m(found: FoundLoops, loop: Loop) -> float | None:
+    """True distance between the two frames of a loop, if it is known."""
+    true = found.recording.positions
+    return None if true is None else float(np.linalg.norm(true[loop.query] - true[loop.match]))
+
+
+def _judged(found: FoundLoops) -> str:
+    """How many loops are wrong, in a sentence. Empty if the true positions are not known."""
+    if found.recording.positions is None or not found.loops:
+        return ""
+    wrong = len(wrong_loops(found))
+    said = f"{wrong} of {len(found.loops)} loops are wrong{' (red)' if wrong else ''}"
+    return f"{said}: more than {NEGATIVE_M:g} m apart by {found.recording.pose_source}."
+
+
+def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
+    return [(loop.query, loop.match) for loop in loops]
 
 
 def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
@@ -114,12 +151,24 @@ def _title(loop: Loop) -> str:
     return f"{loop.query} on {loop.match}"
 
 
+def _rejected(found: FoundLoops) -> str:
+    """Table of the reasons why pairs were rejected."""
+    if not found.rejected:
+        return missing("No pair was rejected.")
+    rows = [(reason, str(count), MEANING[reason]) for reason, count in counted(found.rejected).items()]
+    about = "Pairs that look like loops and were rejected. rejected.jsonl lists them."
+    return f"{paragraph(about)}\n{html_table(('reason', 'pairs', 'meaning'), rows, numbers=('pairs',))}"
+
+
 def _table(found: FoundLoops) -> str:
-    """Table of the loops with the lowest probabilities."""
+    """Table of the wrong loops, if these are known, and of the loops with the lowest probabilities."""
     if not found.loops:
         return missing("No loops.")
+    known = found.recording.positions is not None
     header = ("query", "match", "x [m]", "y [m]", "yaw [deg]", "probability", "overlap")
-    least_sure = sorted(found.loops, key=lambda loop: loop.probability)[:SHOWN_ROWS]
+    header = (*header, "true distance [m]") if known else header
+    wrong = set(_frames(wrong_loops(found)))
+    first = sorted(found.loops, key=lambda loop: ((loop.query, loop.match) not in wrong, loop.probability))[:SHOWN_ROWS]
     ids = found.recording.ids
     rows = [
         (
@@ -130,7 +179,8 @@ def _table(found: FoundLoops) -> str:
             f"{np.degrees(loop.yaw):.1f}",
             f"{loop.probability:.4f}",
             "" if loop.overlap is None else f"{loop.overlap:.2f}",
+            *([f"{_apart_m(found, loop):.1f}"] if known else []),
         )
-        for loop in least_sure
+        for loop in first
     ]
     return html_table(header, rows, numbers=header[2:])
