@@ -1,6 +1,7 @@
-"""Every preset and every shipped weight goes through every command that takes weights."""
+"""Every preset and every shipped weight describes scans; one of each kind goes through all that takes weights."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,66 +10,76 @@ import pytest
 import sglpr_jax
 from sglpr_jax.sim import write_dataset
 
-from .conftest import SENSOR, Ended
+from .conftest import SENSOR, Ended, assert_one_line_error, run_command
 
 pytestmark = pytest.mark.slow
-MODELS = (*sglpr_jax.MODELS, *sglpr_jax.shipped_weights())
+SHIPPED = "shipped "
+MODELS = (*sglpr_jax.MODELS, *(SHIPPED + name for name in sglpr_jax.shipped_weights()))
+KINDS = ("tiny", "small", "sglpr", "shipped rings")
+"""A square image, polar ones of points and of densities, and weights without a segmentation head."""
 SCANS = 24
-"""Few, for the paper's network takes a second for each; so many come back to a place."""
+"""Few, and yet so many that the drive comes back to a place."""
+FEW = 3
+"""The paper's network takes a second for each."""
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory) -> Path:
-    """A recording of fewer scans than other tests have; it comes back to places."""
-    return write_dataset(tmp_path_factory.mktemp("data") / "short", names=("08",), scans=SCANS, sensor=SENSOR)
+def towns(tmp_path_factory) -> dict[int, Path]:
+    """Recordings of fewer scans than other tests have."""
+    root = tmp_path_factory.mktemp("data")
+    return {n: write_dataset(root / str(n), names=("08",), scans=n, sensor=SENSOR) for n in (FEW, SCANS)}
 
 
-@pytest.fixture(scope="module", params=MODELS)
-def model(request, random_params, tmp_path_factory) -> str:
+@pytest.fixture(scope="module")
+def weights_of(random_params, tmp_path_factory) -> Callable[[str], str]:
     """The name of shipped weights, or a folder with random weights of a preset."""
-    name = request.param
-    if name not in sglpr_jax.MODELS:
-        return name
-    params = random_params(sglpr_jax.model_preset(name))
-    return str(sglpr_jax.save(params, tmp_path_factory.mktemp("weights") / name))
+
+    def find(name: str) -> str:
+        if name.startswith(SHIPPED):
+            return name.removeprefix(SHIPPED)
+        params = random_params(sglpr_jax.model_preset(name))
+        return str(sglpr_jax.save(params, tmp_path_factory.mktemp("weights") / name))
+
+    return find
 
 
-@pytest.fixture
-def on_the_town(command, model, town):
-    """Run a command with the weights on drive 08, its output going to a path; it must end well."""
-
-    def run(name: str, *arguments: object, out: Path) -> Ended:
-        options = ("--weights", model, "--data", town, "--seq", "08", "--out", out)
-        ended = command(name, *arguments, *options)
-        assert ended.status == 0, ended.error
-        return ended
-
-    return run
+def well(name: str, *arguments: object) -> Ended:
+    """Run a command; it must end well."""
+    ended = run_command(name, *arguments)
+    assert ended.status == 0, ended.error
+    return ended
 
 
-def test_embed_and_the_page_of_evaluate(on_the_town, model, tmp_path):
-    on_the_town("embed", "--batch", 8, out=tmp_path / "08.npz")
+@pytest.mark.parametrize("model", MODELS)
+def test_embed(weights_of, towns, model, tmp_path):
+    options = ("--weights", weights_of(model), "--data", towns[FEW], "--seq", "08", "--batch", FEW)
+    well("embed", *options, "--out", tmp_path / "08.npz")
     found = sglpr_jax.DescriptorFile.load(tmp_path / "08.npz").descriptors
-    assert found.shape == (SCANS, 256)
+    assert found.shape == (FEW, 256)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
-    assert np.linalg.norm(found[0] - found[SCANS // 2]) > 1e-4
-    on_the_town("evaluate", tmp_path / "08.npz", out=tmp_path / "page")
-    page = (tmp_path / "page" / "report.html").read_text()
-    assert "feature heat maps of frame" in page
-    assert ("semantic map of frame" in page) == sglpr_jax.load(model).config.segments
+    assert np.linalg.norm(found[0] - found[-1]) > 1e-4
 
 
-def test_stress(on_the_town, tmp_path):
-    on_the_town("stress", "--corruption", "rotation", "--batch", 8, out=tmp_path / "stress")
+@pytest.mark.parametrize("model", KINDS)
+def test_the_page_of_evaluate_stress_and_segment(weights_of, towns, model, tmp_path):
+    weights = weights_of(model)
+    options = ("--weights", weights, "--data", towns[SCANS], "--seq", "08")
+    segments = sglpr_jax.load(weights).config.segments
+    assert segments == (not model.startswith(SHIPPED))
+
+    well("stress", *options, "--corruption", "rotation", "--out", tmp_path / "stress")
     rows = json.loads((tmp_path / "stress" / "results.json").read_text())
     assert [row["corruption"] for row in rows] == ["clean", "rotation"]
 
+    well("evaluate", tmp_path / "stress/descriptors/clean-sglpr.npz", *options, "--out", tmp_path / "page")
+    page = (tmp_path / "page" / "report.html").read_text()
+    assert "feature heat maps of frame" in page
+    assert ("semantic map of frame" in page) == segments
 
-def test_segment_where_there_is_a_head(on_the_town, command, model, town, tmp_path):
-    config = sglpr_jax.load(model).config
-    if not config.segments:
-        options = ("--weights", model, "--data", town, "--seq", "08", "--out", tmp_path / "maps")
-        assert "expected weights with a segmentation head" in command("segment", *options).error
-        return
-    on_the_town("segment", out=tmp_path / "maps")
-    assert 0 <= json.loads((tmp_path / "maps" / "segmentation.json").read_text())["mean_iou"] <= 1
+    maps = tmp_path / "maps"
+    if segments:
+        well("segment", *options, "--out", maps)
+        assert 0 <= json.loads((maps / "segmentation.json").read_text())["mean_iou"] <= 1
+    else:
+        ended = run_command("segment", *options, "--out", maps)
+        assert_one_line_error(ended, "expected weights with a segmentation head")

@@ -15,7 +15,7 @@ import pytest
 from sglpr_jax.training.metrics_log import read_metrics
 
 pytestmark = pytest.mark.slow
-KILLS = 15
+KILLS = 6
 STEPS = 60
 SCORE_EVERY = 3
 TIMES = {"steps_per_second", "data_wait"}
@@ -137,7 +137,7 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninte
                 file.write('{"step": 59, "lo')
             (runs.folder / ".config.json.1.tmp").write_text("{")
             (runs.folder / ".weights.1.tmp" / "new").mkdir(parents=True)
-    assert in_a_write >= KILLS // 6 and len(steps) >= KILLS // 3, (in_a_write, steps)
+    assert in_a_write >= KILLS // 6 and len(steps) >= KILLS // 2, (in_a_write, steps)
     assert runs.finish() == 0, runs.errors.read_text()
     assert_equal(runs, uninterrupted)
     starts = json.loads((runs.folder / "environment.json").read_text())

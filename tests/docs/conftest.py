@@ -15,10 +15,10 @@ SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24
 
 @pytest.fixture(scope="session")
 def examples(tmp_path_factory) -> Path:
-    """KITTI/ (three recordings of 200 thin scans, about 2 m apart), my_scans/ (five of them), 08.npz and mine.npz, and
+    """KITTI/ (three recordings of 105 thin scans, about 4 m apart), my_scans/ (five of them), 08.npz and mine.npz, and
     odometry.tum of 08."""
     folder = tmp_path_factory.mktemp("examples")
-    write_dataset(folder / "KITTI", scans=200, sensor=SENSOR)
+    write_dataset(folder / "KITTI", scans=105, sensor=SENSOR)
     (folder / "my_scans").mkdir()
     for scan in sorted((folder / "KITTI/sequences/08/velodyne").glob("*.bin"))[:5]:
         shutil.copy(scan, folder / "my_scans")

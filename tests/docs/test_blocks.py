@@ -1,13 +1,17 @@
 """Every block of code in the README and the manual: Python is run, command lines are parsed by their own parsers."""
 
+import dataclasses
 import importlib
 import inspect
 import re
+import runpy
 import shlex
 import sys
 
 import pytest
 import tyro
+
+import sglpr_jax
 
 from .pages import PAGES, ROOT, blocks, command_lines, name_of
 
@@ -65,8 +69,11 @@ def test_nothing_else_is_unknown():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
-def test_python_runs(page, in_examples):
-    """All blocks of a page, one after another, in a folder with a small dataset."""
+def test_python_runs(page, in_examples, monkeypatch):
+    """All blocks of a page, one after another, in a folder with a small dataset; what is trained is a tiny model."""
+    model = runpy.run_path(str(ROOT / "benchmarks" / "tiny.py"))["MODEL"]
+    preset = sglpr_jax.preset
+    monkeypatch.setattr(sglpr_jax, "preset", lambda name: dataclasses.replace(preset(name), model=model))
     found = {"__name__": "page"}
     for block in blocks(page):
         if block.language == "python":

@@ -9,14 +9,28 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.training.config import LossConfig, without_untrained_head
 from sglpr_jax.training.loss import Summary, joint_loss, triplet, violations
+from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.state import new_state
 from sglpr_jax.training.step import _angles, _chunks, gradients, summarize, train_step
 
 FAST_COMPILE = {"xla_backend_optimization_level": 0}
+
+
+@pytest.fixture(scope="session")
+def config(config):
+    """With one block in place of two, which is compiled in half the time: twenty programs are."""
+    backbone = dataclasses.replace(config.model.backbone, depths=(1,))
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, backbone=backbone))
+
+
+@pytest.fixture(scope="session")
+def params(config, random_params):
+    return random_params(config.model)
 
 
 @functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILE)
@@ -146,7 +160,7 @@ def test_unlabelled_cells_can_be_left_out_of_the_segmentation_losses(config, par
     batch = make_batch(0)
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, ignore_unlabelled=True))
     chunks = chunks_of(batch, config)
-    logits = forward(params, chunks.images[0], key=chunks.key[0]).logits
+    logits = jax.jit(forward)(params, chunks.images[0]).logits
     log_p = np.asarray(jax.nn.log_softmax(logits), np.float64)
     maps = np.asarray(chunks.maps[0])
     counted = (maps != 0) & batch.labelled[:, None, None]
@@ -229,26 +243,29 @@ def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, ran
         gradients_of(params, batch.replace(classes=None), config)
 
 
-def test_both_passes_over_a_chunk_drop_the_same_branches(config, params, make_batch, whole):
+def test_both_passes_over_a_chunk_drop_the_same_branches(config, random_params, make_batch):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
-    backbone = dataclasses.replace(config.model.backbone, drop_path=0.5)
+    backbone = dataclasses.replace(config.model.backbone, depths=(2,), drop_path=0.5)
     config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(config.model, backbone=backbone))
-    batch = jax.tree.map(jnp.asarray, make_batch(0))
+    params, batch = random_params(config.model), jax.tree.map(jnp.asarray, make_batch(0))
 
-    @functools.partial(jax.grad, has_aux=True)
-    def plain(weights):
+    def loss_of(weights, backbone=backbone):
+        model = dataclasses.replace(config.model, backbone=backbone)
         chunks = chunks_of(batch, config)
         parts = [
-            summarize(dataclasses.replace(params, weights=weights, config=config.model), chunk, config.loss)
+            summarize(dataclasses.replace(params, weights=weights, config=model), chunk, config.loss)
             for chunk in (jax.tree.map(lambda x, i=i: x[i], chunks) for i in range(config.images // config.chunk))
         ]
         descriptors, sums = zip(*parts, strict=True)
         summed = jax.tree.map(lambda *chunks: sum(chunks), *sums)
         return joint_loss(Summary(jnp.concatenate(descriptors), summed), batch, config.loss)
 
-    found = gradients_of(dataclasses.replace(params, config=config.model), batch, config)
+    found = gradients_of(params, batch, config)
+    plain = jax.grad(loss_of, has_aux=True)
     assert_same(found, jax.jit(plain, compiler_options=FAST_COMPILE)(params.weights))
-    assert abs(float(found[1]["loss"] - whole[1]["loss"])) > 1e-4
+    whole = functools.partial(loss_of, backbone=dataclasses.replace(backbone, drop_path=0.0))
+    of_all = jax.jit(whole, compiler_options=FAST_COMPILE)(params.weights)[1]
+    assert abs(float(found[1]["loss"] - of_all["loss"])) > 1e-4
 
 
 def test_the_share_of_violations_is_that_of_the_margin_for_the_smooth_loss_too(make_batch):
@@ -284,6 +301,23 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     again = run(steps=2)[1]
     chex.assert_trees_all_equal(again, metrics[:2])
     assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
+
+
+def test_the_step_of_the_preset_that_the_pages_train_is_whole():
+    """Only traced, for it would be compiled for a minute."""
+    config = dataclasses.replace(load_preset("demo"), tuples=4)
+    grid, images = config.model.grid, config.images
+    batch = Batch(
+        labelled=np.ones(images, bool),
+        negatives=np.arange(images)[None] > config.sampling.positives,
+        positives=config.sampling.positives,
+        images=np.zeros((images, grid.height, grid.width), np.float32),
+        maps=np.zeros((images, grid.height, grid.width), np.int32),
+    )
+    state = jax.eval_shape(lambda: new_state(config))
+    after, metrics = jax.eval_shape(functools.partial(train_step, config=config), state, batch)
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    assert {"loss", "triplet", "cross_entropy", "dice"} <= set(metrics)
 
 
 def test_rotations_follow_the_key_and_can_be_turned_off(config, make_batch):
