@@ -40,7 +40,7 @@ class Pairs(NamedTuple):
 
 
 def main(
-    drives: Path,
+    drives: tyro.conf.Positional[Path],
     *,
     weights: tuple[str, ...] = ("sglpr", "rings"),
     left_out: tuple[str, ...] = LEFT_OUT,

@@ -38,7 +38,7 @@ SURE = 0.99
 
 
 def main(
-    drives: Path,
+    drives: tyro.conf.Positional[Path],
     *,
     odometry: bool = False,
     sceneries: tuple[str, ...] = (),

@@ -29,7 +29,7 @@ class DetectorConfig:
 
     min_probability: float = MIN_PROBABILITY
     """Of a loop that is returned."""
-    min_neighbour_probability: float = 0.5
+    min_neighbour_probability: float = 0.2
     """Of those beside it that speak for it; `min_probability` where that is less."""
     near_m: float = 200.0
     """With odometry, a loop has to agree with half of those, returned or not, within so many metres of way."""

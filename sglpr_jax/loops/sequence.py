@@ -21,7 +21,7 @@ from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar,
 class SequenceConfig:
     """Which frames count, and how much."""
 
-    frames: int = 10
+    frames: int = 30
     """Number of frames before and after a loop that count."""
     support: int = 2
     """Minimum number of loops that show the same place, including the loop itself."""
