@@ -97,10 +97,11 @@ def _check(command: LoopsCommand) -> None:
 
 def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
     from sglpr_jax.evaluation.page.of_loops import write_loops_page
-    from sglpr_jax.loops.explanation import why_few_queries, why_none, why_rejected
+    from sglpr_jax.loops.explanation import why_few_queries, why_none
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.folder import write_found
     from sglpr_jax.loops.optimization import optimize_trajectory
+    from sglpr_jax.loops.reasons import why_rejected
     from sglpr_jax.loops.unfinished import remove
     from sglpr_jax.models.weights_file import load
 

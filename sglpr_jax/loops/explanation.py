@@ -1,48 +1,15 @@
-"""Explanations for the user: why pairs were rejected, and why a recording has no loops."""
-
-from collections import Counter
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+"""Explanations for the user: why a recording has no loops."""
 
 import numpy as np
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.candidates import CandidateConfig
-from sglpr_jax.loops.loop import DEGENERATE_M, Reason, Rejected
+from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.probability import Evidence
-
-if TYPE_CHECKING:
-    from sglpr_jax.loops.find import FoundLoops
-
-MEANING: dict[Reason, str] = {
-    "repeats": "Another place, or another pose, fits about as well.",
-    "too few neighbours": "Too few of the frames before and after the query show the same place.",
-    "contradicts the motion": "The motion between the two frames, estimated from their images, leads elsewhere.",
-    "contradicts the odometry": "The loop needs more drift of the odometry than was stated.",
-    "contradicts other loops": "The loop is not consistent with the largest set of loops that agree.",
-    "little overlap": "The two scans, registered in 6 degrees of freedom, overlap too little.",
-    "degenerate": f"The position is uncertain by more than {DEGENERATE_M:g} m along one direction, as between walls.",
-}
-"""One sentence for each reason."""
+from sglpr_jax.loops.reasons import counted, listed
 
 
-def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
-    """Number of rejected pairs by reason, the most frequent reason first."""
-    reasons: list[Reason] = [one.reason for one in rejected]
-    return dict(Counter(reasons).most_common())
-
-
-def listed(counts: dict[Reason, int]) -> str:
-    """The counts in one line: "repeats: 10, little overlap: 2"."""
-    return ", ".join(f"{reason}: {count}" for reason, count in counts.items())
-
-
-def why_rejected(rejected: Sequence[Rejected]) -> list[str]:
-    """One line for each reason, with its count and meaning."""
-    return [f"rejected, {reason} ({count}): {MEANING[reason]}" for reason, count in counted(rejected).items()]
-
-
-def why_none(found: "FoundLoops") -> list[str]:
+def why_none(found: FoundLoops) -> list[str]:
     """Reasons why a recording has no loops, one sentence each. Empty if there are loops."""
     if found.loops:
         return []
@@ -103,7 +70,7 @@ def _queries(recording: Recording, rules: CandidateConfig, frames: int) -> int:
     return int((times[1:] - times[0] >= rules.exclude_s).sum())
 
 
-def _of_pairs(found: "FoundLoops", *, alone: bool) -> list[str]:
+def _of_pairs(found: FoundLoops, *, alone: bool) -> list[str]:
     """What became of the pairs that were compared. With `alone`, there is no other reason."""
     if found.rejected:
         pairs = len(found.rejected)
@@ -119,7 +86,7 @@ def _of_pairs(found: "FoundLoops", *, alone: bool) -> list[str]:
     return [f"{compared}; some are probable, but too few frames before and after them show the same place."]
 
 
-def _nothing_compared(found: "FoundLoops") -> str:
+def _nothing_compared(found: FoundLoops) -> str:
     rules = found.config
     if found.odometry is None:
         return (

@@ -15,11 +15,11 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.candidates import Candidate, Compared, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.drift import DriftModel
-from sglpr_jax.loops.explanation import counted, listed
 from sglpr_jax.loops.given import check_is, given_poses
 from sglpr_jax.loops.joint import check_odometry, settled
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.probability import LoopModel
+from sglpr_jax.loops.reasons import counted, listed
 from sglpr_jax.loops.registration import check_installed
 from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.upright import check_level

@@ -11,10 +11,11 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.loops.candidates import Candidate
-from sglpr_jax.loops.explanation import MEANING, counted, listed, why_few_queries, why_none, why_rejected
+from sglpr_jax.loops.explanation import why_few_queries, why_none
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop, Reason, Rejected
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.reasons import MEANING, counted, listed, why_rejected
 from sglpr_jax.loops.verification import Alignment
 
 LOOP = Loop(5, 0, np.eye(4), np.eye(6), 0.995)

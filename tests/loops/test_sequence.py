@@ -52,8 +52,8 @@ def test_a_neighbour_counts_as_much_as_the_sensor_moved(step_m, least, most):
 
 
 def test_neighbours_that_match_elsewhere_speak_against_a_loop_and_improbable_ones_do_not_count():
-    motion = moving([transform(100.0 * frame, 0.0, 0.0) for frame in range(30)])
-    loops = [loop(10, 0), loop(11, 5), loop(12, 0), loop(29, 0)]
+    motion = moving([transform(100.0 * frame, 0.0, 0.0) for frame in range(60)])
+    loops = [loop(10, 0), loop(11, 5), loop(12, 0), loop(59, 0)]
     agreeing = np.array([[i == j or (i, j) in ((0, 2), (2, 0)) for j in range(4)] for i in range(4)])
     found = added_log_odds(loops, np.array([3.0, 1.0, -2.0, 3.0]), agreeing, motion)
     np.testing.assert_allclose(found, [3.0 - 1.0 + 0.0, 1.0 - 3.0 - 0.0, -2.0 + 3.0 - 1.0, 3.0], atol=1e-6)
