@@ -61,7 +61,7 @@ def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 @pytest.mark.parametrize("degrees", TILTS.values(), ids=TILTS)
 def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params, degrees):
     recording, poses = tilted_drive(drive, degrees)
-    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=0))
+    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=0, min_travelled_m=0.0))
     query, match = revisit
     finder.add(recording.record(match))
     (found,) = finder.add(recording.record(query))
