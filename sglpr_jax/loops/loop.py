@@ -121,7 +121,7 @@ def planar_loop(
       match_mounting: Mounting of the match's sensor.
     """
     upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
-    covariance = unseen_covariance(float(np.hypot(alignment.x, alignment.y)))
+    covariance = unseen_covariance(float(np.hypot(*upright[:2, 3])))
     seen = np.array([0, 1, 5])
     to_query = np.eye(3)
     to_query[:2, :2] = upright[:2, :2].T  # the alignment's covariance is in the match's frame
