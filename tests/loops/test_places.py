@@ -46,7 +46,7 @@ def test_scans_between_those_of_the_map_find_themselves_however_they_are_turned(
         found = places.relocate(params, Record(points=rotated(drive.points(frame), angle)))
         true = drive.poses.world_from_lidar[frame]
         error = inverse(true) @ found[0].world_from_query
-        assert found[0].probability > 0.99 and np.linalg.norm(error[:2, 3]) < 0.4
+        assert found[0].probability > 0.8 and np.linalg.norm(error[:2, 3]) < 0.4
         assert abs(np.angle(np.exp(1j * (yaw_of(error) + angle)))) < np.radians(2)
         assert found[0].place == f"08/{drive.ids[frame - 1]}" or found[0].place == f"08/{drive.ids[frame + 1]}"
         assert [one.probability for one in found] == sorted((one.probability for one in found), reverse=True)

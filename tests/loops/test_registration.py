@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.loops.find import MIN_OVERLAP
+from sglpr_jax.loops.joint import MIN_OVERLAP
 from sglpr_jax.loops.loop import is_degenerate, position_deviation
 from sglpr_jax.loops.registration import coarse_pose, overlap, register
 from sglpr_jax.loops.transforms import inverse, transform, transformed
