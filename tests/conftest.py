@@ -26,7 +26,21 @@ os.environ |= {  # for the processes that tests start
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(KEPT_FROM_S),
 }
 
-SHARED = Path(__file__).resolve().parents[2] / "shared"
+TESTS = Path(__file__).resolve().parent
+QUICKLY = ("benchmarks/test_gpu.py", "benchmarks/test_speed.py", "cli/", "docs/", "training/", "test_wheel.py")
+"""What is tested there is what is done with numbers: XLA need not optimize, which halves the time that it takes. The
+numbers themselves are tested elsewhere, of programs compiled as users' are."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before fixtures of any scope compile
+def pytest_runtest_setup(item):
+    where = item.path.relative_to(TESTS).as_posix()
+    quickly = where.startswith(QUICKLY) and "loops" not in where  # their programs run for longer than they compile
+    jax.config.update("jax_disable_most_optimizations", quickly)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quickly))
+
+
+SHARED = TESTS.parents[1] / "shared"
 
 
 @pytest.fixture(scope="session")
