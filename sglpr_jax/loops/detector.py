@@ -25,14 +25,15 @@ from sglpr_jax.models.params import Params
 
 @dataclasses.dataclass(frozen=True)
 class DetectorConfig:
-    """When a pair of scans is called a loop."""
+    """Thresholds for accepting a loop closure."""
 
     min_probability: float = MIN_PROBABILITY
-    """Of a loop that is returned."""
+    """Minimum probability of a returned loop, given its neighbours."""
     min_neighbour_probability: float = 0.2
-    """Of those beside it that speak for it; `min_probability` where that is less."""
+    """Minimum probability of a pair alone that takes part in the sequential test, at most `min_probability`."""
     near_m: float = 200.0
-    """With odometry, a loop has to agree with half of those, returned or not, within so many metres of way."""
+    """With odometry, a loop must be consistent with at least half of the loops within this travelled distance, in
+    metres."""
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
@@ -43,7 +44,7 @@ class DetectorConfig:
     """Drift of the odometry. Loops that contradict it are rejected."""
 
     def __post_init__(self):
-        """Raise ValueError for a probability that is none."""
+        """Raises ValueError if a probability is outside [0, 1]."""
         for name in ("min_probability", "min_neighbour_probability"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"expected {name} from 0 to 1, found {getattr(self, name)}")
@@ -52,9 +53,10 @@ class DetectorConfig:
 class LoopDetector:
     """Takes scans or images in order, with or without times and odometry.
 
-    A loop is probable by its descriptors and images (`LoopModel`); of `neighbours` frames in a row `support` show the
-    same place; and where there is odometry it agrees with the loops found about it. So the first loop of a revisit is
-    returned one frame late, together with the second.
+    `LoopModel` gives the probability of a pair from descriptors and images. The sequential test (`loops.sequence`) adds
+    the evidence of neighbouring frames, at least one of which must agree. Loops that contradict the odometry are
+    rejected; without odometry, those that contradict the motion estimated from the images. The first loop of a revisit
+    is returned one frame late or more, together with others.
 
     Example:
       detector = LoopDetector(sglpr_jax.load("sglpr"))
@@ -64,22 +66,22 @@ class LoopDetector:
     """
 
     def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
-        """`model` says how probable pairs are (None: that which ships for these weights)."""
+        """`model` is the model of the probabilities, by default the one shipped for the weights."""
         self.finder = CandidateFinder(
             params, config=config.candidates, verification=config.verification, drift=config.drift
         )
         self.model = default_model(self.finder.index.weights_hash) if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
-        """All pairs that were looked at."""
+        """All pairs that were compared."""
         self.loops: list[Loop] = []
-        """All that were returned."""
+        """All returned loops."""
         self.supported: list[Loop] = []
-        """All that the frames beside them speak for: those returned, and those that other loops contradict."""
+        """Loops that pass the sequential test and the drift, whether or not other loops contradict them."""
         self.rejected: list[Rejected] = []
-        """Loops that the frames beside them support, but that contradict the odometry."""
+        """Pairs that looked like loops, each with the reason for its rejection."""
         self.by_scans: set[int] = set()
-        """The frames that would have a loop by the scans alone: odometry that most of them contradict is none."""
+        """Frames whose scans alone support a loop. If most contradict the odometry, the odometry may be wrong."""
         self._waiting: list[Loop] = []
 
     def __len__(self) -> int:
@@ -147,12 +149,12 @@ class LoopDetector:
         rules, motion = self.config.sequence, self.finder.motion
         self.by_scans |= {loop.query for loop in self._accepted(agree_in_order(self._waiting, config=rules))}
         found = self._accepted(agree_in_motion(self._waiting, motion, self.finder.mounting, config=rules))
-        found = self._within_drift(found)
         recent = 2 * rules.frames
+        done = {loop.query for loop in self.loops[-recent:]}
+        found = self._within_drift([loop for loop in found if loop.query not in done])
         known = {loop.query for loop in self.supported[-recent:]}
         self.supported += [loop for loop in found if loop.query not in known]
-        done = {loop.query for loop in self.loops[-recent:]}
-        return [loop for loop in found if loop.query not in done and self._agrees(loop)]
+        return [loop for loop in found if self._agrees(loop)]
 
     def _accepted(self, agreeing: Bool[np.ndarray, "n n"]) -> list[Loop]:
         """The loops of the last frames that are probable enough, given those that agree with them."""

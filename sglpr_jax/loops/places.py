@@ -211,10 +211,9 @@ class PlaceMap:
     def _rivals(self, descriptor: Float[np.ndarray, " d"], match: int) -> Int[np.ndarray, " k"]:
         """Places that look like a query, away from its match and from each other."""
         places, chosen = self.world_from_place[:, :3, 3], [match]
-        distances = np.linalg.norm(self.index.descriptors - descriptor, axis=1)
-        while len(chosen) <= RIVALS:
-            apart = np.linalg.norm(places[:, None] - places[chosen][None], axis=2).min(axis=1)
-            left = np.where(apart >= RIVAL_SPACING_M, distances, np.inf)
+        left = np.linalg.norm(self.index.descriptors - descriptor, axis=1)
+        for _ in range(RIVALS):
+            left[np.linalg.norm(places - places[chosen[-1]], axis=1) < RIVAL_SPACING_M] = np.inf
             if not np.isfinite(left).any():
                 break
             chosen.append(int(left.argmin()))
