@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 import tyro
+from drives import compared, distances, read
 from jaxtyping import Bool, Float
 
 import sglpr_jax
-from sglpr_jax.data.record import Record
 from sglpr_jax.files import write_json
-from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.probability import ALL, DEFAULTS, OF_IMAGES, Evidence, fit
 from sglpr_jax.models.weights import weights_hash
 
@@ -77,18 +77,14 @@ def main(
 
 def pairs(path: Path, *, weights: str) -> Pairs:
     """The evidence of the candidates of one drive, and which are loops."""
-    with np.load(path) as file:
-        images, descriptors, poses, times, other_m = (
-            file[name] for name in ("images", "descriptors", "world_from_lidar", "times", "other_m")
-        )
-    finder, found = CandidateFinder(sglpr_jax.load(weights)), []
-    for i, (image, descriptor) in enumerate(zip(images, descriptors, strict=True)):
-        seen = Seen(descriptor, image, None) if weights == "sglpr" else finder.seen(Record(image=image))
-        for one in finder.add_seen(seen, time=float(times[i])):
-            found.append((*one.evidence, np.linalg.norm(poses[one.query, :3, 3] - poses[one.match, :3, 3])))
-    rows = np.array(found, np.float64).reshape(-1, len(ALL) + 1)
-    loop, other = rows[:, -1] <= min(LOOP_M, float(other_m) / 2), rows[:, -1] > other_m
-    return Pairs(rows[loop | other, :-1], loop[loop | other])
+    params = sglpr_jax.load(weights)
+    drive = read(path, None if weights == "sglpr" else params)
+    frames = compared(drive, CandidateFinder(params), path.parent / "compared")
+    candidates = [one for frame in frames for one in frame.candidates]
+    apart = distances([(one.query, one.match) for one in candidates], drive.world_from_lidar)
+    evidence = np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(ALL))
+    loop, other = apart <= min(LOOP_M, drive.other_m / 2), apart > drive.other_m
+    return Pairs(evidence[loop | other], loop[loop | other])
 
 
 if __name__ == "__main__":

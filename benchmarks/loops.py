@@ -31,6 +31,7 @@ from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.joint import settled
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.optimization import optimized, trajectory_error
+from sglpr_jax.loops.pose_search import query_spectra
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.reliability import Bin, reliability_of
 from sglpr_jax.loops.transforms import inverse, transform
@@ -142,13 +143,15 @@ class Speed:
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
         rules = finder.config.rivals
         sizes = finder.config.candidates + 1, rules.of_query + rules.of_match
-        peak = finder.search(image, [image], 1).one(0)
+        spectra = query_spectra(image)
+        peak = finder.search(spectra, [image], 1).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
             ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder.index.recent(500.0))),
-            ("comparison", lambda i: finder.search(image, [image] * sizes[0], sizes[0])),
+            ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
+            ("comparison", lambda i: finder.search(spectra, [image] * sizes[0], sizes[0])),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),
-            ("rivals", lambda i: finder.search(image, [image] * sizes[1], sizes[1])),
+            ("rivals", lambda i: finder.search(spectra, [image] * sizes[1], sizes[1])),
             ("all of it", lambda i: detector.add(records[i % 20], time=float(next(clock)))),
         ):
             work(0)

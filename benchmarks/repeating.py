@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 import tyro
+from drives import compared, distances, read
 from jaxtyping import Bool, Float
-from loops import drifted
 from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from sglpr_jax.loops.candidates import Seen
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import accepted
 from sglpr_jax.loops.loop import Loop
@@ -90,16 +90,15 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
 
 def searched(path: Path, *, odometry: bool, weights: str) -> dict[str, Any]:
     """The loops of one drive, judged by the true poses."""
-    with np.load(path) as file:
-        drive = {name: file[name] for name in file.files}
-    poses, times = drive["world_from_lidar"], drive["times"]
-    given = drifted(poses, seed=int(drive["seed"])) if odometry else None
-    detector = LoopDetector(sglpr_jax.load(weights))
-    for i, (descriptor, image) in enumerate(zip(drive["descriptors"], drive["images"], strict=True)):
+    params, drive = sglpr_jax.load(weights), read(path)
+    poses, times, other_m = drive.world_from_lidar, drive.times, drive.other_m
+    given = drive.drifted if odometry else None
+    detector = LoopDetector(params)
+    frames = compared(drive, CandidateFinder(params), path.parent / "compared", odometry=odometry)
+    for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if given is None else given[i]
-        detector.add_seen(Seen(descriptor, image, None), time=float(times[i]), odometry=pose)
+        detector.add_seen(seen, time=float(times[i]), odometry=pose, compared=frame)
     loops = detector.loops if given is None else accepted(detector.supported, given)[0]
-    other_m = float(drive["other_m"])
     revisited = revisits(poses[:, :3, 3], times, min(REVISIT_M, other_m / 2))
     apart = distances([(loop.query, loop.match) for loop in loops], poses)
     right = {loop.query for loop, metres in zip(loops, apart, strict=True) if metres <= other_m}
@@ -107,7 +106,7 @@ def searched(path: Path, *, odometry: bool, weights: str) -> dict[str, Any]:
     sure = np.array([float(detector.model.probability(one.evidence)) >= SURE for one in detector.candidates], bool)
     return {
         "drive": path.stem,
-        **{name: str(drive[name]) for name in ("scenery", "revisit", "sensor", "seed")},
+        **drive.about,
         "scans": len(poses),
         "loops": len(loops),
         "wrong": int((apart > other_m).sum()),
@@ -130,12 +129,6 @@ def revisits(positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " n"]
         old = positions[times <= time - AGE_S]
         found[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
     return found
-
-
-def distances(pairs: Sequence[tuple[int, int]], poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " k"]:
-    """Metres between the scans of each pair."""
-    frames = np.array(pairs, np.int64).reshape(-1, 2)
-    return np.linalg.norm(poses[frames[:, 0], :3, 3] - poses[frames[:, 1], :3, 3], axis=1)
 
 
 def report(rows: Sequence[dict[str, Any]]) -> None:

@@ -18,6 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.drift import position_deviations
+from sglpr_jax.loops.pose_search import query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.rivals import distance_share, rival_share
 from sglpr_jax.loops.transforms import travelled
@@ -138,7 +139,8 @@ class _Places:
         elsewhere = self.far(frame) & (self.apart(row) > NEGATIVE_M)
         found = finder.index.query(query.descriptor, RIVALS, exclude=~elsewhere).rows
         rows = [row, *found[found >= 0].tolist()]
-        peaks = finder.search(query.image, [self.images[k] for k in rows], 1 + RIVALS)
+        spectra = query_spectra(query.image, config=finder.verification)
+        peaks = finder.search(spectra, [self.images[k] for k in rows], 1 + RIVALS)
         peak = peaks.one(0)
         share = rival_share(peaks.some(slice(1, None)), float(peak.correlation), [])
         fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))

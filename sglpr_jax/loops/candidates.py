@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Num, UInt8
+from jaxtyping import Array, Bool, Complex, Float, Float32, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.degenerate import check_cloud
@@ -19,7 +19,7 @@ from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.loops.drift import DriftModel, position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion, MotionConfig
-from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, search
+from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, query_spectra, search_spectra
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import RivalConfig, distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.transforms import inverse, transform
@@ -211,15 +211,19 @@ class CandidateFinder:
         priors = np.full((len(matches), 3), np.nan)
         if linked:
             priors[-1] = self.motion.prior(clock)
-        peaks = self.search(seen.image, matches, self.config.candidates + linked, priors)
+        spectra = query_spectra(seen.image, config=self.verification)
+        peaks = self.search(spectra, matches, self.config.candidates + linked, priors)
         link = peaks.one(len(rows)) if linked else None
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
             return Compared([], link)
         best = int(np.argmax(peaks.correlation[: len(rows)]))
-        return Compared([self._candidate(seen, int(rows[best]), float(distances[best]), peaks.one(best))], link)
+        match, distance = int(rows[best]), float(distances[best])
+        return Compared([self._candidate(seen, spectra, match, distance, peaks.one(best))], link)
 
-    def _candidate(self, seen: Seen, match: int, distance: float, peak: Peak) -> Candidate:
+    def _candidate(
+        self, seen: Seen, spectra: Complex[Array, "s t f"], match: int, distance: float, peak: Peak
+    ) -> Candidate:
         query, rules = len(self.index), self.config.rivals
         alignment = jax.device_get(refined(seen.image, self.images[match], peak, config=self.verification))
         shares = np.nan, np.nan
@@ -228,7 +232,7 @@ class CandidateFinder:
             known = self.index.descriptors
             exclude_s = self.config.exclude_s
             rows = rivals(seen.descriptor, known, match, self.motion, usable, exclude_s=exclude_s, config=rules)
-            found = self.search(seen.image, [self.images[row] for row in rows], rules.of_query + rules.of_match)
+            found = self.search(spectra, [self.images[row] for row in rows], rules.of_query + rules.of_match)
             match_from_query = transform(float(peak.x), float(peak.y), float(peak.yaw))
             expected = [
                 expected_poses(self.motion, query, rows, np.eye(4), config=rules),
@@ -244,18 +248,18 @@ class CandidateFinder:
 
     def search(
         self,
-        image: UInt8[np.ndarray, "n n"],
+        spectra: Complex[Array, "s t f"],
         matches: Sequence[UInt8[np.ndarray, "n n"]],
         size: int,
         priors: Float[np.ndarray, "k 3"] | None = None,
     ) -> Peak:
-        """The poses of an image over those of some matches; `size` of them are compared, so that it compiles once."""
+        """The poses of a query over some matches; `size` images are compared, so that it compiles once."""
         if not matches:
             return NO_PEAKS
         chosen = np.arange(size) % len(matches)
         expected = np.full((size, 3), np.nan) if priors is None else priors[chosen]
         padded = np.stack([matches[k] for k in chosen.tolist()])
-        found = jax.device_get(search(image, padded, expected.astype(np.float32), config=self.verification))
+        found = jax.device_get(search_spectra(spectra, padded, expected.astype(np.float32), config=self.verification))
         return found.some(slice(len(matches)))
 
     def _mounting_of(self, seen: Seen | None) -> Mounting | None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Array, Complex, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
@@ -19,7 +19,7 @@ from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Compare
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.pose_search import Peak, VerificationConfig, search
+from sglpr_jax.loops.pose_search import Peak, VerificationConfig, query_spectra, search_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.rivals import RivalConfig, distance_share, rival_share
 from sglpr_jax.loops.transforms import inverse, transform
@@ -142,11 +142,12 @@ class PlaceMap:
             return []
         model = default_model(self.index.weights_hash) if model is None else model
         settings = VerificationConfig()
-        peaks = jax.device_get(search(image, self.images[rows], config=settings))
+        spectra = query_spectra(image, config=settings)
+        peaks = jax.device_get(search_spectra(spectra, self.images[rows], config=settings))
         pairs = []
         for k, (row, distance) in enumerate(zip(rows.tolist(), distances.tolist(), strict=True)):
             alignment = jax.device_get(refined(image, self.images[row], peaks.one(k), config=settings))
-            shares = self._rival_shares(descriptor, image, row, distance, peaks.one(k))
+            shares = self._rival_shares(descriptor, spectra, row, distance, peaks.one(k))
             evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
             mountings = {"query_mounting": mounting, "match_mounting": self.mounting(row)}
             probability = float(model.probability(evidence))
@@ -192,7 +193,7 @@ class PlaceMap:
     def _rival_shares(
         self,
         descriptor: Float[np.ndarray, " d"],
-        image: UInt8[np.ndarray, "h h"],
+        spectra: Complex[Array, "s t f"],
         match: int,
         distance: float,
         peak: Peak,
@@ -201,7 +202,7 @@ class PlaceMap:
         rows = self._rivals(descriptor, match)
         if peak.correlation < CandidateConfig().min_rival_correlation or not len(rows):
             return np.nan, np.nan
-        found = jax.device_get(search(image, self.images[np.resize(rows, RIVALS)])).some(slice(len(rows)))
+        found = jax.device_get(search_spectra(spectra, self.images[np.resize(rows, RIVALS)])).some(slice(len(rows)))
         upright = self.world_from_place @ inverse(upright_from_lidar(self.mounting(match)))
         query = upright[match] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
         expected = [(inverse(upright[rows]) @ query, np.full(len(rows), RivalConfig().agree_m))]

@@ -2,7 +2,7 @@
 
 The square root of the query's image is rotated, band-passed and correlated with that of the match. The band is a blur
 less a wider blur: it keeps what is as wide as a wall, a pole or a trunk, without which one street looks like any other.
-The correlation is needed at small shifts alone, so the inverse Fourier transform is a product with two small matrices,
+The correlation is needed at small shifts alone, so the inverse Fourier transform is a product with small matrices,
 which is faster than a whole one.
 """
 
@@ -107,15 +107,35 @@ def search(
     Raises:
       ValueError: if the images are not square or have an odd number of cells.
     """
+    return search_spectra(query_spectra(query, config=config), matches, priors, config=config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def query_spectra(
+    query: Num[Array | np.ndarray, "h w"], *, config: VerificationConfig = DEFAULT
+) -> Complex[Array, "s t f"]:
+    """Return the spectra of all rotations of a query, for `search_spectra`. Errors are those of `search`."""
     angles = np.arange(config.turns, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
-    cell_m = config.resolution_m * config.coarse
     rotated = rotations(merged(prepared(query, config), config.coarse), jnp.asarray(angles))
-    spectra = jnp.moveaxis(spectrum(rotated, cell_m, config), 1, 0)
+    return jnp.moveaxis(spectrum(rotated, config.resolution_m * config.coarse, config), 1, 0)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def search_spectra(
+    spectra: Complex[Array, "s t f"],
+    matches: Num[Array | np.ndarray, "k h w"],
+    priors: Float[Array | np.ndarray, "k 3"] | None = None,
+    *,
+    config: VerificationConfig = DEFAULT,
+) -> Peak:
+    """`search` for a query whose `query_spectra` are known."""
+    cell_m = config.resolution_m * config.coarse
+    halves = _halves(spectra)
 
     def one(match: tuple[Num[Array, "h w"], Float[Array, " 3"]]) -> Peak:
         image, prior = match
         there = spectrum(merged(prepared(image, config), config.coarse)[None], cell_m, config)
-        return _peak(_correlations(spectra, there[0], cell_m, config), prior, cell_m, config)
+        return _peak(_correlations(halves, there[0], cell_m, config), prior, cell_m, config)
 
     priors = np.full((len(matches), 3), np.nan, np.float32) if priors is None else priors
     return jax.lax.map(one, (jnp.asarray(matches), jnp.asarray(priors, jnp.float32)))
@@ -171,34 +191,70 @@ def twice(size: int) -> Float32[np.ndarray, "1 f"]:
     return np.where(np.isin(np.arange(size // 2 + 1), (0, size / 2)), 1, 2).astype(np.float32)[None]
 
 
+class _Halves(NamedTuple):
+    """Real and imaginary parts of spectra, by rows: those of frequencies 0 to s/2, and those of -1, -2 and so on."""
+
+    low: tuple[Float[Array, "h t f"], Float[Array, "h t f"]]
+    high: tuple[Float[Array, "g t f"], Float[Array, "g t f"]]
+
+
+def _halves(spectra: Complex[Array, "s t f"]) -> _Halves:
+    size = len(spectra)
+    low, high = spectra[: size // 2 + 1], spectra[::-1][: (size - 1) // 2]
+    return _Halves((low.real, low.imag), (high.real, high.imag))
+
+
 def _correlations(
-    queries: Complex[Array, "s t f"], match: Complex[Array, "s f"], cell_m: float, config: VerificationConfig
+    queries: _Halves, match: Complex[Array, "s f"], cell_m: float, config: VerificationConfig
 ) -> Float[Array, "d t r"]:
-    """Correlation of the match with every rotated query at every shift: rows down, rotations, columns to the right."""
-    size, turns, width = queries.shape
-    reach = cells(config.max_shift_m, cell_m)
-    rows, columns = _inverse_transforms(size, reach)
-    real, imaginary = match.real[:, None], match.imag[:, None]
-    product = [
-        real * queries.real + imaginary * queries.imag,
-        imaginary * queries.real - real * queries.imag,
-    ]
-    by_row = (rows @ jnp.concatenate(product).reshape(2 * size, turns * width)).reshape(2, -1, turns, width)
-    return (jnp.moveaxis(by_row, 0, 2).reshape(-1, 2 * width) @ columns).reshape(-1, turns, columns.shape[1])
+    """Correlation of the match with every rotated query at every shift: rows down, rotations, columns to the right.
+
+    The transform of even and odd parts, for shifts from zero on, takes a quarter of the multiplications of the whole
+    one: the cosine of an opposite shift is the same, and the sine changes its sign.
+    """
+    size, (_, turns, width) = len(match), queries.low[0].shape
+    cos_down, sin_down, cos_right, sin_right = _waves_to(cells(config.max_shift_m, cell_m), size)
+    there = _halves(match[:, None])
+    low, high = _products(there.low, queries.low), _products(there.high, queries.high)
+    unpaired = ((1, len(low[0]) - len(high[0]) - 1), (0, 0), (0, 0))
+    even = [one + jnp.pad(other, unpaired) for one, other in zip(low, high, strict=True)]
+    odd = [one[1 : len(other) + 1] - other for one, other in zip(low, high, strict=True)]
+    cos_real, cos_imaginary = (cos_down @ part.reshape(len(part), -1) for part in even)
+    sin_real, sin_imaginary = (sin_down @ part.reshape(len(part), -1) for part in odd)
+    real = _both_ways(cos_real, sin_imaginary, axis=0).reshape(-1, width)
+    imaginary = _both_ways(cos_imaginary, -sin_real, axis=0).reshape(-1, width)
+    found = _both_ways(real @ cos_right, imaginary @ sin_right, axis=1)
+    return found.reshape(-1, turns, found.shape[1])
+
+
+def _products(
+    match: tuple[Float[Array, "h 1 f"], Float[Array, "h 1 f"]],
+    queries: tuple[Float[Array, "h t f"], Float[Array, "h t f"]],
+) -> tuple[Float[Array, "h t f"], Float[Array, "h t f"]]:
+    """Real and imaginary part of a match's spectrum times those of the queries, conjugate."""
+    (a, b), (c, d) = match, queries
+    return a * c + b * d, b * c - a * d
+
+
+def _both_ways(even: Float[Array, "a b"], odd: Float[Array, "a b"], *, axis: int) -> Float[Array, "*c"]:
+    """Values at shifts from the most negative to the greatest: even - odd from zero on, and even + odd before it."""
+    before = jnp.flip(jax.lax.slice_in_dim(even + odd, 1, None, axis=axis), axis)
+    return jnp.concatenate([before, even - odd], axis)
 
 
 @functools.cache
-def _inverse_transforms(size: int, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices of the inverse Fourier transform along columns and along rows, for shifts from -reach to reach.
+def _waves_to(reach: int, size: int) -> tuple[Float32[np.ndarray, "_ _"], ...]:
+    """Cosines and sines: of shifts from 0 to reach by frequencies down, and of frequencies by shifts to the right.
 
-    Complex numbers are pairs of real ones, which XLA multiplies faster.
+    The latter are scaled so that an inverse transform of a half spectrum comes out. The sines down leave out
+    frequencies that are their own opposites.
     """
-    shifts = np.arange(-reach, reach + 1)
-    down = 2 * np.pi * np.outer(shifts, np.fft.fftfreq(size))
-    right, often = 2 * np.pi * np.outer(np.fft.rfftfreq(size), shifts), twice(size).T / size**2
-    rows = np.block([[np.cos(down), -np.sin(down)], [np.sin(down), np.cos(down)]])
-    columns = np.concatenate([np.cos(right) * often, -np.sin(right) * often])
-    return rows.astype(np.float32), columns.astype(np.float32)
+    shifts, rows, columns = np.arange(reach + 1), np.arange(size // 2 + 1), np.arange(size // 2 + 1)
+    down, right = (2 * np.pi / size * np.outer(*pair) for pair in ((shifts, rows), (columns, shifts)))
+    often = twice(size).T / size**2
+    sines = np.sin(down[:, 1 : (size - 1) // 2 + 1])
+    found = np.cos(down), sines, np.cos(right) * often, np.sin(right) * often
+    return tuple(values.astype(np.float32) for values in found)
 
 
 def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], cell_m: float, config: VerificationConfig) -> Peak:
@@ -206,13 +262,38 @@ def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], cell_m: float
     x, y, yaw = prior  # of which NaN leaves everything
     expected = reach - y / cell_m, yaw / step, reach + x / cell_m
     near_prior = _near(found.shape, expected, config.prior_m / cell_m, config.prior_deg)
-    at = jnp.unravel_index(jnp.argmax(jnp.where(near_prior | jnp.isnan(x), found, -1.0)), found.shape)
-    near = _near(found.shape, at, config.second_m / cell_m, config.second_deg)
-    about = _near(found.shape, at, config.ridge_m / cell_m, config.second_deg)
-    second, ridge = (jnp.max(jnp.where(where, found, 0.0)) for where in (~near, about & ~near))
+    highest = found.max(0)  # the slow axis, along which a maximum is fast
+    allowed = jnp.where(jnp.isnan(x), highest, jnp.where(near_prior, found, -1.0).max(0))
+    turn, right = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
+    column = found[:, turn, right]
+    down = jnp.argmax(jnp.where(near_prior[:, turn, right] | jnp.isnan(x), column, -1.0))
+    second, ridge = _others(found, highest, (down, turn, right), cell_m, config)
+    at = down, turn, right
     down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
     x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
     return Peak(x, y, yaw, found[at], second, ridge)
+
+
+def _others(
+    found: Float[Array, "d t r"],
+    highest: Float[Array, "t r"],
+    at: tuple[Int[Array, ""], ...],
+    cell_m: float,
+    config: VerificationConfig,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The highest correlation away from a peak, and that on its ridge; `highest` is that of all shifts down."""
+    down, turn, right = at
+    most_turns = int(config.second_deg * config.turns / 360 + 1e-6)
+    turns = jnp.mod(turn + np.arange(-most_turns, most_turns + 1), config.turns)
+    about = found[:, turns]
+    middle = down, most_turns, right
+    near, on_ridge = (
+        _near(about.shape, middle, metres / cell_m, 360.0) for metres in (config.second_m, config.ridge_m)
+    )
+    other_turns = jnp.ones(config.turns, bool).at[turns].set(False)
+    ridge = jnp.max(jnp.where(on_ridge & ~near, about, 0.0))
+    second = jnp.maximum(jnp.max(jnp.where(other_turns[:, None], highest, 0.0)), jnp.max(jnp.where(~near, about, 0.0)))
+    return second, ridge
 
 
 def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
@@ -234,7 +315,7 @@ def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> 
 
 
 def _near(
-    shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""]], most_cells: float, most_deg: float
+    shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""] | int], most_cells: float, most_deg: float
 ) -> Bool[Array, "d t r"]:
     """Which poses are near one."""
     down, turn, right = (jnp.abs(jnp.arange(n) - at) for n, at in zip(shape, pose, strict=True))

@@ -99,14 +99,12 @@ class Unfinished:
             except ValueError:
                 return
             shown, images = set(more["shown"].tolist()), iter(more["images"])
-            candidates = _candidates(more)
-            for row, descriptor in enumerate(frames.descriptors, start=self.kept):
+            rows = range(self.kept, self.kept + len(frames))
+            for row, descriptor, compared in zip(rows, frames.descriptors, compared_of(more, rows), strict=True):
                 seen = Seen(np.array(descriptor), next(images), mounting) if row in shown else None
                 if seen is None and not missing:
                     return
-                link = more["links"][row - self.kept]
-                compared = [one for one in candidates if one.query == row]
-                add(seen, Compared(compared, None if np.isnan(link).all() else Peak(*link)))
+                add(seen, compared)
             self.kept = len(finder.index)
 
     def keep(self, finder: CandidateFinder, candidates: Sequence[Candidate] = (), *, all: bool = False) -> None:
@@ -119,8 +117,8 @@ class Unfinished:
         shown = sorted(set(range(first, end)) - set(finder.missing))
         images = [finder.images[row] for row in shown]
         more = {"shown": np.array(shown, np.int64), "images": np.stack(images) if images else np.zeros(0, np.uint8)}
-        more["links"] = np.array([_numbers(link) for link in finder.links[first:end]], np.float64)
-        content = frames.to_bytes(more | _columns([one for one in candidates if one.query >= first]))
+        new = [one for one in candidates if one.query >= first]
+        content = frames.to_bytes(more | columns(new, finder.links[first:end]))
         with replacing(self._path) as temporary:
             temporary.write_bytes(content)
         self.kept = end
@@ -195,25 +193,25 @@ def _is_own(path: Path) -> bool:
     return OWN.fullmatch(path.name) is not None and path.is_file()
 
 
-def _numbers(link: Peak | None) -> list[float]:
-    return [np.nan] * len(Peak._fields) if link is None else [float(value) for value in link]
-
-
-def _columns(candidates: list[Candidate]) -> dict[str, np.ndarray]:
+def columns(candidates: Sequence[Candidate], links: Sequence[Peak | None]) -> dict[str, np.ndarray]:
+    """The comparisons of some frames as arrays: their candidates, in order, and the link of each frame."""
     alignments = [np.concatenate([np.reshape(value, -1) for value in one.alignment]) for one in candidates]
+    missing = [np.nan] * len(Peak._fields)
     return {
         "pairs": np.array([(one.query, one.match) for one in candidates], np.int64).reshape(-1, 2),
         "alignments": np.array(alignments, np.float64).reshape(-1, ALIGNMENT_NUMBERS),
         "evidence": np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(Evidence._fields)),
+        "links": np.array([missing if link is None else [float(value) for value in link] for link in links]),
     }
 
 
-def _candidates(columns: dict[str, np.ndarray]) -> list[Candidate]:
-    found = []
+def compared_of(columns: dict[str, np.ndarray], rows: Sequence[int]) -> list[Compared]:
+    """The comparisons of frames `rows` from their arrays."""
+    found: dict[int, list[Candidate]] = {row: [] for row in rows}
     for (query, match), values, evidence in zip(
         columns["pairs"].tolist(), columns["alignments"], columns["evidence"], strict=True
     ):
         fields: list[Any] = [*values[:3], values[3:12].reshape(3, 3), *values[12:]]
-        alignment = Alignment(*fields)
-        found.append(Candidate(query, match, alignment, Evidence(*map(np.asarray, evidence))))
-    return found
+        found[query].append(Candidate(query, match, Alignment(*fields), Evidence(*map(np.asarray, evidence))))
+    links = [None if np.isnan(link).all() else Peak(*link) for link in columns["links"]]
+    return [Compared(found[row], link) for row, link in zip(rows, links, strict=True)]

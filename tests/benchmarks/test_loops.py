@@ -33,9 +33,10 @@ def test_loops_are_scored_on_images(tmp_path):
 
 def test_the_parts_of_a_loop_are_timed():
     output = printed("loops.py", "speed", "--frames", "300", "--repeats", "2", "--azimuth-steps", "90")
-    assert [line.split(":")[0] for line in output.splitlines()][-6:] == [
+    assert [line.split(":")[0] for line in output.splitlines()][-7:] == [
         "image and descriptor",
         "query",
+        "rotations",
         "comparison",
         "refinement",
         "rivals",
