@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Float32, Num, UInt8
+from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
 from sglpr_jax.data.degenerate import check_cloud
@@ -40,6 +40,8 @@ class CandidateConfig:
 
     candidates: int = 3
     """Number of nearest descriptors whose images are compared. The best fit is the candidate."""
+    elsewhere: int = 2
+    """Number of nearest descriptors away from these whose images are compared, too."""
     exclude_s: float = EXCLUDED_S
     exclude_frames: int = EXCLUDED_FRAMES
     """Minimum age of a match in seconds, or in frames if there are no times."""
@@ -203,48 +205,76 @@ class CandidateFinder:
         if seen is None or self.is_empty(seen.image):
             self.motion.add(clock, pose=pose)
             return Compared([], None)
-        found = self.index.query(seen.descriptor, self.config.candidates, exclude=self._excluded(time, position))
-        rows, distances = (values[found.rows >= 0] for values in found)
+        rows = self._rows(seen.descriptor, self._excluded(time, position))
         key = self.motion.keyframe
         linked = pose is None and len(self.images) > 0 and not self.empty[key]
-        matches = [self.images[row] for row in ([*rows, key] if linked else rows)]
+        matches = [self.images[row] for row in ([*rows, key, key] if linked else rows)]
         priors = np.full((len(matches), 3), np.nan)
         if linked:
             priors[-1] = self.motion.prior(clock)
         spectra = query_spectra(seen.image, config=self.verification)
-        peaks = self.search(spectra, matches, self.config.candidates + linked, priors)
-        link = peaks.one(len(rows)) if linked else None
+        peaks = self.search(spectra, matches, self.config.candidates + self.config.elsewhere + 2 * linked, priors)
+        link = self.motion.link(peaks.one(len(rows)), peaks.one(len(rows) + 1)) if linked else None
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
             return Compared([], link)
         best = int(np.argmax(peaks.correlation[: len(rows)]))
-        match, distance = int(rows[best]), float(distances[best])
-        return Compared([self._candidate(seen, spectra, match, distance, peaks.one(best))], link)
+        return Compared([self._candidate(seen, spectra, rows, peaks.some(slice(len(rows))), best)], link)
+
+    def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+        """Frames with the nearest descriptors, and those with the nearest ones away from the first."""
+        rows = self.nearest(descriptor, self.config.candidates, excluded)
+        if not len(rows):
+            return rows
+        excluded = excluded | self.motion.about(rows[0], self.config.rivals.age[0] * self.config.exclude_s)
+        return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        """Up to k frames with the nearest descriptors, in order."""
+        rows = self.index.query(descriptor, k, exclude=excluded).rows
+        return rows[rows >= 0]
 
     def _candidate(
-        self, seen: Seen, spectra: Complex[Array, "s t f"], match: int, distance: float, peak: Peak
+        self, seen: Seen, spectra: Complex[Array, "s t f"], compared: Int[np.ndarray, " k"], peaks: Peak, best: int
     ) -> Candidate:
-        query, rules = len(self.index), self.config.rivals
+        """The best of the compared frames. The others are rivals if they are known to show another place."""
+        match, peak = int(compared[best]), peaks.one(best)
+        distance = float(np.linalg.norm(self.index.descriptors[match] - seen.descriptor))
         alignment = jax.device_get(refined(seen.image, self.images[match], peak, config=self.verification))
         shares = np.nan, np.nan
         if peak.correlation >= self.config.min_rival_correlation:
-            usable = ~np.array(self.empty, bool)
-            known = self.index.descriptors
-            exclude_s = self.config.exclude_s
+            usable, exclude_s = ~np.array(self.empty, bool), self.config.exclude_s
+            rules, known = self.config.rivals, self.index.descriptors
             rows = rivals(seen.descriptor, known, match, self.motion, usable, exclude_s=exclude_s, config=rules)
             found = self.search(spectra, [self.images[row] for row in rows], rules.of_query + rules.of_match)
-            match_from_query = transform(float(peak.x), float(peak.y), float(peak.yaw))
-            expected = [
-                expected_poses(self.motion, query, rows, np.eye(4), config=rules),
-                expected_poses(self.motion, match, rows, match_from_query, config=rules),
-            ]
-            apart = np.linalg.norm(known[rows] - seen.descriptor, axis=1)
-            shares = (
-                distance_share(distance, apart, expected, config=rules),
-                rival_share(found, float(peak.correlation), expected, config=rules),
-            )
+            by_motion = expected_poses(self.motion, len(self.index), rows, np.eye(4), config=rules)
+            shares = self._shares(seen, match, distance, peak, rows, found, [by_motion])
+            far = ~self.motion.about(match, rules.age[0] * exclude_s)[compared] & self.motion.same(match, compared)
+            elsewhere = self._shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
+            shares = np.fmax(shares, elsewhere)
         evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
-        return Candidate(query, match, alignment, evidence)
+        return Candidate(len(self.index), match, alignment, evidence)
+
+    def _shares(
+        self,
+        seen: Seen,
+        match: int,
+        distance: float,
+        peak: Peak,
+        rows: Int[np.ndarray, " k"],
+        found: Peak,
+        expected: Sequence[tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]],
+    ) -> tuple[float, float]:
+        """Distance and correlation of a match beside those of its rivals `rows`; see `rival_share` for the rest."""
+        rules, match_from_query = self.config.rivals, transform(float(peak.x), float(peak.y), float(peak.yaw))
+        expected = [*expected, expected_poses(self.motion, match, rows, match_from_query, config=rules)]
+        apart = np.linalg.norm(self.index.descriptors[rows] - seen.descriptor, axis=1)
+        return (
+            distance_share(distance, apart, expected, config=rules),
+            rival_share(found, float(peak.correlation), expected, config=rules),
+        )
 
     def search(
         self,

@@ -38,7 +38,7 @@ class DetectorConfig:
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     sequence: SequenceConfig = SequenceConfig()
-    motion_drift: DriftModel = DriftModel(metres_per_metre=0.02, degrees_per_metre=0.05)
+    motion_drift: DriftModel = DriftModel(metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5)
     """Drift of the motion that stands in for odometry (`loops.motion`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""
@@ -172,14 +172,14 @@ class LoopDetector:
         """The loops that the drift of the odometry or, without it, of the motion explains. The others are rejected."""
         if not loops:
             return []
-        motion, mounting, segments = self.finder.motion, self.finder.mounting, self.finder.motion.segments
+        motion, mounting, guessed_m = self.finder.motion, self.finder.mounting, None
         if self.finder.odometry:
             poses, drift, reason = np.stack(self.finder.odometry), self.config.drift, "contradicts the odometry"
         else:
             poses, drift, reason = motion.odometry(mounting), self.config.motion_drift, "contradicts the motion"
-        apart = deviations(loops, poses, drift=drift, mounting=mounting)
-        known = np.array([segments[loop.query] == segments[loop.match] for loop in loops])
-        fits = (apart <= drift.max_deviation) | ~known
+            guessed_m = np.array(motion.guessed_m)
+        apart = deviations(loops, poses, drift=drift, mounting=mounting, guessed_m=guessed_m)
+        fits = apart <= drift.max_deviation
         self._reject([loop for loop, fit in zip(loops, fits, strict=True) if not fit], reason)
         return [loop for loop, fit in zip(loops, fits, strict=True) if fit]
 

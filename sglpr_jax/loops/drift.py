@@ -57,6 +57,7 @@ def deviations(
     *,
     drift: DriftModel = DriftModel(),
     mounting: Mounting | None = None,
+    guessed_m: Float[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, " k"]:
     """Mahalanobis distance of each loop from the odometry between its frames.
 
@@ -70,6 +71,7 @@ def deviations(
       odometry: Pose of the LiDAR at each frame.
       drift: Drift model.
       mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
+      guessed_m: Distance up to each frame that drifts as the path does, but in no known direction (`Motion.guessed_m`).
     """
     flat = planar_odometry(odometry, mounting)
     poses, covariances = planar_loops(loops, mounting)
@@ -77,7 +79,7 @@ def deviations(
     by_loop = compose(flat[match], poses)
     error = by_loop - flat[query]
     error[:, 2] = wrapped(error[:, 2])
-    spread = _drifted(flat, match, query, drift) + _turned(covariances, by_loop[:, 2])
+    spread = _drifted(flat, match, query, drift, guessed_m) + _turned(covariances, by_loop[:, 2])
     spread += np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
     return np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
 
@@ -123,11 +125,14 @@ class _Path(NamedTuple):
     """Of the product of the position with itself."""
 
     @classmethod
-    def of(cls, positions: Float[np.ndarray, "n d"]) -> "_Path":
+    def of(cls, positions: Float[np.ndarray, "n d"], guessed_m: Float[np.ndarray, " n"] | None = None) -> "_Path":
         steps, middle = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2
         length = np.linalg.norm(steps, axis=1)
         square = steps[:, :, None] * steps[:, None]
         direction = square / np.maximum(length, 1e-12)[:, None, None]
+        if guessed_m is not None:
+            more = np.diff(guessed_m)
+            length, direction = length + more, direction + more[:, None, None] * np.eye(positions.shape[1])
         squares = length[:, None, None] * (middle[:, :, None] * middle[:, None] + square / 12)
         parts = (length, direction, length[:, None] * middle, squares)
         return cls(
@@ -135,13 +140,15 @@ class _Path(NamedTuple):
         )
 
 
-def _drifted(flat: Planar, start: np.ndarray, end: np.ndarray, drift: DriftModel) -> Float[np.ndarray, "k 3 3"]:
+def _drifted(
+    flat: Planar, start: np.ndarray, end: np.ndarray, drift: DriftModel, guessed_m: Float[np.ndarray, " n"] | None
+) -> Float[np.ndarray, "k 3 3"]:
     """Covariance of x, y, yaw of frame `end` by odometry from frame `start`.
 
     The rates of drift along the path are independent. Their integral has the variance of a constant rate.
     """
     positions = flat[:, :2] - flat[:, :2].mean(axis=0)
-    between = _Path(*(part[end] - part[start] for part in _Path.of(positions)))
+    between = _Path(*(part[end] - part[start] for part in _Path.of(positions, guessed_m)))
     last, length = positions[end], between.length[:, None, None]
     crossed = last[:, :, None] * between.first[:, None]
     levers = length * last[:, :, None] * last[:, None] - crossed - np.swapaxes(crossed, 1, 2) + between.squares

@@ -2,7 +2,8 @@
 
 Evidence of repetition needs to know which earlier scans the query may resemble because they show the same place. The
 motion is good enough for that over some tens of metres; it is not an odometry. Where the surroundings do not tell how
-the sensor moved, as in a tunnel, the motion is unknown: a new segment begins.
+the sensor moved, as in a tunnel, the motion is unknown: a new segment begins. Its pose is guessed at the last known
+velocity, and the guess drifts fast.
 """
 
 import dataclasses
@@ -35,6 +36,8 @@ class MotionConfig:
     keyframe_m: float = 3.0
     keyframe_deg: float = 20.0
     """A frame farther from the keyframe than this, in metres or degrees, is the next keyframe."""
+    guess_m_per_s: float = 300.0
+    """Where the motion is unknown, a second of the guessed path drifts as much as this distance in metres."""
     standing_s: float = 5.0
     """A keyframe accounts for at most this much time, in seconds: a vehicle that stands sees nothing new."""
 
@@ -45,16 +48,20 @@ class Motion:
     def __init__(self, config: MotionConfig = MotionConfig()):
         self.config = config
         self.poses: list[Float[np.ndarray, "4 4"]] = []
-        """Pose of each frame in the frame of its segment."""
+        """Pose of each frame in the frame of the first one; across segments a guess."""
         self.segments: list[int] = []
         """Frames of one segment have a known relative pose."""
         self.travelled: list[float] = []
         """Distance from keyframe to keyframe, in metres."""
+        self.guessed_m: list[float] = []
+        """Distance that drifts as much as all guesses so far, in metres."""
         self.clock: list[float] = []
         """Seconds, without those in which the sensor stood still."""
         self.keyframe = 0
         self._times: list[float] = []
         self._coasted = 0
+        self._m_per_s = 0.0
+        """Last known speed."""
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -72,18 +79,22 @@ class Motion:
             pose, coasts = self._expected(time), True
         self._coasted = self._coasted + 1 if coasts else 0
         if not self.poses:
-            self._append(time, pose, segment=0, travelled=0.0, clock=0.0)
+            self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, clock=0.0, guessed_m=0.0)
         elif pose is None:
-            clock = self.clock[-1] + time - self._times[-1]
-            self._append(time, pose, segment=self.segments[-1] + 1, travelled=self.travelled[-1], clock=clock)
+            self._guess(time)
         else:
             moved, rotation = self._moved(key, pose)
             clock = self.clock[key] + min(time - self._times[key], self.config.standing_s)
             travelled = self.travelled[key] + moved
-            self._append(time, pose, segment=self.segments[key], travelled=travelled, clock=clock)
+            guessed_m = self._drifted_m(time) if coasts else self.guessed_m[key]
+            self._append(time, pose, segment=self.segments[key], travelled=travelled, clock=clock, guessed_m=guessed_m)
             if moved <= self.config.keyframe_m and rotation <= np.radians(self.config.keyframe_deg) and not coasts:
                 return
         self.keyframe = len(self) - 1
+
+    def link(self, anywhere: Peak, expected: Peak) -> Peak:
+        """Of the best peak over the keyframe and the best one near the prior, the one to trust."""
+        return anywhere if self._is_trusted(anywhere, expected=False) else expected
 
     def prior(self, time: float) -> Float[np.ndarray, " 3"]:
         """The expected x, y and yaw over the keyframe at `time`, at constant velocity; NaN if that is not known."""
@@ -102,20 +113,55 @@ class Motion:
         last = inverse(self.poses[-2]) @ self.poses[-1]
         return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
 
+    def _guess(self, time: float) -> None:
+        """Add a frame whose motion is unknown."""
+        seconds = time - self._times[-1]
+        if len(self) > 1 and self.segments[-1] == self.segments[-2] and self._times[-1] > self._times[-2]:
+            step = inverse(self.poses[-2]) @ self.poses[-1]
+            self._m_per_s = float(step[0, 3]) / (self._times[-1] - self._times[-2])
+        self._append(
+            time,
+            self.poses[-1] @ transform(self._m_per_s * seconds, 0.0, 0.0),
+            segment=self.segments[-1] + 1,
+            travelled=self.travelled[-1],
+            clock=self.clock[-1] + seconds,
+            guessed_m=self._drifted_m(time),
+        )
+
+    def _drifted_m(self, time: float) -> float:
+        """The distance that drifts as much as all guesses up to `time`."""
+        return self.guessed_m[-1] + self.config.guess_m_per_s * (time - self._times[-1])
+
     def _append(
-        self, time: float, pose: Float[np.ndarray, "4 4"] | None, *, segment: int, travelled: float, clock: float
+        self,
+        time: float,
+        pose: Float[np.ndarray, "4 4"],
+        *,
+        segment: int,
+        travelled: float,
+        clock: float,
+        guessed_m: float,
     ) -> None:
         self._times.append(time)
-        self.poses.append(np.eye(4) if pose is None else pose)
+        self.guessed_m.append(guessed_m)
+        self.poses.append(pose)
         self.segments.append(segment)
         self.travelled.append(travelled)
         self.clock.append(clock)
 
     def from_frame(self, frame: int, rows: np.ndarray) -> tuple[Float[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
         """The poses of `frame` in the frames of `rows`, and which of them are known."""
-        known = np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
         poses = np.stack([self.poses[row] for row in rows]) if len(rows) else np.zeros((0, 4, 4))
-        return inverse(poses) @ self.poses[frame], known
+        return inverse(poses) @ self.poses[frame], self.same(frame, rows)
+
+    def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
+        """Which frames are less than a time of travel from one, before or after it."""
+        clock = np.array(self.clock)
+        return np.abs(clock - clock[frame]) < seconds
+
+    def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
+        """Which of some frames have a known pose relative to one."""
+        return np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
 
     def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:
         """The poses of the LiDAR, tilted as its mounting says."""

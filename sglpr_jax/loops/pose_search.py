@@ -76,7 +76,7 @@ class Peak(NamedTuple):
         """The k-th of several."""
         return Peak(*(values[k] for values in self))
 
-    def some(self, rows: slice) -> "Peak":
+    def some(self, rows: slice | np.ndarray) -> "Peak":
         """Some of several."""
         return Peak(*(values[rows] for values in self))
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import logit
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.loop import Loop
@@ -25,8 +26,10 @@ class SequenceConfig:
     """Number of frames before and after a loop that count."""
     support: int = 2
     """Minimum number of loops that show the same place, including the loop itself."""
-    independent_m: float = 5.0
+    independent_m: float = 8.0
     """Travelled distance at which two frames are about independent, in metres."""
+    least_probability: float = 0.2
+    """A neighbour counts by how much its log odds exceed those of this probability."""
     unknown_m: float = 1.0
     """Distance from one frame to the next if the motion is not known, in metres."""
     max_log_odds: float = 4.0
@@ -38,6 +41,9 @@ class SequenceConfig:
     agree_deg: float = 10.0
     """Two loops agree if their circle closes within this distance, plus this share of the travelled distance, and
     within this angle."""
+    guess_share: float = 0.02
+    guess_deg_per_m: float = 0.05
+    """What is added to both for each metre of `Motion.guessed_m`, in metres and degrees."""
 
 
 def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceConfig()) -> Bool[np.ndarray, "n n"]:
@@ -50,7 +56,7 @@ def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceCo
 def agree_in_motion(
     loops: Sequence[Loop], motion: Motion, mounting: Mounting | None, *, config: SequenceConfig = SequenceConfig()
 ) -> Bool[np.ndarray, "n n"]:
-    """Which pairs of loops agree by the motion of the sensor; where that is not known, by their frames alone."""
+    """Which pairs of loops agree by the motion of the sensor; where that is a guess, by their frames, too."""
     query, match = frames_of(loops)
     segment = np.array(motion.segments)
     known = segment[query][:, None] == segment[query][None]
@@ -59,11 +65,15 @@ def agree_in_motion(
     poses = planar(np.stack(motion.poses)[np.concatenate([query, match])])
     expected = _moved(fitted, poses[: len(loops)], poses[len(loops) :])
     apart = compose(inverted(expected), np.broadcast_to(fitted[None], expected.shape))
-    travelled = np.array(motion.travelled)
-    length = sum(np.abs(travelled[frames][:, None] - travelled[frames][None]) for frames in (query, match))
-    close = np.hypot(apart[..., 0], apart[..., 1]) <= config.agree_m + config.agree_share * length
-    close = close & (np.abs(wrapped(apart[..., 2])) <= np.radians(config.agree_deg))
-    return np.where(known, close, agree_in_order(loops, config=config))
+    length, guess = (
+        sum(np.abs(way[frames][:, None] - way[frames][None]) for frames in (query, match))
+        for way in (np.array(motion.travelled), np.array(motion.guessed_m))
+    )
+    metres = config.agree_m + config.agree_share * length + config.guess_share * guess
+    close = np.hypot(apart[..., 0], apart[..., 1]) <= metres
+    degrees = config.agree_deg + config.guess_deg_per_m * guess
+    close = close & (np.abs(wrapped(apart[..., 2])) <= np.radians(degrees))
+    return close & (known | agree_in_order(loops, config=config))
 
 
 def _moved(fitted: Planar, query: Planar, match: Planar) -> Planar:
@@ -91,7 +101,7 @@ def added_log_odds(
     """
     query, _ = frames_of(loops)
     gaps = _gaps(query, motion, config)
-    counted = np.clip(log_odds, 0, config.max_log_odds)
+    counted = np.clip(log_odds - logit(config.least_probability), 0, config.max_log_odds)
     fresh = 1 - np.exp(-gaps / config.independent_m)
     towards = np.sign(np.arange(len(loops))[:, None] - np.arange(len(loops))[None])  # of i, seen from j
     weight = np.where(towards > 0, fresh[None, 1:], np.where(towards < 0, fresh[None, :-1], 0.0))

@@ -49,6 +49,16 @@ def test_by_hand_straight_on():
     np.testing.assert_allclose(both[1] ** 2 - both[0] ** 2, 9 / 1.89, rtol=0.01)
 
 
+def test_a_guessed_path_drifts_in_every_direction():
+    odometry = along([(0, 0), (101, 0)])
+    guessed_m = np.where(np.arange(101) < 50, 0.0, 100.0)  # one step as uncertain as 100 m
+    beside = Loop(100, 0, odometry[100] @ transform(0.0, 3.0, 0.0), np.zeros((6, 6)), 1.0)
+    before, after = (deviations([beside], odometry, guessed_m=given) for given in (None, guessed_m))
+    assert after < 0.6 * before
+    (same,) = deviations([exact(odometry, 100, 60)], odometry, guessed_m=guessed_m)
+    assert same == 0
+
+
 def test_positions_drift_along_and_by_the_turns_before():
     positions = along([(0, 0), (101, 0)])[:, :3, 3]
     found = position_deviations(positions, 100)
