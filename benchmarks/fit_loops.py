@@ -4,11 +4,13 @@
     python benchmarks/fit_loops.py build/fit --weights sglpr rings
 
 Every drive is searched by the loop detector's finder, one candidate a scan. A pair is a loop if its scans are at most
-half as far apart as frames of other places (`other_m`, at most 10 m), and none beyond that. All drives count alike,
-so that the towns do not drown the tunnels. The drives of a few sceneries are left out, to judge the model by them.
+half as far apart as frames of other places (`other_m`, at most 10 m), and none beyond that. All sceneries count alike,
+so that the towns do not drown the tunnels, and so do drives without revisits, in the same and in the opposite
+direction. The drives of a few sceneries are left out, to judge the model by them.
 """
 
 import functools
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,8 +30,8 @@ from sglpr_jax.models.weights import weights_hash
 LEFT_OUT = ("garage", "highway", "rooms_equal", "vineyard", "warehouse", "gardens", "lanes")
 """Sceneries that have no part in the fit."""
 LOOP_M = 10.0
-PAIRS = 300.0
-"""Every drive counts as this number of pairs."""
+PAIRS = 600.0
+"""The drives of a scenery with one kind of revisits count as this number of pairs."""
 
 
 class Pairs(NamedTuple):
@@ -63,7 +65,13 @@ def main(
             found = list(pool.map(functools.partial(pairs, weights=name), files))
         evidence = Evidence(*np.concatenate([one.evidence for one in found]).T)
         is_loop = np.concatenate([one.is_loop for one in found])
-        shares = np.concatenate([np.full(len(one.is_loop), PAIRS / max(len(one.is_loop), 1)) for one in found])
+        kinds = [tuple(path.stem.split("-")[:2]) for path in files]
+        counts = Counter[tuple[str, ...]]()
+        for kind, one in zip(kinds, found, strict=True):
+            counts[kind] += len(one.is_loop)
+        shares = np.concatenate(
+            [np.full(len(one.is_loop), PAIRS / counts[kind]) for kind, one in zip(kinds, found, strict=True)]
+        )
         sceneries = ", ".join(dict.fromkeys(path.stem.split("-")[0] for path in files))
         about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(files)} simulated drives ({sceneries})"
         made_with = f"{about}; benchmarks/fit_loops.py --weights {name}"

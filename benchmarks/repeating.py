@@ -1,6 +1,6 @@
 """Find loops where places repeat: wrong loops, recall and reliability by scenery, without and with odometry.
 
-    python benchmarks/repeating_scans.py --seeds 11 12 --out build/test
+    python benchmarks/repeating_scans.py --seeds 13 14 --out build/test
     python benchmarks/repeating.py build/test
     python benchmarks/repeating.py build/test --odometry --sensors vlp16
 
@@ -43,6 +43,7 @@ def main(
     odometry: bool = False,
     sceneries: tuple[str, ...] = (),
     sensors: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (),
     weights: str = "sglpr",
     workers: int = 1,
 ) -> None:
@@ -53,12 +54,13 @@ def main(
         odometry: give the detector drifting odometry.
         sceneries: those to search; without them all.
         sensors: likewise.
+        seeds: likewise.
         weights: the model that described the scans.
         workers: number of processes.
     """
     found = drives / ("found-odometry.jsonl" if odometry else "found.jsonl")
     settings = _settings(weights)
-    files = [path for path in sorted(drives.glob("*.npz")) if _chosen(path, sceneries, sensors)]
+    files = [path for path in sorted(drives.glob("*.npz")) if _chosen(path, sceneries, sensors, seeds)]
     done = {row["drive"]: row for row in _rows(found) if row["settings"] == settings}
     left = [path for path in files if path.stem not in done]
     search = functools.partial(searched, odometry=odometry, weights=weights)
@@ -71,9 +73,11 @@ def main(
     report([done[path.stem] for path in files])
 
 
-def _chosen(path: Path, sceneries: Sequence[str], sensors: Sequence[str]) -> bool:
+def _chosen(path: Path, sceneries: Sequence[str], sensors: Sequence[str], seeds: Sequence[int]) -> bool:
     scenery, _, rest = path.stem.split("-", 2)
-    return (not sceneries or scenery in sceneries) and (not sensors or rest.rsplit("-", 1)[0] in sensors)
+    sensor, seed = rest.rsplit("-", 1)
+    wanted = ((scenery, sceneries), (sensor, sensors), (int(seed), seeds))
+    return all(not some or one in some for one, some in wanted)
 
 
 def _settings(weights: str) -> str:

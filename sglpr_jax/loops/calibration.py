@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
 from sglpr_jax.loops.drift import position_deviations
-from sglpr_jax.loops.pose_search import query_spectra
+from sglpr_jax.loops.pose_search import occupied, query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.rivals import distance_share, rival_share
 from sglpr_jax.loops.transforms import travelled
@@ -146,4 +146,6 @@ class _Places:
         fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))
         distance = float(np.linalg.norm(finder.index.descriptors[row].astype(np.float64) - query.descriptor))
         apart = np.linalg.norm(finder.index.descriptors[rows[1:]] - query.descriptor, axis=1)
-        return Evidence.of(distance, distance_share(distance, apart, []), fitted.correlation, fitted.second, share)
+        nearest = distance_share(distance, apart, [])
+        cells = min(occupied(image, finder.verification) for image in (query.image, self.images[row]))
+        return Evidence.of(distance, nearest, fitted.correlation, fitted.second, share, cells)

@@ -19,7 +19,7 @@ from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.loops.drift import DriftModel, position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion, MotionConfig
-from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, query_spectra, search_spectra
+from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, occupied, query_spectra, search_spectra
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import RivalConfig, distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.transforms import inverse, transform
@@ -226,7 +226,7 @@ class CandidateFinder:
         rows = self.nearest(descriptor, self.config.candidates, excluded)
         if not len(rows):
             return rows
-        excluded = excluded | self.motion.about(rows[0], self.config.rivals.age[0] * self.config.exclude_s)
+        excluded = excluded | self.motion.about(int(rows[0]), self.config.rivals.age[0] * self.config.exclude_s)
         return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
 
     def nearest(
@@ -254,7 +254,8 @@ class CandidateFinder:
             far = ~self.motion.about(match, rules.age[0] * exclude_s)[compared] & self.motion.same(match, compared)
             elsewhere = self._shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
             shares = np.fmax(shares, elsewhere)
-        evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
+        cells = min(occupied(image, self.verification) for image in (seen.image, self.images[match]))
+        evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
         return Candidate(len(self.index), match, alignment, evidence)
 
     def _shares(

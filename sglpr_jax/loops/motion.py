@@ -36,7 +36,7 @@ class MotionConfig:
     keyframe_m: float = 3.0
     keyframe_deg: float = 20.0
     """A frame farther from the keyframe than this, in metres or degrees, is the next keyframe."""
-    guess_m_per_s: float = 300.0
+    guess_m_per_s: float = 80.0
     """Where the motion is unknown, a second of the guessed path drifts as much as this distance in metres."""
     standing_s: float = 5.0
     """A keyframe accounts for at most this much time, in seconds: a vehicle that stands sees nothing new."""

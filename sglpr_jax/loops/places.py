@@ -19,7 +19,7 @@ from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Compare
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.pose_search import Peak, VerificationConfig, query_spectra, search_spectra
+from sglpr_jax.loops.pose_search import Peak, VerificationConfig, occupied, query_spectra, search_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.rivals import RivalConfig, distance_share, rival_share
 from sglpr_jax.loops.transforms import inverse, transform
@@ -148,7 +148,8 @@ class PlaceMap:
         for k, (row, distance) in enumerate(zip(rows.tolist(), distances.tolist(), strict=True)):
             alignment = jax.device_get(refined(image, self.images[row], peaks.one(k), config=settings))
             shares = self._rival_shares(descriptor, spectra, row, distance, peaks.one(k))
-            evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1])
+            cells = min(occupied(image, settings), occupied(self.images[row], settings))
+            evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
             mountings = {"query_mounting": mounting, "match_mounting": self.mounting(row)}
             probability = float(model.probability(evidence))
             loop = planar_loop(len(self), row, alignment, probability=probability, **mountings)

@@ -153,6 +153,13 @@ def prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) 
     return jnp.where(inside, jnp.sqrt(jnp.maximum(counts, 0)), 0)
 
 
+def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT) -> float:
+    """Number of occupied cells within reach."""
+    down, right = (np.arange(n) - (n - 1) / 2 for n in image.shape)
+    inside = np.hypot(down[:, None], right[None]) < config.reach_m / config.resolution_m
+    return float(np.count_nonzero(image * inside))
+
+
 def cells(metres: float, cell_m: float) -> int:
     """Number of cells that cover a length."""
     return int(np.ceil(metres / cell_m))
@@ -213,7 +220,8 @@ def _correlations(
     one: the cosine of an opposite shift is the same, and the sine changes its sign.
     """
     size, (_, turns, width) = len(match), queries.low[0].shape
-    cos_down, sin_down, cos_right, sin_right = _waves_to(cells(config.max_shift_m, cell_m), size)
+    waves = map(jnp.asarray, _waves_to(cells(config.max_shift_m, cell_m), size))
+    cos_down, sin_down, cos_right, sin_right = waves
     there = _halves(match[:, None])
     low, high = _products(there.low, queries.low), _products(there.high, queries.high)
     unpaired = ((1, len(low[0]) - len(high[0]) - 1), (0, 0), (0, 0))

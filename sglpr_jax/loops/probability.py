@@ -24,9 +24,10 @@ KNOTS: Mapping[str, tuple[float, ...]] = {
     "correlation": (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
     "second": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "rival": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    "cells": (100.0, 200.0, 400.0, 800.0, 1200.0, 1600.0),
 }
 """Where the functions may bend. Outside they are constant."""
-RISING = ("correlation",)
+RISING = ("correlation", "cells")
 """Numbers that speak for a loop where they are large; the others speak against it."""
 RIDGE = 0.02
 """Weight of the squared differences of the functions' values in the fit: keeps them finite, and smooth."""
@@ -45,11 +46,15 @@ class Evidence(NamedTuple):
     """Second peak of the correlation, as a share of the best."""
     rival: Float[np.ndarray, "*n"]
     """Correlation with the best rival, as a share of the match's; NaN if there are no rivals."""
+    cells: Float[np.ndarray, "*n"]
+    """Number of occupied cells of the emptier image: a few walls look like others more easily than a whole street."""
 
     @classmethod
-    def of(cls, distance: float, distance_share: float, correlation: Any, second: Any, rival: float) -> "Evidence":
+    def of(
+        cls, distance: float, distance_share: float, correlation: Any, second: Any, rival: float, cells: float
+    ) -> "Evidence":
         """Evidence of one pair."""
-        values = (distance, distance_share, correlation, second, rival)
+        values = (distance, distance_share, correlation, second, rival, cells)
         return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
@@ -59,7 +64,7 @@ class Evidence(NamedTuple):
 
 
 ALL = Evidence._fields
-OF_IMAGES = ("correlation", "second", "rival")
+OF_IMAGES = ("correlation", "second", "rival", "cells")
 """The numbers that mean the same whatever weights made the descriptors."""
 
 OF_REPETITION = ("distance_share", "second", "rival")

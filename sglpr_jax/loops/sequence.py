@@ -26,7 +26,7 @@ class SequenceConfig:
     """Number of frames before and after a loop that count."""
     support: int = 2
     """Minimum number of loops that show the same place, including the loop itself."""
-    independent_m: float = 8.0
+    independent_m: float = 15.0
     """Travelled distance at which two frames are about independent, in metres."""
     least_probability: float = 0.2
     """A neighbour counts by how much its log odds exceed those of this probability."""
@@ -41,8 +41,8 @@ class SequenceConfig:
     agree_deg: float = 10.0
     """Two loops agree if their circle closes within this distance, plus this share of the travelled distance, and
     within this angle."""
-    guess_share: float = 0.02
-    guess_deg_per_m: float = 0.05
+    guess_share: float = 0.075
+    guess_deg_per_m: float = 0.2
     """What is added to both for each metre of `Motion.guessed_m`, in metres and degrees."""
 
 

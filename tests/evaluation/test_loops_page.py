@@ -78,7 +78,7 @@ def known(found) -> FoundLoops:
     positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
     recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")
     pairs = [(5, 1, 6.0), (6, 2, 7.0), (7, 3, -6.0)]
-    candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, c, 0.0, 0.0)) for q, m, c in pairs)
+    candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, c, 0.0, 0.0, 1e3)) for q, m, c in pairs)
     return dataclasses.replace(found, recording=recording, candidates=candidates, model=model)
 
 

@@ -125,7 +125,7 @@ def test_candidates_with_true_positions_are_labelled():
 
 
 def _candidate(query: int, match: int):
-    return Candidate(query, match, None, Evidence(float(query), 0.0, 0.0, 0.0, 0.0))
+    return Candidate(query, match, None, Evidence(float(query), 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 def model_of(log_odds: float) -> LoopModel:
@@ -144,7 +144,7 @@ def streamed_pairs(params, matches: dict[int, int], model: LoopModel, **options)
         if query in matches:
             true = inverse(poses[matches[query]]) @ pose
             alignment = Alignment(*true[:2, 3], yaw_of(true), np.diag([0.1, 0.1, 0.01]), 0.8, 0.3)
-            pairs = [Candidate(query, matches[query], alignment, Evidence.of(1.0, 0.5, 0.8, 0.3, 0.3))]
+            pairs = [Candidate(query, matches[query], alignment, Evidence.of(1.0, 0.5, 0.8, 0.3, 0.3, 1e3))]
         detector.add_seen(seen, odometry=pose, compared=Compared(pairs, None))
     return detector
 
@@ -169,7 +169,7 @@ def test_pairs_that_other_places_fit_as_well_are_rejected_with_that_reason(param
     seen = Seen(np.zeros(detector.finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
     alignment = Alignment(*np.zeros(3), np.eye(3), 0.9, 0.3)
     for rival, reasons in ((1.0, ["repeats"]), (np.nan, ["repeats"] * 2), (0.5, ["repeats"] * 2)):
-        pair = Candidate(len(detector), 0, alignment, Evidence.of(0.1, 0.5, 0.9, 0.3, rival))
+        pair = Candidate(len(detector), 0, alignment, Evidence.of(0.1, 0.5, 0.9, 0.3, rival, 1e3))
         detector.add_seen(seen, compared=Compared([pair], None))
         assert [one.reason for one in detector.rejected] == reasons
 

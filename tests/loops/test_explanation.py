@@ -31,7 +31,7 @@ def found_in(frames: int, times: np.ndarray | None, **about) -> FoundLoops:
 def pairs(*correlations: float) -> tuple[Candidate, ...]:
     alignment = Alignment(*map(jnp.zeros, [(), (), (), (3, 3), (), ()]))
     return tuple(
-        Candidate(50 + k, k, alignment, Evidence.of(0.0, 0.0, c, 0.0, 0.0)) for k, c in enumerate(correlations)
+        Candidate(50 + k, k, alignment, Evidence.of(0.0, 0.0, c, 0.0, 0.0, 1e3)) for k, c in enumerate(correlations)
     )
 
 

@@ -53,7 +53,7 @@ def searched(
         if match < query:
             true = np.eye(4) if query in wrong else inverse(poses[match]) @ poses[query]
             alignment = Alignment(*true[:2, 3], yaw_of(true), np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
-            pairs = [Candidate(query, match, alignment, Evidence.of(1.0, 0.5, 0.8, 0.3, 0.3))]
+            pairs = [Candidate(query, match, alignment, Evidence.of(1.0, 0.5, 0.8, 0.3, 0.3, 1e3))]
         detector.add_seen(seen, odometry=pose, compared=Compared(pairs, None))
     return detector
 

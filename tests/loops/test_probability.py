@@ -28,10 +28,11 @@ def pairs(n: int = 600, *, seed: int = 0, noise: float = 1.0, shift: float = 0.0
     """Pairs of which a third are loops, with evidence that overlaps."""
     rng = np.random.default_rng(seed)
     is_loop = rng.random(n) < 1 / 3
-    draw = [rng.normal(scale=noise * s, size=n) for s in (0.2, 0.2, 0.15, 0.2, 0.15)]
+    draw = [rng.normal(scale=noise * s, size=n) for s in (0.2, 0.2, 0.15, 0.2, 0.15, 200.0)]
     distance, share = 1.2 - 0.5 * is_loop + draw[0], 1.0 - 0.4 * is_loop + draw[1]
     correlation, second = 0.2 + shift + 0.4 * is_loop + draw[2], 0.9 - 0.4 * is_loop + draw[3]
-    return Evidence(distance, share, correlation, second, 0.9 - 0.4 * is_loop + draw[4]), is_loop
+    rival, cells = 0.9 - 0.4 * is_loop + draw[4], 600 + 300 * is_loop + draw[5]
+    return Evidence(distance, share, correlation, second, rival, cells), is_loop
 
 
 @pytest.mark.parametrize("names", [ALL, OF_IMAGES])
@@ -64,9 +65,9 @@ def test_weights_are_as_good_as_pairs_that_stand_several_times():
     np.testing.assert_allclose(one.log_odds(evidence), other.log_odds(evidence), atol=0.02)
 
 
-@given(values=st.lists(st.floats(-1, 3), min_size=10, max_size=10), name=st.sampled_from(ALL))
+@given(values=st.lists(st.floats(-1, 3), min_size=12, max_size=12), name=st.sampled_from(ALL))
 def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
-    one, other = (Evidence(*np.array(half)) for half in (values[:5], values[5:]))
+    one, other = (Evidence(*np.array(half)) for half in (values[:6], values[6:]))
     better = other._replace(**{field: getattr(one, field) for field in ALL if field != name})
     stronger = (
         getattr(better, name) >= getattr(one, name) if name in RISING else getattr(better, name) <= getattr(one, name)
@@ -79,12 +80,12 @@ FITTED = fit(*pairs())
 
 
 def test_evidence_says_this_much_and_no_more():
-    best, beyond = Evidence(0.2, 0.3, 0.8, 0.3, 0.3), Evidence(-9.0, -9.0, 9.0, -9.0, -9.0)
+    best, beyond = Evidence(0.2, 0.3, 0.8, 0.3, 0.3, 1600.0), Evidence(-9.0, -9.0, 9.0, -9.0, -9.0, 9e9)
     assert FITTED.log_odds(best) == FITTED.log_odds(beyond)
 
 
 def test_no_rivals_count_as_the_worst():
-    missing, worst = (Evidence(0.5, rival, 0.7, 0.4, rival) for rival in (np.nan, 9.0))
+    missing, worst = (Evidence(0.5, rival, 0.7, 0.4, rival, 900.0) for rival in (np.nan, 9.0))
     assert FITTED.log_odds(missing) == FITTED.log_odds(worst) < FITTED.but_for_repetition(missing)
     evidence, is_loop = pairs()
     some = np.where(np.arange(len(is_loop)) % 5, evidence.rival, np.nan)
@@ -145,9 +146,9 @@ def test_the_shipped_models_say_how_they_were_made_and_tell_clear_pairs():
     shipped, others = default_model(weights_hash(sglpr_jax.load("sglpr"))), default_model("no such weights")
     assert set(shipped.curves) == set(ALL) and set(others.curves) == set(OF_IMAGES)
     loop, none, repeats = (
-        Evidence(0.3, 0.3, 0.9, 0.3, 0.25),
-        Evidence(1.2, 1.0, 0.2, 0.98, 1.2),
-        Evidence(0.01, 1.0, 0.99, 0.97, 1.0),
+        Evidence(0.3, 0.3, 0.9, 0.3, 0.25, 1000.0),
+        Evidence(1.2, 1.0, 0.2, 0.98, 1.2, 1000.0),
+        Evidence(0.01, 1.0, 0.99, 0.97, 1.0, 300.0),
     )
     for model in (shipped, others):
         assert "benchmarks/fit_loops.py" in model.made_with

@@ -43,23 +43,25 @@ def test_without_a_known_motion_the_frames_decide():
     np.testing.assert_array_equal(agree_in_motion(loops, motion, None), agree_in_order(loops))
 
 
-@pytest.mark.parametrize(("step_m", "least", "most"), [(0.0, 0.0, 1e-9), (1.0, 0.3, 0.4), (50.0, 1.99, 2.0)])
+@pytest.mark.parametrize(("step_m", "least", "most"), [(0.0, 0.0, 1e-9), (3.0, 0.18, 0.19), (150.0, 0.99, 1.0)])
 def test_a_neighbour_counts_as_much_as_the_sensor_moved(step_m, least, most):
     motion = moving([transform(step_m * frame, 0.0, 0.0) for frame in range(3)])
     log_odds = np.array([1.0, 2.0])
-    found = added_log_odds([loop(1, 0), loop(2, 0)], log_odds, np.ones((2, 2), bool), motion)
+    config = SequenceConfig(least_probability=0.5 + 0.5 * np.tanh(0.5))  # log odds of 1
+    found = added_log_odds([loop(1, 0), loop(2, 0)], log_odds, np.ones((2, 2), bool), motion, config=config)
     assert least <= found[0] - log_odds[0] <= most
 
 
 def test_neighbours_that_match_elsewhere_speak_against_a_loop_and_improbable_ones_do_not_count():
-    motion = moving([transform(100.0 * frame, 0.0, 0.0) for frame in range(60)])
+    motion = moving([transform(500.0 * frame, 0.0, 0.0) for frame in range(60)])
     loops = [loop(10, 0), loop(11, 5), loop(12, 0), loop(59, 0)]
     agreeing = np.array([[i == j or (i, j) in ((0, 2), (2, 0)) for j in range(4)] for i in range(4)])
-    found = added_log_odds(loops, np.array([3.0, 1.0, -2.0, 3.0]), agreeing, motion)
+    config = SequenceConfig(least_probability=0.5)
+    found = added_log_odds(loops, np.array([3.0, 1.0, -2.0, 3.0]), agreeing, motion, config=config)
     np.testing.assert_allclose(found, [3.0 - 1.0 + 0.0, 1.0 - 3.0 - 0.0, -2.0 + 3.0 - 1.0, 3.0], atol=1e-6)
 
 
 def test_one_frame_does_not_decide_for_another():
-    motion = moving([transform(100.0 * frame, 0.0, 0.0) for frame in range(3)])
+    motion = moving([transform(500.0 * frame, 0.0, 0.0) for frame in range(3)])
     found = added_log_odds([loop(1, 0), loop(2, 0)], np.array([0.0, 50.0]), np.ones((2, 2), bool), motion)
     assert found[0] == pytest.approx(SequenceConfig().max_log_odds)
