@@ -88,7 +88,7 @@ def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, fir
     np.testing.assert_array_equal(both.world_from_place[MAPPED // 2 :], shifted)
     found = both.relocate(params, drive.record(20), candidates=2)
     assert {one.place.split("/")[0] for one in found} == {"08", "sunday"}
-    assert min(one.probability for one in found) > 0.99
+    assert min(one.probability for one in found) > 0.98
 
     again = both.merged(places).merged(other)
     assert again.index.to_bytes() == both.index.to_bytes()
