@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
+import sglpr_jax
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.sim import write_dataset
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording
+from sglpr_jax.sim.repeating import simulate_repeating
 
 from .programs import SENSOR, printed
 
@@ -57,7 +60,7 @@ def test_models_of_loops_are_fitted_and_written(rendered, tmp_path):
     output = printed("fit_loops.py", str(rendered), "--weights", "sglpr", "--out", str(tmp_path / "models.json"))
     assert "sglpr: LoopModel" in output
     found = json.loads((tmp_path / "models.json").read_text())
-    assert len(found) == 2 and set(found[""]["curves"]) == {"correlation", "second", "rival"}
+    assert len(found) == 2 and set(found[""]["curves"]) == {"correlation", "second", "rival", "cells"}
     assert "2 simulated drives (town, walls)" in found[""]["made_with"]
 
 
@@ -99,6 +102,26 @@ def test_closures_of_maps_and_of_scans_are_scored_alike(monkeypatch, capsys):
     closures.print_table("a line", {"maps": maps, "scans": scans}, drive)
     table = capsys.readouterr().out
     assert "0.500" in table and "maps" in table
+
+
+def test_peers_are_counted_where_places_repeat(monkeypatch):
+    monkeypatch.delitem(sys.modules, "loops", raising=False)
+    peers = importlib.import_module("repeating_peers")
+    recording = simulate_repeating("walls", scans=16, sensor=SENSOR)
+    finder = peers.ScanContextFinder(sglpr_jax.load("sglpr"))
+    seen = [finder.seen(recording.record(i, labels=False)) for i in (0, 9, 1)]
+    assert seen[0].descriptor.shape == (1200,)
+    for one in seen:
+        finder.index.add(one.descriptor, times=None, positions=None)
+    assert finder.nearest(seen[0].descriptor, 2, np.array([True, False, False])).tolist() in ([1, 2], [2, 1])
+    detector = LoopDetector(finder.params)
+    detector.finder = peers.ScanContextFinder(finder.params)
+    found = peers.detected(detector, recording, 20.0)
+    assert (found.loops, found.wrong, found.revisits) == (0, 0, 0) and found.seconds > 0
+    closure = {"source": 0, "target": 1, "target_from_source": np.eye(4).tolist()}
+    peer = {"maps": [[0, 2], [14, 16]], "closures": [closure], "seconds": {"maps and closures": 1.6}}
+    assert peers.closed(peer, recording, 20.0) == peers.Counts(1, 1, 0, 0, 0.1)
+    assert peers.closed(peer, recording, 1e4).wrong == 0
 
 
 def test_drives_where_places_repeat_are_rendered_once(tmp_path):
