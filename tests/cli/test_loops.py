@@ -18,7 +18,7 @@ from .conftest import SCANS, assert_one_line_error
 
 FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "rejected.jsonl", "index.html"}
 TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
-TWICE = DetectorConfig(min_probability=0.01, drift=DriftModel(0.02, 0.01))
+TWICE = DetectorConfig(min_probability=1e-4, drift=DriftModel(0.02, 0.01))
 OPTIMIZED = {"trajectory-optimized.tum", "trajectory-optimized.kitti"}
 
 
@@ -33,7 +33,7 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
     write_kitti(tmp_path / "odometry.txt", odometry)
     out = tmp_path / "found"
     options = ("--odometry", tmp_path / "odometry.txt", "--odometry-format", "kitti", "--out", out, "--optimize")
-    drift = ("--drift-percent", "2", "--drift-deg-per-100m", "1", "--min-probability", "0.01")
+    drift = ("--drift-percent", "2", "--drift-deg-per-100m", "1", "--min-probability", "1e-4")
     ended = command("loops", town, "--seq", "08", *options, *drift)
     assert ended.status == 0, ended.error
     assert {path.name for path in out.iterdir()} == FILES | TRAJECTORIES | {
