@@ -54,11 +54,13 @@ class ScanContextFinder(CandidateFinder):
         self.index = Index.empty(NUMBERS, weights_hash=self.index.weights_hash)
 
     def seen(self, record: Record) -> Seen:
+        """The matrix of Scan Context in place of the descriptor."""
         return super().seen(record)._replace(descriptor=scan_context(np.asarray(record.points)[:, :3]))
 
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
+        """Up to k frames that are nearest over all rotations, in order."""
         allowed = np.flatnonzero(~excluded)
         apart = scan_context_distance(descriptor[None], self.index.descriptors[allowed])[0]
         return allowed[np.argsort(apart, kind="stable")[:k]]

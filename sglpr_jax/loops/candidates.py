@@ -41,7 +41,7 @@ class CandidateConfig:
     candidates: int = 3
     """Number of nearest descriptors whose images are compared. The best fit is the candidate."""
     elsewhere: int = 2
-    """Number of nearest descriptors away from these whose images are compared, too."""
+    """Number of frames at other times (`rivals.age`) with the nearest descriptors, whose images are compared, too."""
     exclude_s: float = EXCLUDED_S
     exclude_frames: int = EXCLUDED_FRAMES
     """Minimum age of a match in seconds, or in frames if there are no times."""

@@ -37,7 +37,7 @@ class MotionConfig:
     keyframe_deg: float = 20.0
     """A frame farther from the keyframe than this, in metres or degrees, is the next keyframe."""
     guess_m_per_s: float = 80.0
-    """Where the motion is unknown, a second of the guessed path drifts as much as this distance in metres."""
+    """One second of guessed motion drifts as much as this many metres of a measured path."""
     standing_s: float = 5.0
     """A keyframe accounts for at most this much time, in seconds: a vehicle that stands sees nothing new."""
 
@@ -54,14 +54,14 @@ class Motion:
         self.travelled: list[float] = []
         """Distance from keyframe to keyframe, in metres."""
         self.guessed_m: list[float] = []
-        """Distance that drifts as much as all guesses so far, in metres."""
+        """All guesses up to each frame drift as much as this many metres of a measured path."""
         self.clock: list[float] = []
         """Seconds, without those in which the sensor stood still."""
         self.keyframe = 0
         self._times: list[float] = []
         self._coasted = 0
         self._m_per_s = 0.0
-        """Last known speed."""
+        """Last known forward speed, in metres per second."""
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -129,7 +129,7 @@ class Motion:
         )
 
     def _drifted_m(self, time: float) -> float:
-        """The distance that drifts as much as all guesses up to `time`."""
+        """The next `guessed_m`, if the motion since the last frame is a guess."""
         return self.guessed_m[-1] + self.config.guess_m_per_s * (time - self._times[-1])
 
     def _append(
@@ -155,12 +155,12 @@ class Motion:
         return inverse(poses) @ self.poses[frame], self.same(frame, rows)
 
     def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
-        """Which frames are less than a time of travel from one, before or after it."""
+        """Which frames were taken less than `seconds` of travel before or after a frame."""
         clock = np.array(self.clock)
         return np.abs(clock - clock[frame]) < seconds
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
-        """Which of some frames have a known pose relative to one."""
+        """Which of `rows` have a known pose relative to `frame`."""
         return np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
 
     def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:

@@ -155,9 +155,14 @@ def prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) 
 
 def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT) -> float:
     """Number of occupied cells within reach."""
-    down, right = (np.arange(n) - (n - 1) / 2 for n in image.shape)
-    inside = np.hypot(down[:, None], right[None]) < config.reach_m / config.resolution_m
-    return float(np.count_nonzero(image * inside))
+    return float(np.count_nonzero(image[_within(image.shape, config.reach_m / config.resolution_m)]))
+
+
+@functools.cache
+def _within(shape: tuple[int, int], radius: float) -> Bool[np.ndarray, "h w"]:
+    """Which cells lie within a radius (cells) of the middle."""
+    down, right = (np.arange(n) - (n - 1) / 2 for n in shape)
+    return np.hypot(down[:, None], right[None]) < radius
 
 
 def cells(metres: float, cell_m: float) -> int:

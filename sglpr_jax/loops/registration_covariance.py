@@ -14,7 +14,7 @@ NEIGHBOURS = 20
 """Neighbours of a point from which its normal is estimated. With 10, normals on the rings of 16 beams are arbitrary,
 and GICP holds the rings of one scan on those of the other: roll and pitch were .3 degrees off."""
 POINTS = 4000
-"""At most so many points of the query are looked at."""
+"""Maximum number of points of the query that the covariance is computed from."""
 BLOCK_M = 8.0
 """Edge of the blocks of space whose errors are taken as independent."""
 SCALE, HEIGHT_SCALE = 1.15, 0.8

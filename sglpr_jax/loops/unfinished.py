@@ -28,7 +28,7 @@ from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import fingerprint
 
 KIND = "sglpr-jax unfinished loops"
-FORMAT = f"{KIND} 2"
+FORMAT = f"{KIND} 3"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
 OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
