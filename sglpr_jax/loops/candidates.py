@@ -16,10 +16,19 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
+from sglpr_jax.loops.background import Background
 from sglpr_jax.loops.drift import DriftModel, position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion, MotionConfig
-from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, VerificationConfig, occupied, query_spectra, search_spectra
+from sglpr_jax.loops.pose_search import (
+    NO_PEAKS,
+    Peak,
+    VerificationConfig,
+    occupied,
+    query_spectra,
+    search_spectra,
+    within_reach,
+)
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import RivalConfig, distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.transforms import inverse, transform
@@ -49,6 +58,11 @@ class CandidateConfig:
     """Minimum travelled distance between match and query, in metres, if the motion is known."""
     min_cells: int = 20
     """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
+    background_frames: int = 16
+    """Number of keyframes over which images are averaged. What they have in common is not compared
+    (`loops.background`)."""
+    min_background_frames: int = 4
+    """Minimum number of keyframes for that."""
     min_rival_correlation: float = 0.25
     """Candidates with a lower correlation are no loops whatever else fits, and have no rivals."""
     rivals: RivalConfig = RivalConfig()
@@ -102,12 +116,15 @@ class CandidateFinder:
         self.params, self.config, self.verification, self.drift = params, config, verification, drift
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
+        self.details: list[UInt8[np.ndarray, "m m"]] = []
+        """What is compared: the middle of each image, without the background."""
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
         self.mounting: Mounting | None = None
         """Of the sensor, one for all frames."""
         self.empty: list[bool] = []
         """Which frames show next to nothing."""
         self.motion = Motion(config.motion)
+        self.background = Background(frames=config.background_frames, least=config.min_background_frames)
         self.links: list[Peak | None] = []
         """Pose of each frame over its keyframe, if there is no odometry."""
         self.missing: list[int] = []
@@ -145,13 +162,18 @@ class CandidateFinder:
         position = None if pose is None else pose[:3, 3]
         clock = len(self.index) * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
         upright = None if pose is None else pose @ inverse(upright_from_lidar(self._mounting_of(seen)))
+        if seen is None:
+            self.missing.append(len(self.index))
+            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
+        middle = within_reach(seen.image, self.verification) if seen.image.size else seen.image
+        detail, keyframe = self.background.without(middle), self.motion.keyframe
         if compared is None:
-            compared = self._compared(seen, time, position, upright, clock)
+            compared = self._compared(seen._replace(image=detail), time, position, upright, clock)
         else:
             self.motion.add(clock, pose=upright, link=compared.link)
-        if seen is None:
-            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
-            self.missing.append(len(self.index))
+        if middle.size and (self.motion.keyframe != keyframe or not self.images):
+            self.background.add(middle)
+        self.details.append(detail)
         self.index.add(seen.descriptor, times=time, positions=position)
         self.images.append(seen.image)
         self.empty.append(self.is_empty(seen.image))
@@ -195,20 +217,20 @@ class CandidateFinder:
 
     def _compared(
         self,
-        seen: Seen | None,
+        seen: Seen,
         time: float | None,
         position: Float[np.ndarray, " 3"] | None,
         pose: Float[np.ndarray, "4 4"] | None,
         clock: float,
     ) -> Compared:
         """Compare the next frame with its nearest descriptors and the keyframe, and add it to the motion."""
-        if seen is None or self.is_empty(seen.image):
+        if self.is_empty(seen.image):
             self.motion.add(clock, pose=pose)
             return Compared([], None)
         rows = self._rows(seen.descriptor, self._excluded(time, position))
         key = self.motion.keyframe
-        linked = pose is None and len(self.images) > 0 and not self.empty[key]
-        matches = [self.images[row] for row in ([*rows, key, key] if linked else rows)]
+        linked = pose is None and len(self.details) > 0 and not self.empty[key]
+        matches = [self.details[row] for row in ([*rows, key, key] if linked else rows)]
         priors = np.full((len(matches), 3), np.nan)
         if linked:
             priors[-1] = self.motion.prior(clock)
@@ -242,19 +264,19 @@ class CandidateFinder:
         """The best of the compared frames. The others are rivals if they are known to show another place."""
         match, peak = int(compared[best]), peaks.one(best)
         distance = float(np.linalg.norm(self.index.descriptors[match] - seen.descriptor))
-        alignment = jax.device_get(refined(seen.image, self.images[match], peak, config=self.verification))
+        alignment = jax.device_get(refined(seen.image, self.details[match], peak, config=self.verification))
         shares = np.nan, np.nan
         if peak.correlation >= self.config.min_rival_correlation:
             usable, exclude_s = ~np.array(self.empty, bool), self.config.exclude_s
             rules, known = self.config.rivals, self.index.descriptors
             rows = rivals(seen.descriptor, known, match, self.motion, usable, exclude_s=exclude_s, config=rules)
-            found = self.search(spectra, [self.images[row] for row in rows], rules.of_query + rules.of_match)
+            found = self.search(spectra, [self.details[row] for row in rows], rules.of_query + rules.of_match)
             by_motion = expected_poses(self.motion, len(self.index), rows, np.eye(4), config=rules)
             shares = self._shares(seen, match, distance, peak, rows, found, [by_motion])
             far = ~self.motion.about(match, rules.age[0] * exclude_s)[compared] & self.motion.same(match, compared)
             elsewhere = self._shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
             shares = np.fmax(shares, elsewhere)
-        cells = min(occupied(image, self.verification) for image in (seen.image, self.images[match]))
+        cells = min(occupied(image, self.verification) for image in (seen.image, self.details[match]))
         evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
         return Candidate(len(self.index), match, alignment, evidence)
 

@@ -141,16 +141,22 @@ def search_spectra(
     return jax.lax.map(one, (jnp.asarray(matches), jnp.asarray(priors, jnp.float32)))
 
 
-def prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
-    """The square root of the counts within reach, zero around them; m is a multiple of two merged cells."""
+def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAULT) -> Num[AnyArray, "m m"]:
+    """The middle of an image that is compared; m is a multiple of two merged cells. Errors are those of `search`."""
     if image.shape[0] != image.shape[1] or image.shape[0] % 2:
         raise ValueError(f"expected a square image of an even number of cells, found {image.shape}")
     size = min(2 * cells(config.reach_m, config.resolution_m), image.shape[0])
     size = max(size - size % (2 * config.coarse), 2 * config.coarse)
+    return centre_crop(image, height=size, width=size)
+
+
+def prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
+    """The square root of the counts within reach, zero around them."""
+    middle = within_reach(image, config)
+    size = middle.shape[0]
     axis = (np.arange(size) - (size - 1) / 2) * config.resolution_m
     inside = np.hypot(axis[:, None], axis[None]) < min(config.reach_m, size / 2 * config.resolution_m)
-    counts = centre_crop(jnp.asarray(image, jnp.float32), height=size, width=size)
-    return jnp.where(inside, jnp.sqrt(jnp.maximum(counts, 0)), 0)
+    return jnp.where(inside, jnp.sqrt(jnp.maximum(jnp.asarray(middle, jnp.float32), 0)), 0)
 
 
 def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT) -> float:

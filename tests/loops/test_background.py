@@ -1,0 +1,50 @@
+"""What all images of a moving sensor have in common is not compared."""
+
+import numpy as np
+
+import sglpr_jax
+from sglpr_jax.loops.background import Background
+from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
+from sglpr_jax.models.params import Params
+
+CELLS, CELL_M, RINGS_M = 152, 0.4, (4.0, 6.0, 9.0, 13.0)
+RING_COUNT = 80
+
+
+def test_the_average_is_the_mean_and_then_forgets():
+    images = np.random.default_rng(0).integers(0, 256, (6, 4, 4)).astype(np.uint8)
+    background, roots = Background(frames=3, least=2), np.sqrt(images.astype(np.float64))
+    expected = roots[0]
+    for k, (image, root) in enumerate(zip(images, roots, strict=True)):
+        expected = expected + (root - expected) / min(k + 1, 3)
+        background.add(image)
+        found = background.without(images[0])
+        wanted = np.round(np.maximum(roots[0] - expected, 0) ** 2) if k else images[0]
+        np.testing.assert_allclose(found, wanted, atol=1)  # float32 roots round at a half
+        if k == 2:
+            np.testing.assert_allclose(expected, roots[:3].mean(axis=0))
+
+
+def test_rings_do_not_hold_the_motion():
+    params, posts = sglpr_jax.load("rings"), np.random.default_rng(0).uniform(-60, 60, (200, 2))
+    without, within = (_moved(params, posts, least) for least in (4, 10_000))
+    assert 24 < without < 31  # some at the start is lost, before there is an average
+    assert within < 1  # the reference: where rings are compared, the motion stands still
+
+
+def _moved(params: Params, posts: np.ndarray, least: int) -> float:
+    """How far the motion moved, in metres, over 29 m."""
+    finder = CandidateFinder(params, config=CandidateConfig(min_background_frames=least))
+    descriptor = np.zeros(finder.index.width, np.float32)
+    for k in range(30):
+        finder.add_seen(Seen(descriptor, _image(posts - (k, 0.0)), None), time=0.1 * k)
+    return float(np.linalg.norm(finder.motion.poses[-1][:3, 3]))
+
+
+def _image(posts: np.ndarray) -> np.ndarray:
+    """Posts about a sensor, and rings on the floor."""
+    axis = (np.arange(CELLS) - (CELLS - 1) / 2) * CELL_M
+    radius = np.hypot(axis[:, None], axis[None])
+    image = np.where((np.abs(radius[..., None] - RINGS_M) < 0.2).any(axis=-1), RING_COUNT, 0)
+    apart = np.hypot(axis[:, None, None] - posts[:, 0], axis[None, :, None] - posts[:, 1]).min(axis=-1)
+    return np.where(apart < 0.5, 160, image).astype(np.uint8)
