@@ -3,9 +3,10 @@
 Reproduces nothing of the paper; it answers the first open question of its conclusion, a descriptor that does not move
 when the scan is rotated. docs/decisions/models.md has the reasons, docs/results.md the measurements.
 
-Expect: on the KITTI BEV images, trained on 00 and 02 for 320 steps (docs/log/results.md has the flags) and tested on
-06: top-1 F1max .921, Recall@1 .952; rotated .919 and .981. That took five minutes on one CPU core; at this rate the
-1500 steps of the preset take less than half an hour.
+Expect: on the KITTI BEV images, trained on 00 and 02 for 320 steps and tested on 06: top-1 F1max .921, Recall@1 .952;
+rotated .919 and .981. The flags of that run were `--sampling.cluster 4 --sampling.positive-m 4 --steps 320
+--optimizer.decay-steps 75 --score-every 160`. It took five minutes on one CPU core; at this rate the 1500 steps of the
+preset take less than half an hour.
 
 Command: bin/train --seq 06 --data KITTI_BEV --preset rings
 """
