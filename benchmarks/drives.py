@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,8 @@ from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared, Seen
 from sglpr_jax.loops.unfinished import columns, compared_of
 from sglpr_jax.models.params import Params
+
+Odometry = Literal["none", "exact", "drifting"]
 
 
 class RenderedDrive(NamedTuple):
@@ -34,10 +36,12 @@ class RenderedDrive(NamedTuple):
     about: dict[str, str]
     """Scenery, revisit, sensor and seed."""
 
-    @property
-    def drifted(self) -> Float[np.ndarray, "n 4 4"]:
-        """Drifting odometry."""
-        return drifted(self.world_from_lidar, seed=int(self.about["seed"]))
+    def odometry(self, kind: Odometry) -> Float[np.ndarray, "n 4 4"] | None:
+        """The true poses, the same with drift (`loops.drifted`), or None."""
+        if kind == "none":
+            return None
+        poses = self.world_from_lidar
+        return poses if kind == "exact" else drifted(poses, seed=int(self.about["seed"]))
 
 
 def read(path: Path, params: Params | None = None) -> RenderedDrive:
@@ -55,15 +59,18 @@ def read(path: Path, params: Params | None = None) -> RenderedDrive:
     return RenderedDrive(path.stem, seen, poses, times, float(other_m), about)
 
 
-def compared(drive: RenderedDrive, finder: CandidateFinder, folder: Path, *, odometry: bool = False) -> list[Compared]:
+def compared(
+    drive: RenderedDrive, finder: CandidateFinder, folder: Path, *, odometry: Odometry = "none"
+) -> list[Compared]:
     """What a finder, an empty one, makes of each scan; read from the folder where it is kept."""
     path = folder / f"{drive.name}-{_settings(finder, odometry)}.npz"
     if path.exists():
         with np.load(path) as file:
             return compared_of(dict(file), range(len(drive.seen)))
-    poses = drive.drifted if odometry else [None] * len(drive.seen)
+    poses = drive.odometry(odometry)
     candidates: list[Any] = []
-    for seen, time, pose in zip(drive.seen, drive.times.tolist(), poses, strict=True):
+    for i, (seen, time) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
+        pose = None if poses is None else poses[i]
         candidates += finder.add_seen(seen, time=time, odometry=pose)
     kept = columns(candidates, finder.links)
     path.parent.mkdir(exist_ok=True, parents=True)
@@ -78,8 +85,8 @@ def distances(pairs: Sequence[tuple[int, int]], poses: Float[np.ndarray, "n 4 4"
     return np.linalg.norm(poses[frames[:, 0], :3, 3] - poses[frames[:, 1], :3, 3], axis=1)
 
 
-def _settings(finder: CandidateFinder, odometry: bool) -> str:
+def _settings(finder: CandidateFinder, odometry: Odometry) -> str:
     """A name for all that decides the comparisons."""
-    parts = [finder.config, finder.verification, *([finder.drift] if odometry else [])]
-    about = json.dumps([finder.index.weights_hash, *map(dataclasses.asdict, parts)])
+    parts = [finder.config, finder.verification, *([] if odometry == "none" else [finder.drift])]
+    about = json.dumps([finder.index.weights_hash, odometry, *map(dataclasses.asdict, parts)])
     return hashlib.sha256(about.encode()).hexdigest()[:16]

@@ -2,12 +2,13 @@
 
     python benchmarks/repeating_scans.py --seeds 13 14 --out build/test
     python benchmarks/repeating.py build/test
-    python benchmarks/repeating.py build/test --odometry --sensors vlp16
+    python benchmarks/repeating.py build/test --odometry drifting --sensors vlp16
+    python benchmarks/repeating.py build/test --odometry exact --sceneries rooms corridor car_park --optimized
 
 Reads the drives that `repeating_scans.py` has rendered. A loop is wrong if its scans are farther apart than the
 scenery's `other_m`: 20 m outdoors, 4 to 9 m indoors. Revisits are scans within half of that (at most 5 m) of one
-that is 30 s older. Odometry is that of the true poses with drift (`loops.drifted`). Results are kept beside the
-drives, in `found.jsonl` or `found-odometry.jsonl`; with the same model and settings, a drive is searched once.
+that is 30 s older. Odometry is the true poses, exact or with drift (`loops.drifted`). Results are kept beside the
+drives, in `found-ODOMETRY.jsonl`; with the same model and settings, a drive is searched once.
 """
 
 import dataclasses
@@ -22,16 +23,18 @@ from typing import Any
 
 import numpy as np
 import tyro
-from drives import compared, distances, read
+from drives import Odometry, compared, distances, read
 from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
+from sglpr_jax.loops import optimization
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import accepted
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.optimization import trajectory_error
 
 REVISIT_M, AGE_S = 5.0, 30.0
 SURE = 0.99
@@ -40,7 +43,8 @@ SURE = 0.99
 def main(
     drives: tyro.conf.Positional[Path],
     *,
-    odometry: bool = False,
+    odometry: Odometry = "none",
+    optimized: bool = False,
     sceneries: tuple[str, ...] = (),
     sensors: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (),
@@ -51,19 +55,21 @@ def main(
 
     Args:
         drives: folder of `repeating_scans.py`.
-        odometry: give the detector drifting odometry.
+        odometry: what the detector is given.
+        optimized: correct the odometry by the loops, and print how far that moved it and its error before and after
+            (extra gtsam).
         sceneries: those to search; without them all.
         sensors: likewise.
         seeds: likewise.
         weights: the model that described the scans.
         workers: number of processes.
     """
-    found = drives / ("found-odometry.jsonl" if odometry else "found.jsonl")
+    found = drives / f"found-{odometry}{'-optimized' * optimized}.jsonl"
     settings = _settings(weights)
     files = [path for path in sorted(drives.glob("*.npz")) if _chosen(path, sceneries, sensors, seeds)]
     done = {row["drive"]: row for row in _rows(found) if row["settings"] == settings}
     left = [path for path in files if path.stem not in done]
-    search = functools.partial(searched, odometry=odometry, weights=weights)
+    search = functools.partial(searched, odometry=odometry, optimized=optimized, weights=weights)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool, found.open("a") as lines:
         for number, row in enumerate(pool.map(search, left), 1):
             done[row["drive"]] = row | {"settings": settings}
@@ -92,11 +98,11 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
         yield from map(json.loads, path.read_text().splitlines())
 
 
-def searched(path: Path, *, odometry: bool, weights: str) -> dict[str, Any]:
+def searched(path: Path, *, odometry: Odometry, optimized: bool, weights: str) -> dict[str, Any]:
     """The loops of one drive, judged by the true poses."""
     params, drive = sglpr_jax.load(weights), read(path)
     poses, times, other_m = drive.world_from_lidar, drive.times, drive.other_m
-    given = drive.drifted if odometry else None
+    given = drive.odometry(odometry)
     detector = LoopDetector(params)
     frames = compared(drive, CandidateFinder(params), path.parent / "compared", odometry=odometry)
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
@@ -108,6 +114,7 @@ def searched(path: Path, *, odometry: bool, weights: str) -> dict[str, Any]:
     right = {loop.query for loop, metres in zip(loops, apart, strict=True) if metres <= other_m}
     pairs = distances([(one.query, one.match) for one in detector.candidates], poses)
     sure = np.array([float(detector.model.probability(one.evidence)) >= SURE for one in detector.candidates], bool)
+    moved = _moved(given, loops, poses) if optimized and given is not None else {}
     return {
         "drive": path.stem,
         **drive.about,
@@ -119,7 +126,17 @@ def searched(path: Path, *, odometry: bool, weights: str) -> dict[str, Any]:
         "found": int(sum(frame in right for frame in np.flatnonzero(revisited))),
         "sure_pairs": int((sure & ((pairs <= other_m / 2) | (pairs > other_m))).sum()),
         "sure_loops": int((sure & (pairs <= other_m / 2)).sum()),
+        **moved,
     }
+
+
+def _moved(
+    odometry: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], poses: Float[np.ndarray, "n 4 4"]
+) -> dict[str, float]:
+    """How far the optimisation moves the odometry at most, and its RMS error before and after, in metres."""
+    corrected = optimization.optimized(odometry, tuple(loops))
+    before, after = (trajectory_error(each, poses[:, :3, 3]) for each in (odometry, corrected.poses))
+    return {"moved_m": corrected.moved_m, "before_m": before, "after_m": after}
 
 
 def _surest(loops: Sequence[Loop], wrong: Bool[np.ndarray, " n"]) -> float:
@@ -149,6 +166,10 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
             counts = (total["scans"], total["loops"], total["wrong"], recall, total["sure_pairs"], total["sure_loops"])
             table.add_row(scenery, *map(str, counts))
         Console().print(table)
+    for row in rows:
+        if "moved_m" in row:
+            moved = "moved by {moved_m:.2f} m, error {before_m:.2f} m before, {after_m:.2f} m after".format(**row)
+            print(f"{row['drive']}: {row['loops']} loops, {moved}")
 
 
 if __name__ == "__main__":

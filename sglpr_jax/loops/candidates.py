@@ -40,7 +40,6 @@ from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
-from sglpr_jax.same_place import NEGATIVE_M
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,14 +157,14 @@ class CandidateFinder:
         `compared` has the comparisons of an earlier run, which are not repeated. Errors are those of `add`.
         """
         self._check(seen, time, odometry)
-        pose = None if odometry is None else np.asarray(odometry, np.float64)
-        position = None if pose is None else pose[:3, 3]
-        clock = len(self.index) * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
-        upright = None if pose is None else pose @ inverse(upright_from_lidar(self._mounting_of(seen)))
         if seen is None:
             self.missing.append(len(self.index))
             seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
-        middle = within_reach(seen.image, self.verification) if seen.image.size else seen.image
+        pose = None if odometry is None else np.asarray(odometry, np.float64)
+        position = None if pose is None else pose[:3, 3]
+        clock = len(self.index) * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
+        upright = None if pose is None else pose @ inverse(upright_from_lidar(seen.mounting))
+        middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
         detail, keyframe = self.background.without(middle), self.motion.keyframe
         if compared is None:
             compared = self._compared(seen._replace(image=detail), time, position, upright, clock)
@@ -173,9 +172,9 @@ class CandidateFinder:
             self.motion.add(clock, pose=upright, link=compared.link)
         if middle.size and (self.motion.keyframe != keyframe or not self.images):
             self.background.add(middle)
-        self.details.append(detail)
         self.index.add(seen.descriptor, times=time, positions=position)
         self.images.append(seen.image)
+        self.details.append(detail)
         self.empty.append(self.is_empty(seen.image))
         self.links.append(compared.link)
         self.mounting = seen.mounting
@@ -315,9 +314,6 @@ class CandidateFinder:
         found = jax.device_get(search_spectra(spectra, padded, expected.astype(np.float32), config=self.verification))
         return found.some(slice(len(matches)))
 
-    def _mounting_of(self, seen: Seen | None) -> Mounting | None:
-        return self.mounting if seen is None else seen.mounting
-
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self.index):
             return
@@ -343,19 +339,6 @@ class CandidateFinder:
             place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
             excluded = excluded | (apart > place_m + self.drift.max_deviation * drifted)
         return excluded
-
-
-def labelled(
-    candidates: Sequence[Candidate], positions: Float[np.ndarray, "n 3"], *, loop_m: float = 10.0
-) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
-    """The evidence of candidates whose true positions are known, and which of them are loops: up to `loop_m` apart.
-
-    Those between that and 20 m are left out.
-    """
-    apart = np.array([np.linalg.norm(positions[one.query] - positions[one.match]) for one in candidates])
-    clear = (apart <= loop_m) | (apart > NEGATIVE_M)
-    chosen = [one.evidence for one, kept in zip(candidates, clear, strict=True) if kept]
-    return Evidence.stack(chosen), apart[clear] <= loop_m
 
 
 def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:

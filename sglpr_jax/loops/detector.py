@@ -38,7 +38,9 @@ class DetectorConfig:
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     sequence: SequenceConfig = SequenceConfig()
-    motion_drift: DriftModel = DriftModel(metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5)
+    motion_drift: DriftModel = DriftModel(
+        metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5, max_deviation=3.0
+    )
     """Drift of the motion that stands in for odometry (`loops.motion`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""

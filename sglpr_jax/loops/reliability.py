@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.loops.candidates import Candidate, labelled
-from sglpr_jax.loops.probability import LoopModel
+from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.same_place import NEGATIVE_M
 
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
 """Narrow where loops are accepted and refused."""
@@ -53,3 +54,16 @@ def reliability_of(
         return ()
     evidence, is_loop = labelled(candidates, positions)
     return reliability(model.probability(evidence), is_loop)
+
+
+def labelled(
+    candidates: Sequence[Candidate], positions: Float[np.ndarray, "n 3"], *, loop_m: float = 10.0
+) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
+    """The evidence of candidates whose true positions are known, and whether each is a loop: up to `loop_m` apart.
+
+    Candidates between that and 20 m are left out.
+    """
+    apart = np.array([np.linalg.norm(positions[one.query] - positions[one.match]) for one in candidates])
+    clear = (apart <= loop_m) | (apart > NEGATIVE_M)
+    chosen = [one.evidence for one, kept in zip(candidates, clear, strict=True) if kept]
+    return Evidence.stack(chosen), apart[clear] <= loop_m

@@ -65,7 +65,7 @@ def test_models_of_loops_are_fitted_and_written(rendered, tmp_path):
 
 
 def test_loops_are_counted_by_scenery_and_drives_are_searched_once(rendered):
-    for options in ((), ("--odometry",)):
+    for options in ((), ("--odometry", "drifting")):
         output = printed("repeating.py", str(rendered), *options)
         assert "2/2 walls-same-vlp16-1" in output and "recall" in output
         again = printed("repeating.py", str(rendered), *options, "--sceneries", "walls")

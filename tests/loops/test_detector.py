@@ -13,7 +13,6 @@ from sglpr_jax.loops.candidates import (
     CandidateFinder,
     Compared,
     Seen,
-    labelled,
     square_image,
 )
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
@@ -114,18 +113,6 @@ def test_a_frame_near_which_the_sensor_stayed_is_no_candidate(drive, params, rev
         for step in (0.0, metres, metres):
             found = finder.add(Record(points=drive.points(revisit[0])), odometry=transform(step, 0.0, 0.0))
         assert len(found) == there
-
-
-def test_candidates_with_true_positions_are_labelled():
-    finder_gave = [_candidate(5, 0), _candidate(6, 1), _candidate(7, 2)]
-    positions = np.zeros((8, 3))
-    positions[5:, 0] = 3, 15, 40
-    evidence, is_loop = labelled(finder_gave, positions)
-    assert is_loop.tolist() == [True, False] and evidence.distance.tolist() == [5, 7]
-
-
-def _candidate(query: int, match: int):
-    return Candidate(query, match, None, Evidence(float(query), 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 def model_of(log_odds: float) -> LoopModel:
