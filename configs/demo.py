@@ -1,9 +1,9 @@
-"""What bin/demo trains: the shipped weights `sglpr`, a little longer, in minutes.
+"""Training of bin/demo: the shipped weights `sglpr` are trained on for some minutes.
 
-Reproduces nothing of the paper; it shows that everything works, on two simulated recordings with labels.
+Reproduces no result of the paper. It shows that everything works, on two simulated recordings with labels.
 
-Expect: 120 steps in a minute and a half on two CPU cores; on the simulated recording 00 a top-1 F1max of .99, and the
-same with every scan rotated (the weights as they ship: 1.00 and 1.00; untrained: .78 and .79).
+Expect: 120 steps take a minute and a half on two CPU cores. On the simulated recording 00, the top-1 F1max is .99, with
+and without rotation of every scan. The shipped weights have 1.00 and 1.00, untrained weights .78 and .79.
 
 Command: bin/demo
 """

@@ -1,8 +1,8 @@
 """The preset `paper` with a place head of a third of the cost: a 4 x 4 convolution of stride 4, then two of 3 x 3.
 
-Reproduces table 1, of whose place head the paper gives no sizes (docs/decisions/paper.md, place head).
+Reproduces table 1. The paper gives no sizes of the place head (docs/decisions/paper.md, place head).
 
-Expect: as for `paper`, not measured here; it wants a GPU.
+Expect: as for `paper`; not measured here. It requires a GPU.
 
 Command: bin/train --seq 08 --data KITTI --preset paper-head-b
 """

@@ -1,7 +1,7 @@
-"""From weights of the simulator to real images without labels: `rings`, trained on for some minutes.
+"""Adaptation of weights from the simulator to real images without labels: `rings`, trained on for some minutes.
 
-Reproduces nothing of the paper; it answers the second open question of its conclusion, semantics without labels: places
-are learnt on real images, and on simulated ones with label images places and semantics (docs/guides/training.md).
+Reproduces no result of the paper. It answers the second open question of its conclusion: semantics without labels. The
+model learns places on real images, and places and semantics on simulated images with labels (docs/guides/training.md).
 
 Expect: on the KITTI BEV images, trained on 00 and 02, whitened on them (`bin/export --whiten`) and tested on 06: top-1
 F1max .981, Recall@1 .993; rotated .985 and .993 (one seed). The 240 steps take four to five minutes on one CPU core.

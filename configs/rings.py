@@ -1,7 +1,7 @@
-"""Convolutions around the polar image in place of the Swin-Unet: more accurate than `small` after less computation.
+"""Circular convolutions on the polar image instead of the Swin-Unet: more accurate than `small` with less computation.
 
-Reproduces nothing of the paper; it answers the first open question of its conclusion, a descriptor that does not move
-when the scan is rotated. docs/decisions/models.md has the reasons, docs/results.md the measurements.
+Reproduces no result of the paper. It answers the first open question of its conclusion: a descriptor that does not
+change when the scan is rotated. docs/decisions/models.md has the reasons, docs/results.md the measurements.
 
 Expect: on the KITTI BEV images, trained on 00 and 02 for 320 steps and tested on 06: top-1 F1max .921, Recall@1 .952;
 rotated .919 and .981. The flags of that run were `--sampling.cluster 4 --sampling.positive-m 4 --steps 320

@@ -1,11 +1,12 @@
-"""From weights of the simulator to real images without labels: `sglpr`, trained on for some minutes.
+"""Adaptation of weights from the simulator to real images without labels: `sglpr`, trained on for some minutes.
 
-Reproduces nothing of the paper; it is `rings-adapt` with SG-LPR's network, half of the learning rate and half of the
-tuples simulated: places are learnt on real images, places and semantics on simulated ones (docs/guides/training.md).
+Reproduces no result of the paper. It is `rings-adapt` with SG-LPR's network, a lower learning rate, and half of the
+tuples simulated. The model learns places on real images, and places and semantics on simulated images
+(docs/guides/training.md).
 
 Expect: on the KITTI BEV images, trained on 00 and 02, whitened on them and tested on 06: top-1 F1max .994, pairs F1max
-.937, Recall@1 1.000; rotated .996, .922 and 1.000 (one seed; without it .991, .924 and 1.000). The 240 steps take three
-minutes of one CPU core, seven of a busy one.
+.937, Recall@1 1.000; rotated .996, .922 and 1.000 (one seed). Without this training: .991, .924 and 1.000. The 240
+steps take three minutes on one CPU core, or seven on a busy one.
 
 Command: bin/train --seq 06 --data KITTI_BEV --also SIMULATED --weights sglpr --preset sglpr-adapt
 """

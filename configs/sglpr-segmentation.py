@@ -1,10 +1,10 @@
-"""The semantic map of `sglpr`, learnt better after the places: all images segmented, descriptors as they were.
+"""Training of the semantic map of `sglpr` after the places: all images are segmented, and descriptors do not change.
 
-Reproduces nothing of the paper, which learns both at once; `sglpr` does so first. Whitening is kept, so that
-the weights at the end describe a place as those that the run began with (docs/guides/semantics.md).
+Reproduces no result of the paper, which learns both at once, as `sglpr` does first. Whitening is kept, so the final
+weights give the same descriptors as the initial ones (docs/guides/semantics.md).
 
-Expect: begun with the weights `sglpr` of before, mean IoU on a simulated recording of a town never seen rose from .247
-to .309, on 36 real labelled scans from .138 to .169 (sglpr_jax/weights/sglpr/README.md). One step takes 1.6 s of a CPU
+Expect: from the earlier weights `sglpr`, the mean IoU rose from .247 to .309 on a simulated recording of an unseen
+town, and from .138 to .169 on 36 real labelled scans (sglpr_jax/weights/sglpr/README.md). One step takes 1.6 s on a CPU
 core.
 
 Command: bin/train --seq 08 --data TOWNS --weights sglpr --preset sglpr-segmentation

@@ -1,10 +1,11 @@
-"""SG-LPR in a form that turns with the scan: the paper's windows, CBAM, convolutions and NetVLAD, and its joint loss.
+"""SG-LPR in a form that follows rotations: the paper's windows, CBAM, convolutions, NetVLAD and joint loss.
 
-Reproduces the network and the losses of the paper (figure 2, equations 5 to 8), not its sizes: the image is polar,
-convolutions that go around see its patches, and CBAM and the head's convolutions go around too
+Reproduces the network and the losses of the paper (figure 2, equations 5 to 8), but not its sizes. The image is polar,
+and circular convolutions make the tokens. CBAM and the convolutions of the head are circular, too
 (docs/decisions/models.md).
 
-Expect: on the KITTI BEV images, trained on simulated towns alone, the numbers of sglpr_jax/weights/sglpr/README.md.
+Expect: on the KITTI BEV images, after training on simulated towns only, the numbers of
+sglpr_jax/weights/sglpr/README.md.
 
 Command: bin/train --seq 08 --data TOWNS --preset sglpr
 """

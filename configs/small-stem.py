@@ -1,10 +1,10 @@
 """The preset `small` with convolutions in front: places and a better semantic map, for two CPU cores.
 
-Reproduces nothing of the paper. A step has few images, and all of them are segmented; docs/decisions/models.md has the
-reasons.
+Reproduces no result of the paper. A step has few images, and all of them are segmented. docs/decisions/models.md has
+the reasons.
 
-Expect: after 4278 of the 6000 steps (67 minutes on two CPU cores) a mean IoU above .22 on a simulated recording that
-was not trained on, where the commonest class everywhere has .02.
+Expect: after 4278 of the 6000 steps (67 minutes on two CPU cores), a mean IoU above .22 on a simulated recording that
+was not used in training. Predicting the most common class everywhere gives .02.
 
 Command: bin/train --seq 08 --data TOWNS --preset small-stem
 """
@@ -24,4 +24,4 @@ CONFIG = TrainConfig(
     max_points=131072,
     score_every=500,
 )
-"""With 1e-3 after 100 steps of warm-up the descriptors fell into one point."""
+"""With a learning rate of 1e-3 and 100 warm-up steps, the descriptors collapsed to one point."""

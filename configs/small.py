@@ -1,10 +1,10 @@
-"""The paper's network made small, for two CPU cores: place recognition within the hour.
+"""The paper's network in a small size, for two CPU cores: place recognition in less than an hour.
 
-Reproduces nothing of the paper. The image is polar, and other places of the batch are further negatives;
+Reproduces no result of the paper. The image is polar, and other places of the batch are additional negatives.
 docs/decisions/models.md has the reasons, docs/results.md the measurements.
 
 Expect: on the KITTI BEV images, trained on 00 and 02 and tested on 06: top-1 F1max .90, Recall@1 .99; rotated .94 and
-.99. The 3000 steps took 40 minutes on two CPU cores. The preset has changed a little since that run (docs/results.md).
+.99. The 3000 steps took 40 minutes on two CPU cores. The preset has changed slightly since that run (docs/results.md).
 
 Command: bin/train --seq 06 --data KITTI_BEV --preset small
 """

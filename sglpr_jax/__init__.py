@@ -1,20 +1,21 @@
-"""LiDAR place recognition in JAX: the public API, by what one wants to do.
+"""LiDAR place recognition in JAX: the public API, by task.
 
     params = sglpr_jax.load("sglpr")                    # weights by name, or by folder
     bev = sglpr_jax.scan_image(points, params.config)   # scan (n, 3), metres -> image (h, w)
     descriptor = sglpr_jax.describe(params, bev)        # image -> 256 numbers of unit length
 
-- describe a place: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`; under jit, vmap and grad
+- describe a place, under jit, vmap and grad: `load`, `scan_image`, `describe`, `is_describable`; `segment`, `forward`
 - read recordings: `open_recording`, `recording_names`, `read_scan`, `Recording`, `Record`; `Mounting`,
   `estimate_mounting`
-- find places again: `embed`, `DescriptorFile`, `nearest`, and as they come `Index` (of a fleet: `FleetIndex`); score
-  that: `evaluate`
-- close loops: `find_loops` of a recording, `LoopDetector` for a stream of scans; `read_odometry`,
-  `optimize_trajectory`; `PlaceMap` for scans of another day
-- train: `preset`, `train`; begin with `init`, keep with `save`, hand out with `for_places`, `average`, `save_program`
-- recordings without a dataset: `simulate`
+- find places again: `embed`, `DescriptorFile`, `nearest`; incrementally `Index`, for a fleet `FleetIndex`
+- score retrieval: `evaluate`
+- find loops: `find_loops` of a recording, `LoopDetector` for a stream of scans; `read_odometry`, `optimize_trajectory`;
+  `PlaceMap` for scans of another day
+- train: `preset`, `train`; initialise with `init`, store with `save`, publish with `for_places`, `average`,
+  `save_program`
+- simulate recordings with labels: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
-- what a model is: `ModelConfig`, its backbones `SwinConfig`, `RingConfig`, `SglprConfig`, its `HeadConfig`
+- configure a model: `ModelConfig`, its backbones `SwinConfig`, `RingConfig`, `SglprConfig`, its `HeadConfig`
 """
 
 import importlib
@@ -92,10 +93,11 @@ _HOMES = {
     "training.presets": ("preset",),
     "training.recipe": ("TrainResult", "train"),
 }
-"""Where each name is defined. It is imported when it is first asked for: JAX alone takes most of a second."""
+"""Module that defines each public name. It is imported on first access, because importing JAX takes most of a
+second."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _THERE = {"preset": "load_preset"}
-"""Names that are others at home."""
+"""Public names that differ from the name in their module."""
 
 
 def __getattr__(name: str) -> Any:

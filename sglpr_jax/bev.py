@@ -1,7 +1,8 @@
 """Bird's-eye-view images of point clouds (equation 1), and rotations about the vertical axis.
 
-Points are metres in the LiDAR frame: x forward, y left, z up. Images are `image[v, u]`: x grows with the column u, y
-against the row v. Functions on clouds take any leading batch axes; a padded cloud says how many of its points count.
+Points are in metres in the LiDAR frame: x forward, y left, z up. Images are `image[v, u]`: x increases with the column
+u, and y decreases with the row v. Functions on point clouds accept any leading batch axes. For padded clouds, `count`
+is the number of valid points.
 """
 
 import functools
@@ -17,8 +18,8 @@ from sglpr_jax.grid import Grid
 
 
 def _cell_of_point(points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array, "*b"] | None) -> Int[Array, "*b n"]:
-    """The flat cell of every point; one past the last cell for a point that is outside, not finite or padding."""
-    # A multiplication, because XLA compiles a division by a constant to one; tiny values would flush to zero there.
+    """Flat cell index of every point. Points outside, not finite or padding have the index after the last cell."""
+    # Multiply, because XLA compiles a division by a constant to a multiplication, where tiny values become zero.
     scale = np.float32(1.0 / grid.resolution_m)
     planar = jnp.where(jnp.abs(points[..., :2]) < 1e-30, 0.0, points[..., :2])
     x, y = jnp.moveaxis(jnp.floor(planar * scale), -1, 0)
@@ -32,8 +33,8 @@ def _cell_of_point(points: Float[Array, "*b n 3"], grid: Grid, count: Int[Array,
 
 
 def _scatter(cells: Int[Array, "*b n"], values: Int[Array, "*b n"], grid: Grid, *, operation: str, start: int):
-    """One image per cloud, each cell the sum or maximum of the values that fall into it."""
-    cells_per_image = grid.height * grid.width + 1  # the last one collects what is outside
+    """One image for each cloud. Each cell is the sum or the maximum of its values."""
+    cells_per_image = grid.height * grid.width + 1  # the last cell collects values outside
     batch, n = cells.shape[:-1], cells.shape[-1]
     clouds = int(np.prod(batch))
     offsets = cells_per_image * jnp.arange(clouds, dtype=jnp.int32)[:, None]
@@ -47,10 +48,14 @@ def _scatter(cells: Int[Array, "*b n"], values: Int[Array, "*b n"], grid: Grid, 
 def rasterize(
     points: Float[Array, "*b n 3"], *, grid: Grid, count: Int[Array, "*b"] | None = None
 ) -> Int[Array, "*b {grid.height} {grid.width}"]:
-    """The image B^I of equation 1: how many points fall into each cell, as int32.
+    """Count the points in each cell, as int32: the image B^I of equation 1.
 
-    Points outside the window or not finite are dropped (`count_outside` counts them). `count` is the number of valid
-    points at the front of each padded cloud; without it all are.
+    Points outside the window or not finite are dropped; `count_outside` counts them.
+
+    Arguments:
+      points: Point clouds in metres.
+      grid: Cells of the image.
+      count: Number of valid points at the front of each padded cloud. By default all points are valid.
     """
     cells = _cell_of_point(points, grid, count)
     return _scatter(cells, jnp.ones_like(cells), grid, operation="add", start=0)
@@ -64,10 +69,10 @@ def rasterize_labels(
     grid: Grid,
     count: Int[Array, "*b"] | None = None,
 ) -> Int[Array, "*b {grid.height} {grid.width}"]:
-    """The map B^S of equation 1: the label of the last point that falls into each cell, 0 where none does."""
+    """Return the label of the last point in each cell, or 0 for empty cells: the map B^S of equation 1."""
     cells = _cell_of_point(points, grid, count)
     order = jnp.broadcast_to(jnp.arange(points.shape[-2], dtype=jnp.int32), cells.shape)
-    # The order of duplicate writes is undefined, that of a maximum is not.
+    # Duplicate writes have an undefined order; a maximum is well defined.
     last = _scatter(cells, order, grid, operation="max", start=-1)
     found = jnp.take_along_axis(labels.astype(jnp.int32), last.reshape(*last.shape[:-2], -1).clip(0), axis=-1)
     return jnp.where(last >= 0, found.reshape(last.shape), 0)
@@ -77,7 +82,7 @@ def rasterize_labels(
 def count_outside(
     points: Float[Array, "*b n 3"], *, grid: Grid, count: Int[Array, "*b"] | None = None
 ) -> Int[Array, "*b"]:
-    """How many valid points of each cloud `rasterize` drops, because they are outside the window or not finite."""
+    """Count the valid points of each cloud that `rasterize` drops: those outside the window or not finite."""
     total = points.shape[-2] if count is None else count
     return total - rasterize(points, grid=grid, count=count).sum((-2, -1), dtype=jnp.int32)
 
@@ -92,18 +97,18 @@ def rotate_points(points: Float[Array, "*b n 3"], angle: Float[Array, "*b"]) -> 
 
 @jax.jit
 def rotate_image(image: Float[Array, "*b h w"], angle: Float[Array, "*b"]) -> Float[Array, "*b h w"]:
-    """Rotate images about their centre as `rotate_points` rotates the points: bilinear, zero from beyond the border."""
+    """Rotate images about their centre as `rotate_points` rotates points: bilinear, with zeros beyond the border."""
     return _rotated(image, angle, order=1)
 
 
 @jax.jit
 def rotate_labels(labels: Int[Array, "*b h w"], angle: Float[Array, "*b"]) -> Int[Array, "*b h w"]:
-    """Rotate maps of classes as `rotate_image` rotates their images: each cell takes the class nearest to it."""
+    """Rotate class maps as `rotate_image` rotates images: each cell takes the class of the nearest cell."""
     return _rotated(labels, angle, order=0)
 
 
 def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order: int) -> Shaped[Array, "*b h w"]:
-    """Images rotated about their centre; `order` 0 takes the nearest cell, 1 interpolates."""
+    """Images rotated about their centre. Order 0 takes the nearest cell, order 1 interpolates."""
     *batch, height, width = image.shape
     down, right = np.mgrid[:height, :width].astype(np.float32)
     down, right = down - (height - 1) / 2, right - (width - 1) / 2
@@ -119,12 +124,14 @@ def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order
 
 
 def even_cells(image: Num[Array | np.ndarray, "*b h w"]) -> Num[Array | np.ndarray, "*b h+h%2 w+w%2"]:
-    """A ready-made density image on the cells of eq. 1: its middle row and column become two of half the count.
+    """Convert a ready-made density image to the cells of equation 1, by halving its middle row and column.
 
-    There they are as wide as two others, for the recipe truncates coordinates. Left as they are, they are a bright
-    cross that points where the vehicle does, and the sensor is not at the middle of an even crop. Labels (integers)
-    are not halved. Images of an even number of cells stay as they are. A numpy image stays one: an operation of JAX on
-    each image of a recording would wait for the network that describes the last batch.
+    The recipe of these images truncates coordinates, so the middle row and column are as wide as two others. They
+    become two rows and columns with half of the count each. Without this, they form a bright cross in the direction of
+    the vehicle, and the sensor is not at the centre of an even crop.
+
+    Labels (integers) are not halved. Images with an even number of cells are unchanged. A numpy image stays a numpy
+    image: a JAX operation on each image of a recording would wait for the network that describes the previous batch.
     """
     of_arrays: Any = np if isinstance(image, np.ndarray) else jnp
     counts = jnp.issubdtype(image.dtype, jnp.floating)
@@ -140,17 +147,27 @@ def even_cells(image: Num[Array | np.ndarray, "*b h w"]) -> Num[Array | np.ndarr
 def centre_crop(
     image: Shaped[Array | np.ndarray, "*b h w"], *, height: int, width: int
 ) -> Shaped[Array | np.ndarray, "*b {height} {width}"]:
-    """The middle `height` x `width` cells of larger images; the odd cell of an uneven margin is cut at the far side."""
+    """Return the middle `height` x `width` cells of larger images.
+
+    If a margin is uneven, the additional cell is cut at the far side.
+
+    Raises:
+      ValueError: If the image is smaller than the crop.
+    """
     if image.shape[-2] < height or image.shape[-1] < width:
-        raise ValueError(f"a crop of {height} x {width} cells needs a larger image, found {image.shape[-2:]}")
+        raise ValueError(f"a crop of {height} x {width} cells requires a larger image, found {image.shape[-2:]}")
     down, right = _margin(image.shape[-2], height), _margin(image.shape[-1], width)
     return image[..., down[0] : down[0] + height, right[0] : right[0] + width]
 
 
 def uncropped(crop: Int[np.ndarray, "h w"], *, shape: tuple[int, ...]) -> Int[np.ndarray, "..."]:
-    """The labels of an image of this shape, 0 around the `crop` that was cut from its `even_cells`.
+    """Return the labels of a whole image, with 0 around a crop of its `even_cells`.
 
-    Where the two halves of a middle cell differ the first one counts, unless it is 0.
+    If the two halves of a middle cell differ, the first half counts, unless it is 0.
+
+    Arguments:
+      crop: Labels of the crop.
+      shape: Rows and columns of the whole image.
     """
     whole = np.pad(crop, [_margin(size + size % 2, part) for size, part in zip(shape, crop.shape, strict=True)])
     for axis, size in enumerate(shape):
@@ -161,6 +178,6 @@ def uncropped(crop: Int[np.ndarray, "h w"], *, shape: tuple[int, ...]) -> Int[np
 
 
 def _margin(whole: int, part: int) -> tuple[int, int]:
-    """How many cells lie before and behind a crop."""
+    """Number of cells before and after a crop."""
     before = (whole - part) // 2
     return before, whole - part - before

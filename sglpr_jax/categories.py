@@ -1,10 +1,10 @@
-"""SemanticKITTI's raw label ids, and figure 9's ways to sort them into categories (docs/reference/labels.md)."""
+"""Raw label ids of SemanticKITTI, and their categories in the settings of figure 9 (docs/reference/labels.md)."""
 
 from collections.abc import Iterable
 from typing import Literal
 
 Categories = Literal[0, 6, 15, 20, 25, 34]
-"""The settings of figure 9 by their number; 0 means no semantics at all."""
+"""Number of categories of each setting of figure 9. 0: no semantics."""
 
 RAW_NAMES = {
     0: "unlabeled",
@@ -42,7 +42,7 @@ RAW_NAMES = {
     258: "moving-truck",
     259: "moving-other-vehicle",
 }
-"""The 34 raw ids. 252 to 259 are the moving twins of things that also stand still."""
+"""Names of the 34 raw ids. Ids 252 to 259 are the moving variants of other ids."""
 
 _NOTHING = (0, 1)
 _MOVING = range(252, 260)
@@ -52,12 +52,12 @@ _SCENE = tuple(raw for raw in _STILL if raw not in _MOVABLE)
 
 
 def _named(raw_ids: Iterable[int]) -> dict[str, tuple[int, ...]]:
-    """A class of its own for each of these ids."""
+    """A separate class for each of these ids."""
     return {RAW_NAMES[raw]: (raw,) for raw in raw_ids}
 
 
 RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
-    # Six groups of SemanticKITTI's paper: what has similar attributes.
+    # The six groups of similar attributes in SemanticKITTI's paper.
     6: {
         "unlabeled": _NOTHING,
         "ground": (40, 44, 48, 49, 60),
@@ -67,9 +67,9 @@ RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
         "human": (30, 31, 32, 253, 254, 255),
         "object": (80, 81, 99),
     },
-    # All that can move, whether it does or not, is as if not annotated.
+    # Everything that can move is unlabelled, whether it moves or not.
     15: {"unlabeled": (*_NOTHING, *_MOVABLE), **_named(_SCENE)},
-    # RINet's, which is the dataset's own `learning_map`: a thing that moves is what it is when it stands.
+    # The classes of RINet, which are the dataset's own `learning_map`. Moving and standing objects share a class.
     20: {
         "unlabeled": (0, 1, 52, 99),
         "car": (10, 252),
@@ -92,8 +92,8 @@ RAW_IDS: dict[int, dict[str, tuple[int, ...]]] = {
         "pole": (80,),
         "traffic-sign": (81,),
     },
-    # All that moves is one thing.
+    # All moving objects are one class.
     25: {"unlabeled": _NOTHING, **_named(_STILL), "moving": tuple(_MOVING)},
     34: _named(RAW_NAMES),
 }
-"""Of each setting its classes, in order, with the raw ids that become them; the first of these lends it its colour."""
+"""Classes of each setting, in order, with their raw ids. The first raw id gives a class its colour."""

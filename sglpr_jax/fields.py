@@ -1,7 +1,7 @@
-"""What the fields of a configuration may hold: their annotations say it, and every road in is checked by them.
+"""Checks of configurations: the annotation of a field defines the values that it accepts.
 
 A configuration is a frozen dataclass whose `__post_init__` calls `check_fields`. Types, choices (`Literal`), tuples and
-`None` mean what they always do; a number is finite, no bool is a number, and `Bounds` may narrow it down.
+`None` have their usual meaning. A number must be finite and must not be a bool, and `Bounds` may restrict its range.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 
 class Bounds(NamedTuple):
-    """Which numbers a field may hold."""
+    """Range of numbers that a field accepts."""
 
     least: float = -math.inf
     most: float = math.inf
@@ -29,11 +29,11 @@ class Bounds(NamedTuple):
 
 
 Size = Annotated[int, Bounds(1, 2**20)]
-"""A number of cells, channels or tokens; far more than fit any memory are a slip."""
+"""Number of cells, channels or tokens. The upper bound, beyond any memory, catches typing errors."""
 SizeOrNone = Annotated[int, Bounds(0, 2**20)]
 Sizes = tuple[Size, ...]
 Depths = tuple[Annotated[int, Bounds(1, 64)], ...]
-"""Blocks of each stage."""
+"""Number of blocks of each stage."""
 Count = Annotated[int, Bounds(1, 2**53)]
 CountOrNone = Annotated[int, Bounds(0, 2**53)]
 Positive = Annotated[float, Bounds(above=0)]
@@ -43,19 +43,19 @@ Degrees = Annotated[float, Bounds(0, 360)]
 
 
 def check_fields(config: Any) -> None:
-    """Raise ValueError, with the field, what was expected and what was found, where a field cannot hold its value."""
+    """Raise ValueError if a field has an invalid value. The message has the field, the expected and the found value."""
     for name, annotation in field_types(type(config)).items():
         check_value(getattr(config, name), annotation, f"{type(config).__name__}.{name}")
 
 
 @functools.cache
 def field_types(config: type) -> dict[str, Any]:
-    """The annotation of every field of a dataclass, by its name."""
+    """Return the annotation of every field of a dataclass, by name."""
     return typing.get_type_hints(config, include_extras=True)
 
 
 def is_config(annotation: Any) -> bool:
-    """Whether a field with this annotation holds a configuration of its own."""
+    """Whether a field with this annotation holds a nested configuration."""
     return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
 
 
@@ -65,7 +65,7 @@ def has_bounds(annotation: Any) -> bool:
 
 
 def check_value(value: Any, annotation: Any, field: str) -> None:
-    """Raise ValueError, which begins with `field`, unless a field with this annotation may hold the value."""
+    """Raise ValueError, whose message begins with `field`, if a field with this annotation rejects the value."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         check_value(value, parts[0], field)
@@ -79,7 +79,7 @@ def check_value(value: Any, annotation: Any, field: str) -> None:
         _check_tuple(value, parts, field)
     elif annotation is float:
         require(value, isinstance(value, int | float) and type(value) is not bool, "a value of type float", field)
-        require(value, abs(value) <= sys.float_info.max, "a finite number", field)  # no whole number is too long for it
+        require(value, abs(value) <= sys.float_info.max, "a finite number", field)  # works for integers of any size
     elif is_config(annotation):
         require(value, isinstance(value, annotation), f"the fields of a {annotation.__name__}", field)
     else:
@@ -88,7 +88,7 @@ def check_value(value: Any, annotation: Any, field: str) -> None:
 
 
 def require(value: Any, fits: bool, expected: str, field: str) -> None:
-    """Raise ValueError, which begins with `field`, with what was expected and the value found, unless it `fits`."""
+    """Raise ValueError with the field, the expected and the found value, unless `fits` is True."""
     if not fits:
         found = repr(value)
         shown = found if len(found) <= 60 else f"{found[:57]}..."
@@ -96,7 +96,7 @@ def require(value: Any, fits: bool, expected: str, field: str) -> None:
 
 
 def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
-    """One member must hold it. The first says what was expected, or all, where they are configurations."""
+    """Checks that a member accepts the value. The message names the first member, or all configurations."""
     if value is None and types.NoneType in members:
         return
     configs = [member for member in members if is_config(member)]

@@ -1,4 +1,4 @@
-"""The plane of a bird's-eye-view image: of which cells, and what they count."""
+"""Plane of a bird's-eye-view image: its cells, and what they count."""
 
 import dataclasses
 from typing import Literal
@@ -6,12 +6,12 @@ from typing import Literal
 from sglpr_jax.fields import Positive, Size, check_fields
 
 ImageKind = Literal["points", "density"]
-"""What the cells of a scan's image count: its points (equation 1), or voxels, as in the ready-made images of KITTI."""
+"""Content of a cell: the number of points (equation 1), or of voxels as in the ready-made images of KITTI."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The image plane of equation 1: cells of `resolution_m` metres, the sensor at the corner of the middle four."""
+    """Image plane of equation 1: cells of `resolution_m` metres, with the sensor at the corner of the middle four."""
 
     resolution_m: Positive = 0.2
     height: Size = 224

@@ -1,4 +1,4 @@
-"""Arrays of labels: from raw ids to the classes of figure 9's settings and back, and the classes' colours."""
+"""Conversion of label arrays between raw ids and the classes of figure 9's settings, and the colours of the classes."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ from jaxtyping import Int, Int32, UInt8
 from sglpr_jax.categories import RAW_IDS, RAW_NAMES
 
 UNLABELLED = 0
-"""The class that stands for no label, whatever the categories; it is left out of scores."""
+"""Class of unlabelled points in every setting. Scores exclude it."""
 
-# Red, green and blue of each raw id: SemanticKITTI's own, but for outlier, on-rails and all that moves, which it draws
-# in the colours of others.
+# Red, green and blue of each raw id, as in SemanticKITTI. Only outlier, on-rails and moving objects have other colours,
+# because SemanticKITTI draws them in the colours of other ids.
 _COLORS = {
     0: (0, 0, 0),
     1: (110, 110, 110),
@@ -44,7 +44,7 @@ _STANDING_TWIN = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18,
 
 
 def _color(raw: int) -> tuple[int, ...]:
-    """What moves is its standing twin half-way to white."""
+    """Colour of a raw id. A moving object has the colour of its standing variant, mixed half with white."""
     if raw in _COLORS:
         return _COLORS[raw]
     return tuple((channel + 255) // 2 for channel in _COLORS[_STANDING_TWIN[raw]])
@@ -52,15 +52,15 @@ def _color(raw: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Taxonomy:
-    """One way to sort raw ids into classes 0 to k - 1. Class 0 is `UNLABELLED`."""
+    """Assignment of raw ids to classes 0 to k - 1. Class 0 is `UNLABELLED`."""
 
     names: tuple[str, ...]
     colors: UInt8[np.ndarray, "k 3"]
     """Red, green and blue of each class in pictures."""
     class_of: Int32[np.ndarray, " 260"]
-    """The class of each raw id; -1 for ids that do not exist."""
+    """Class of each raw id, or -1 for ids that do not exist."""
     raw_of: Int32[np.ndarray, " k"]
-    """The raw id that stands for each class: the first of those that become it."""
+    """Raw id that represents each class: the first id of the class."""
 
 
 def _label_map(raw_ids: dict[str, tuple[int, ...]]) -> Taxonomy:
@@ -76,18 +76,22 @@ _LABEL_MAPS = {categories: _label_map(raw_ids) for categories, raw_ids in RAW_ID
 
 
 def taxonomy(categories: int = 20) -> Taxonomy:
-    """The classes of one setting of figure 9. Raises ValueError with the settings there are."""
+    """Return the classes of one setting of figure 9.
+
+    Raises:
+      ValueError: If there is no setting with this number of categories. The message lists the settings.
+    """
     if categories not in _LABEL_MAPS:
-        raise ValueError(f"no label image of {categories!r} categories; there are {', '.join(map(str, _LABEL_MAPS))}")
+        raise ValueError(f"categories: expected one of {', '.join(map(str, _LABEL_MAPS))}, found {categories!r}")
     return _LABEL_MAPS[categories]
 
 
 CATEGORIES = taxonomy(20).names
-"""The names of the 20 classes of SG-LPR and RINet, by class id."""
+"""Names of the 20 classes of SG-LPR and RINet, by class id."""
 
 
 def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
-    """Return the class of each raw SemanticKITTI id. Raises ValueError naming ids that do not exist."""
+    """Return the class of each raw SemanticKITTI id. Raises ValueError with the ids that do not exist."""
     class_of = taxonomy(categories).class_of
     classes = np.where((raw >= 0) & (raw < len(class_of)), class_of[np.clip(raw, 0, len(class_of) - 1)], -1)
     if np.any(classes < 0):
@@ -96,5 +100,5 @@ def to_classes(raw: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32
 
 
 def to_raw(classes: Int[np.ndarray, "*shape"], *, categories: int = 20) -> Int32[np.ndarray, "*shape"]:
-    """Return a raw SemanticKITTI id of each class; `to_classes` with the same categories gives the classes back."""
+    """Return a raw SemanticKITTI id of each class. `to_classes` with the same categories is the inverse."""
     return taxonomy(categories).raw_of[classes]

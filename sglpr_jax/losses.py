@@ -1,4 +1,4 @@
-"""The training losses, equations 5 to 8. Sums that span a batch are kept apart, so that a batch can come in chunks."""
+"""Training losses, equations 5 to 8. Sums over a batch are separate functions, so that a batch can come in chunks."""
 
 import functools
 import operator
@@ -16,7 +16,7 @@ DICE_EPSILON = 1e-5
 def descriptor_distance(
     a: Float[Array, "*b d"], b: Float[Array, "*b d"], *, squared: bool = False
 ) -> Float[Array, "*b"]:
-    """Euclidean distance between descriptors, or its square; the gradient at distance zero is zero, not NaN."""
+    """Euclidean distance between descriptors, or its square. The gradient at distance zero is zero, not NaN."""
     square = jnp.square(a - b).sum(-1)
     if squared:
         return square
@@ -34,13 +34,20 @@ def lazy_triplet(
     temperature: float = 0.0,
     where: Bool[Array, "*t n"] | None = None,
 ) -> Float[Array, "*t"]:
-    """Equation 5 for each tuple, from the distances of its anchor to its k_p positives and k_n negatives.
+    """Lazy triplet loss (equation 5) of each tuple.
 
-    `where` masks negatives; a tuple left with none costs nothing. `reduction="sum"` is the triplet loss that is not
-    lazy: every negative inside the margin counts. `closest_positive=False` takes the farthest positive.
+    With a temperature of 0, the maximum pulls untrained descriptors into one point, where its gradient vanishes. The
+    smooth maximum of a positive temperature does not.
 
-    A `temperature` T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)), which tends to it as T
-    goes to 0. The maximum alone pulls untrained descriptors into one point, where its gradient vanishes; this does not.
+    Arguments:
+      positive: Distances of each anchor to its k_p positives.
+      negative: Distances of each anchor to its k_n negatives.
+      margin: Margin between the distances of positives and negatives.
+      closest_positive: Whether to use the closest positive. Otherwise the farthest is used.
+      reduction: "max" for the lazy loss. "sum" for the triplet loss, in which every negative inside the margin counts.
+      temperature: T > 0 replaces max_i [x_i]_+ by the smooth T log(1 + sum_i exp(x_i / T)), which tends to it as T goes
+        to 0.
+      where: Mask of the negatives. A tuple without negatives has loss 0.
     """
     pull = positive.min(-1) if closest_positive else positive.max(-1)
     violation = margin + pull[..., None] - negative
@@ -59,11 +66,11 @@ def one_threshold(
     where: Bool[Array, "t n"],
     **options: Any,
 ) -> Float[Array, "t"]:
-    """The lazy triplet loss where the negatives of every anchor are those of all: for a threshold that all share.
+    """Lazy triplet loss in which every anchor has the negatives of all anchors, for a common threshold.
 
-    Equation 5 compares the distances of one anchor. A loop is accepted below one distance for all places, so that the
-    distance to a positive here must be below that of any two places that are apart. Options are those of
-    `lazy_triplet`.
+    Equation 5 compares the distances of one anchor. Loops, however, are accepted below one distance for all places.
+    Therefore the distance to a positive must here be below the distance of any two different places. The options are
+    those of `lazy_triplet`.
     """
     everyone = functools.partial(jnp.broadcast_to, shape=(len(positive), negative.size))
     return lazy_triplet(positive, everyone(negative.reshape(1, -1)), where=everyone(where.reshape(1, -1)), **options)
@@ -76,10 +83,14 @@ def cross_entropy(
     where: Bool[Array, "*b h w"] | None = None,
     balance: float = 0.0,
 ) -> Float[Array, "*b"]:
-    """Equation 6: cross-entropy of each image, averaged over its pixels (those of `where`; zero if there are none).
+    """Cross-entropy of each image (equation 6), averaged over its pixels.
 
-    With `balance` a, a pixel of a class that n pixels of the image have weighs n^-a: 0 is the plain average, with 1 all
-    classes weigh the same.
+    Arguments:
+      logits: Logits of the classes.
+      labels: Class of each pixel.
+      where: Mask of the pixels that count. Without pixels the loss is zero.
+      balance: Exponent a of the class balance. A pixel has the weight n^-a, where n pixels of the image have its class.
+        0 is the plain average; with 1 all classes have the same weight.
     """
     each = optax.softmax_cross_entropy_with_integer_labels(logits, labels)
     weight = jnp.ones_like(each) if where is None else where.astype(each.dtype)
@@ -93,7 +104,7 @@ def cross_entropy(
 def dice_sums(
     logits: Float[Array, "b h w k"], labels: Int[Array, "b h w"], where: Bool[Array, "b h w"] | None = None
 ) -> Float[Array, "3 k"]:
-    """What equation 7 sums over the pixels (of `where`), per class: p t, p^2 and t^2. Sums of chunks add up."""
+    """Sums of equation 7 over the pixels (of `where`), per class: p t, p^2 and t^2. Sums of chunks can be added."""
     probability = jax.nn.softmax(logits)
     truth = jax.nn.one_hot(labels, logits.shape[-1], dtype=logits.dtype)
     if where is not None:
@@ -115,10 +126,10 @@ def dice(
     where: Bool[Array, "b h w"] | None = None,
     weights: Float[Array, "k"] | None = None,
 ) -> Float[Array, ""]:
-    """Equation 7 over a whole batch, or over its pixels of `where`."""
+    """Equation 7 over a whole batch, or over its pixels in `where`."""
     return dice_from_sums(dice_sums(logits, labels, where), weights=weights)
 
 
 def joint(terms: Mapping[str, Float[Array, ""]], weights: Mapping[str, float]) -> Float[Array, ""]:
-    """Equation 8: the sum of the terms, each times its weight (triplet 1, cross-entropy 0.4, Dice 0.6 in the paper)."""
+    """Equation 8: the weighted sum of the terms (triplet 1, cross-entropy 0.4, Dice 0.6 in the paper)."""
     return functools.reduce(operator.add, (weights[name] * term for name, term in terms.items()))

@@ -1,4 +1,4 @@
-"""Precision, recall and F1max from scores and decisions (eq. 9)."""
+"""Precision, recall and F1max from scores and decisions (equation 9)."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecallCurve:
-    """Precision and recall at every distinct score, taken as threshold: accepted is what scores no less than it."""
+    """Precision and recall at every threshold. A threshold accepts the scores that are not below it."""
 
     thresholds: np.ndarray
-    """(k,) float64, rising."""
+    """(k,) float64, increasing. By default the distinct scores."""
     precision: np.ndarray
     """(k,) float64."""
     recall: np.ndarray
@@ -19,22 +19,22 @@ class PrecisionRecallCurve:
 
     @property
     def f1(self) -> Float[np.ndarray, " k"]:
-        """The harmonic mean of precision and recall; 0 where both are 0."""
+        """Harmonic mean of precision and recall, or 0 where both are 0."""
         return _ratio(2 * self.precision * self.recall, self.precision + self.recall)
 
     @property
     def average_precision(self) -> float:
-        """The area under the curve as steps: each precision times how much recall it adds."""
+        """Area under the curve as steps: the sum of each precision times the recall that it adds."""
         return float(np.sum(self.precision * -np.diff(self.recall, append=0.0)))
 
     @property
     def best(self) -> int:
-        """Where F1 is highest; of equal ones the highest threshold."""
+        """Index of the highest F1. If several are equal, the one with the highest threshold."""
         return len(self.thresholds) - 1 - int(np.argmax(self.f1[::-1]))
 
     @property
     def f1_max(self) -> float:
-        """The highest F1 over all thresholds."""
+        """Highest F1 over all thresholds."""
         return float(self.f1[self.best])
 
 
@@ -46,16 +46,25 @@ def decision_curve(
     missed_if_rejected: Bool[np.ndarray, " n"],
     thresholds: Float[np.ndarray, " k"] | None = None,
 ) -> PrecisionRecallCurve:
-    """Return the curve of n >= 1 decisions to accept or reject; equal scores are accepted together.
+    """Return the curve of n >= 1 decisions to accept or reject. Equal scores are accepted together.
 
-    An accepted item is a true positive, a false positive or, flagged as neither, counts for nothing; a rejected one is
-    a false negative or a true negative. A score of -inf is rejected at every threshold. Where no item could be missed,
-    recall is 1, as scikit-learn has it; elsewhere 0 / 0 is 0. `thresholds`, rising and distinct, replace the distinct
-    scores. Raises ValueError where another score is not finite, or none is.
+    An accepted item is a true positive or a false positive. An item flagged as neither has no effect. A rejected item
+    is a false negative or a true negative. A score of -inf is rejected at every threshold. If no item can be missed,
+    recall is 1, as in scikit-learn; otherwise 0 / 0 is 0.
+
+    Arguments:
+      scores: Score of each item.
+      true_if_accepted: Whether accepting the item is a true positive.
+      false_if_accepted: Whether accepting the item is a false positive.
+      missed_if_rejected: Whether rejecting the item is a false negative.
+      thresholds: Increasing thresholds that replace the distinct scores.
+
+    Raises:
+      ValueError: If a score is NaN or +inf, or if no score is finite.
     """
     finite = np.isfinite(scores)
     if not finite.any() or not np.all(finite | np.isneginf(scores)):
-        raise ValueError(f"expected finite scores, found {np.sum(~finite)} of {len(scores)} that are not")
+        raise ValueError(f"expected finite scores, found {np.sum(~finite)} of {len(scores)} that are not finite")
     thresholds = np.unique(scores[finite]) if thresholds is None else thresholds
     accepted_up_to = np.searchsorted(thresholds, scores, side="right")
 
@@ -76,7 +85,7 @@ def classification_curve(
     *,
     thresholds: Float[np.ndarray, " k"] | None = None,
 ) -> PrecisionRecallCurve:
-    """Return the curve of n >= 1 items that are positive or negative: accepting one is right just if it is positive."""
+    """Return the curve of n >= 1 items that are positive or negative. Only positive items are correct to accept."""
     return decision_curve(
         scores,
         true_if_accepted=positive,
@@ -87,5 +96,5 @@ def classification_curve(
 
 
 def _ratio(part: Float[np.ndarray, " k"], whole: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Return part / whole, 0 where whole is 0."""
+    """part / whole, or 0 where whole is 0."""
     return np.divide(part, whole, out=np.zeros_like(part), where=whole > 0)

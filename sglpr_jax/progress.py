@@ -1,14 +1,14 @@
-"""How long work shows how far it is: a function that is handed in, so that a library call stays quiet by itself."""
+"""Interface for progress displays. Callers pass a function, so library calls print nothing by default."""
 
 import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 
 Progress = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
-"""From a title and how much there is to do to a context that gives a function, which is told how much is done."""
+"""Function of a title and a total amount. It returns a context manager, whose value is called with the amount done."""
 
 
 @contextlib.contextmanager
 def no_progress(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show nothing."""
+    """Show no progress."""
     yield lambda done: None

@@ -1,4 +1,4 @@
-"""Revisits: which frames have a place of their own past, or of a database, near them."""
+"""Revisits: frames with a nearby frame in their own past or in a database."""
 
 from collections.abc import Callable
 
@@ -10,19 +10,19 @@ from sglpr_jax.poses import distances
 from sglpr_jax.same_place import POSITIVE_M
 
 EXCLUDED_S = 30.0
-"""A query is never matched with frames younger than this: they are neighbours, not a revisit."""
+"""Minimum age of a match, in seconds. Later frames are neighbours of the query, not revisits."""
 EXCLUDED_FRAMES = 290
-"""What stands for EXCLUDED_S where a sequence has no times: 30 s at KITTI's 9.6 scans a second."""
+"""Replaces EXCLUDED_S for sequences without times: 30 s at KITTI's 9.6 scans per second."""
 
 BLOCK = 32
-"""Queries whose positions are compared at a time: so few that the distances stay in the cache."""
+"""Number of queries whose positions are compared at a time, so that the distances fit in the cache."""
 
 Near = Callable[[Float[np.ndarray, "..."]], Bool[np.ndarray, "..."]]
-"""From distances in metres to whether they are those of one place, such as `lambda apart: apart < 5`."""
+"""Function from distances in metres to whether they are within one place, such as `lambda apart: apart < 5`."""
 
 
 def close_pairs(positions: Float[np.ndarray, "n d"], *, closer_than_m: float) -> Int[np.ndarray, "pairs 2"]:
-    """Return every pair of frames less than so many metres apart, each once and in no order."""
+    """Return every pair of frames less than `closer_than_m` metres apart, each once and in no order."""
     return KDTree(positions).query_pairs(np.nextafter(closer_than_m, 0), output_type="ndarray")
 
 
@@ -33,13 +33,21 @@ def database_end(
     excluded_s: float = EXCLUDED_S,
     excluded_frames: int = EXCLUDED_FRAMES,
 ) -> Int[np.ndarray, " n"]:
-    """Return for each of `n` frames as a query how many of the first frames are its database; 0: it is no query.
+    """Return for each of `n` frames the length of its database: the number of first frames that it is compared with.
 
-    The rule is LoGG3D-Net's. A frame in the first `excluded_s` seconds is no query. The database of any other query at
-    time t is frames `[:k + 1]`, k being the first frame with a time > t - `excluded_s`; so one frame in it is a little
-    younger than `excluded_s`. Without `times` (seconds) the frame number is the clock and `excluded_frames` the limit.
+    0 means that the frame is not a query. The rule is LoGG3D-Net's. A frame in the first `excluded_s` seconds is not a
+    query. The database of any other query at time t is frames `[:k + 1]`, where k is the first frame with a time > t -
+    `excluded_s`. So one frame of the database is a little younger than `excluded_s`.
 
-    Raises ValueError where times are not finite or run backwards.
+    Arguments:
+      n: Number of frames.
+      times: Time of each frame, in seconds. Without times, the frame number is the clock and `excluded_frames` the
+        limit.
+      excluded_s: Minimum age in seconds.
+      excluded_frames: Minimum age in frames.
+
+    Raises:
+      ValueError: If times are not finite or decrease.
     """
     clock, excluded = (np.arange(n, dtype=np.float64), excluded_frames) if times is None else (times, excluded_s)
     if not np.all(np.isfinite(clock)) or np.any(np.diff(clock) < 0):
@@ -53,7 +61,7 @@ def database_end(
 def has_near(
     queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], ends: Int[np.ndarray, " q"], near: Near
 ) -> Bool[np.ndarray, " q"]:
-    """Return whether each query is a revisit: it has a near position among the first `ends` of the database."""
+    """Return whether each query is a revisit: near one of the first `ends` positions of the database."""
     found = np.zeros(len(queries), dtype=bool)
     for start in range(0, len(queries), BLOCK):
         rows = slice(start, start + BLOCK)
@@ -73,7 +81,7 @@ def revisits(
 ) -> Bool[np.ndarray, " n"]:
     """Return for each frame whether its database (see `database_end`) holds a frame within `radius_m` metres.
 
-    `positions` with three columns give the revisits in 3-D, their first two columns alone those in 2-D.
+    `positions` with three columns give the revisits in 3-D. Their first two columns give those in 2-D.
     """
     ends = database_end(len(positions), times=times, excluded_s=excluded_s, excluded_frames=excluded_frames)
     queries = np.flatnonzero(ends)

@@ -1,6 +1,6 @@
-"""What "the same place" means in metres."""
+"""Distances that define "the same place"."""
 
 POSITIVE_M = 3.0
-"""Two scans no farther apart than this show the same place."""
+"""Maximum distance of two scans that show the same place, in metres."""
 NEGATIVE_M = 20.0
-"""Two scans farther apart than this show different places; in between nothing is claimed."""
+"""Distance beyond which two scans show different places, in metres. Between the two limits a pair is neither."""

@@ -107,14 +107,14 @@ def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files)
     small_files(10)
     with pytest.raises(WriteError) as raised, writing(tmp_path), replacing(path) as temporary:
         temporary.write_bytes(bytes(100))
-    assert str(raised.value) == f"{path}: expected to write it, found: File too large"
+    assert str(raised.value) == f"{path}: cannot be written: File too large"
     assert names(tmp_path) == []
 
 
 def test_a_folder_that_cannot_be_made_is_an_error_that_names_the_file(tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / "file" / "a.txt"
-    with pytest.raises(WriteError, match=rf"^{path}: expected to write it, found: (Not a directory|File exists)"):
+    with pytest.raises(WriteError, match=rf"^{path}: cannot be written: (Not a directory|File exists)"):
         write_json(path, {})
 
 
@@ -141,7 +141,7 @@ def test_json_comes_back(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": 1, "a": 2}', b"1" * 5000])
 def test_json_that_is_damaged_names_its_file(tmp_path, content):
     (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"^{tmp_path}/a\.json: expected JSON, found none that is whole"):
+    with pytest.raises(ValueError, match=rf"^{tmp_path}/a\.json: expected JSON, found invalid JSON"):
         read_json(tmp_path / "a.json")
     with pytest.raises(FileNotFoundError, match=rf"^{tmp_path}/b\.json: expected a JSON file, found none"):
         read_json(tmp_path / "b.json")

@@ -56,7 +56,7 @@ def test_an_unknown_id_is_named(unknown):
 
 @pytest.mark.parametrize("categories", [0, 19])
 def test_an_unknown_setting_lists_those_there_are(categories):
-    with pytest.raises(ValueError, match=rf"no label image of {categories} categories; there are 6, 15, 20, 25, 34"):
+    with pytest.raises(ValueError, match=rf"expected one of 6, 15, 20, 25, 34, found {categories}"):
         taxonomy(categories)
 
 

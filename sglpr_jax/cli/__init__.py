@@ -1,1 +1,1 @@
-"""Command lines: each module here is one command, thin over the library."""
+"""Commands: one module each, with little code beside calls of the library."""

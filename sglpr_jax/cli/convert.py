@@ -1,4 +1,4 @@
-"""bin/convert: weights of the published Swin-Unet or Swin-T, to begin a training with."""
+"""bin/convert: convert the weights of a published Swin-Unet or Swin-T to initial weights of a training run."""
 
 import dataclasses
 from pathlib import Path
@@ -11,30 +11,30 @@ from sglpr_jax.cli.runtime import parse_command, run
 
 @dataclasses.dataclass(frozen=True)
 class ConvertCommand:
-    """Write weights that begin with those of a published network, for `bin/train --weights`; the rest is fresh.
+    """Write initial weights for `bin/train --weights`, taken from a published network. Other weights are random.
 
-    Examples:
+    Example:
       bin/convert swin_tiny_patch4_window7_224.safetensors --out start
       bin/convert swin_unet.safetensors --network swin-unet --preset mine.py --out start
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """A .safetensors file with the network's weights by PyTorch's names. A .pth is a pickle and must be converted first
-    (docs/guides/weights.md)."""
+    """A .safetensors file with the network's weights under PyTorch's names. A .pth file is a pickle and must be
+    converted first (docs/guides/weights.md)."""
     out: Path
-    """The folder to write; there must be none yet."""
+    """Output folder. It must not exist."""
     network: Literal["swin-t", "swin-unet"] = "swin-t"
-    """What the file holds: ImageNet's Swin-T, whose blocks fill encoder and decoder as far as they fit, or a whole
-    Swin-Unet, which must fit."""
+    """Network in the file. `swin-t` is ImageNet's Swin-T, whose blocks fill encoder and decoder where they fit.
+    `swin-unet` is a whole Swin-Unet, which must match."""
     preset: str = "paper"
-    """The model to fill, a preset or a .py file of your own; its backbone must be `swin`."""
+    """Model to fill: a preset or your own .py file. Its backbone must be `swin`."""
     seed: int = 0
-    """Of the weights that the file has none for."""
+    """Seed of the weights that the file does not contain."""
 
 
 def convert(command: ConvertCommand) -> Path:
-    """Do what the command says; returns the folder written. Raises FileExistsError where there is one."""
-    import jax  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the output folder. Raises FileExistsError if it exists."""
+    import jax  # slow imports, not needed for --help
 
     from sglpr_jax.models.sglpr import init
     from sglpr_jax.models.torch_import import import_swin_t, import_swin_unet
@@ -52,14 +52,14 @@ def convert(command: ConvertCommand) -> Path:
         copied = tuple(name for name in by_name(params.weights) if not name.startswith("place_head/"))
     save(params, command.out)
     share = _share({name: leaf.size for name, leaf in by_name(params.weights).items()}, copied)
-    print(f"{command.out}: {share} of {command.checkpoint.name}, the rest fresh (seed {command.seed})")
+    print(f"{command.out}: {share} of {command.checkpoint.name}, the rest random (seed {command.seed})")
     if unused:
-        print(f"without a place in {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")
+        print(f"not used by {command.preset}: {', '.join(unused[:5])}{', ...' if len(unused) > 5 else ''}")
     return command.out
 
 
 def _share(sizes: dict[str, int], copied: tuple[str, ...]) -> str:
-    """How many of the numbers were taken over, in words; `sizes` are those of all weights."""
+    """Describe the copied fraction of the numbers. `sizes` are those of all weights."""
     taken, whole = sum(sizes[name] for name in copied), sum(sizes.values())
     return f"{taken / 1e6:.1f} of {whole / 1e6:.1f} million numbers ({taken / whole:.0%})"
 

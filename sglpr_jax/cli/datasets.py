@@ -1,4 +1,4 @@
-"""Which recordings a command works on, said on stderr: those of a named dataset, or the simulated ones."""
+"""Recordings of a command: those of a dataset, or simulated ones. They are described on stderr."""
 
 import contextlib
 import sys
@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 
 
 def dataset_root(data: Path | None) -> Path:
-    """The dataset's folder; without one, the simulated recordings, made on first use and kept in the user's cache."""
+    """Return the dataset's folder. Without one, the simulated recordings are created in the user's cache on first
+    use."""
     if data is not None:
         return data
-    from sglpr_jax.sim.simulation import default_dataset  # this brings the simulator, which real data does not need
+    from sglpr_jax.sim.simulation import default_dataset  # imports the simulator, not needed for real data
 
     root, options = default_dataset(cache_folder())
     print(
-        f"no dataset named: using the simulated recordings in {root} "
-        "(for real KITTI: --data FOLDER, which holds sequences/NN/velodyne)",
+        f"no --data: using the simulated recordings in {root} "
+        "(for real KITTI: --data FOLDER that contains sequences/NN/velodyne)",
         file=sys.stderr,
     )
     simulate(root, **options)
@@ -32,17 +33,18 @@ def dataset_root(data: Path | None) -> Path:
 
 
 def cached_sessions() -> Path:
-    """The folder of the simulated sessions in NCLT's layout, made on first use and kept in the user's cache."""
+    """Return the folder of the simulated sessions in NCLT's layout. They are created in the user's cache on first
+    use."""
     from sglpr_jax.sim.simulation import default_sessions
 
     root, options = default_sessions(cache_folder())
-    print(f"no sessions named: using the simulated ones in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
+    print(f"no --nclt: using the simulated sessions in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
     simulate(root, **options)
     return root
 
 
 def simulate(root: Path, **options: Any) -> "Simulated":
-    """Do what `sim.simulate` does, with the size said beforehand and the progress shown."""
+    """Run `sim.simulate`, with a message about the size and a progress bar."""
     from sglpr_jax import sim
 
     with contextlib.ExitStack() as opened:
@@ -66,7 +68,7 @@ def _announce(dataset: "Simulated") -> None:
 
 
 def open_recording(root: Path, name: str | None, **options: Any) -> Recording:
-    """Do what `data.open_recording` does, and say what was found."""
+    """Run `data.open_recording` and describe the recording on stderr."""
     recording = readers.open_recording(root, name, **options)
     print("\n".join(recording.description), file=sys.stderr)
     return recording
@@ -75,18 +77,18 @@ def open_recording(root: Path, name: str | None, **options: Any) -> Recording:
 def leave_one_out(
     root: Path, seq: str, *, train_seqs: Sequence[str] = (), **options: Any
 ) -> tuple[list[Recording], Recording]:
-    """Return what `data.leave_one_out` does, and say which they are and what was found of each."""
+    """Run `data.leave_one_out` and describe the recordings on stderr."""
     recordings, test = split.leave_one_out(root, seq, train=train_seqs, **options)
     names = ", ".join(recording.name for recording in recordings)
-    print(f"training on {names}; testing on {seq}, never seen", file=sys.stderr)
+    print(f"training on {names}; testing on {seq}, which is held out", file=sys.stderr)
     _describe([*recordings, test])
     return recordings, test
 
 
 def all_recordings(root: Path, **options: Any) -> list[Recording]:
-    """Return every recording of a dataset that is trained on beside another; say which and what was found of each."""
+    """Return all recordings of a second training dataset, and describe them on stderr."""
     recordings = split.all_recordings(root, **options)
-    print(f"training on {', '.join(recording.name for recording in recordings)} of {root} too", file=sys.stderr)
+    print(f"also training on {', '.join(recording.name for recording in recordings)} of {root}", file=sys.stderr)
     _describe(recordings)
     return recordings
 
@@ -94,7 +96,8 @@ def all_recordings(root: Path, **options: Any) -> list[Recording]:
 def without_bad_scans(
     recordings: Sequence[Recording], *, on_bad_scan: Callable[[str, Exception], None]
 ) -> list[Recording]:
-    """Return the recordings without the scans that cannot be read, each of which `on_bad_scan` is told of."""
+    """Read all scans and return the recordings without the unreadable ones. Each of these is passed to
+    `on_bad_scan`."""
     with progress_bar("read all scans", sum(map(len, recordings))) as show:
         found, done = [], 0
         for recording in recordings:

@@ -1,4 +1,4 @@
-"""bin/demo: the whole job in minutes: simulate, train, embed, evaluate."""
+"""bin/demo: simulate, train, embed and evaluate in minutes."""
 
 import dataclasses
 import shutil
@@ -22,14 +22,14 @@ BESIDE = (SHIPPED, UNTRAINED, "thumbnail", "polar-fft")
 
 @dataclasses.dataclass(frozen=True)
 class DemoCommand:
-    """Go on training the shipped weights on two simulated recordings; find the loop closures of a third, never seen.
+    """Fine-tune the shipped weights on two simulated recordings, and find the revisits of a third one that is held out.
 
-    The third is 00, which comes back to its places in the same direction. The shipped weights as they are, and methods
-    that need no training, are scored beside the trained ones.
+    The third recording is 00, whose revisits have the same direction. The unchanged shipped weights and methods without
+    training are scored for comparison.
     """
 
     out: Path = Path("runs/demo")
-    """Folder for everything; an earlier demo's run in it is replaced, its simulated recordings are kept."""
+    """Output folder. The training run of an earlier demo is replaced; its simulated recordings are kept."""
     scans: int = SCANS
     """Scans of each recording."""
     steps: int | None = None
@@ -37,8 +37,8 @@ class DemoCommand:
 
 
 def demo(command: DemoCommand) -> Path:
-    """Do what the command says; returns its folder."""
-    from sglpr_jax.cli.datasets import simulate  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the output folder."""
+    from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
     from sglpr_jax.cli.train import TrainCommand, train_and_test
     from sglpr_jax.evaluation.page.writing import PAGE
     from sglpr_jax.training.presets import load_preset
@@ -51,9 +51,9 @@ def demo(command: DemoCommand) -> Path:
     config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
     train_and_test(
         TrainCommand(seq=TESTED, data=town, preset=PRESET, weights=WEIGHTS, method=BESIDE, out=trained, config=config),
-        go_on="the demo begins its training anew",
+        go_on="the next demo restarts its training",
     )
-    print(own_names("\nthe same by hand: bin/embed, then bin/evaluate"), file=sys.stderr)
+    print(own_names("\nthe same with two commands: bin/embed, then bin/evaluate"), file=sys.stderr)
     source, weights = PosedRecordingOptions(seq=TESTED), str(trained)
     file = command.out / f"{TESTED}.npz"
     embed_recording(EmbedCommand(data=town, source=source, weights=weights, out=file))

@@ -1,4 +1,4 @@
-"""bin/embed: write the descriptors of a sequence, or of a folder of scans."""
+"""bin/embed: write the descriptors of a sequence or of a folder of scans."""
 
 import dataclasses
 from pathlib import Path
@@ -13,9 +13,9 @@ from sglpr_jax.methods.names import NETWORK, MethodName
 
 @dataclasses.dataclass(frozen=True)
 class EmbedCommand:
-    """Write one descriptor per scan, with ids, positions and times where there are any.
+    """Write one descriptor per scan, with ids, and with positions and times if available.
 
-    Examples:
+    Example:
       bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
       bin/embed --data my_scans/ --out mine.npz --skip-bad
       bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
@@ -23,32 +23,32 @@ class EmbedCommand:
     """
 
     data: Path
-    """A dataset, a bag or a folder of scans or ready-made images, of any layout that is known."""
+    """A dataset, a bag or a folder of scans or ready-made images, in any supported layout."""
     out: Path
-    """The descriptor file to write (.npz)."""
+    """Descriptor file to write (.npz)."""
     weights: str | None = None
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors. None: those
-    of the name sglpr."""
+    """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors. None: the
+    shipped weights sglpr."""
     method: MethodName = "sglpr"
-    """The network, or a handcrafted method, which needs no weights; some need points, ssc labels too."""
+    """The network, or a handcrafted method, which needs no weights. Some methods need points; ssc also needs labels."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     rotate: bool = False
-    """Rotate every scan about z by its own random angle first."""
+    """Rotate every scan about z by its own random angle."""
     seed: CountOrNone = 0
-    """Draws the angles of --rotate."""
+    """Seed of the angles of --rotate."""
     skip_bad: bool = False
-    """Report scans that cannot be read and go on without them."""
+    """Report unreadable scans and skip them."""
     batch: Size = 8
-    """Images described at a time, where there are so many scans."""
+    """Maximum number of images that are described at a time."""
 
 
 def embed_recording(command: EmbedCommand) -> Path:
-    """Do what the command says; returns the file written."""
-    from sglpr_jax.methods.registry import method_named  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the path of the descriptor file."""
+    from sglpr_jax.methods.registry import method_named  # slow imports, not needed for --help
     from sglpr_jax.retrieval.embed import embed
 
     if command.weights is not None and command.method != NETWORK:
-        raise ValueError(f"{command.weights}: expected no --weights beside --method {command.method}, found some")
+        raise ValueError(f"{command.weights}: expected --method {NETWORK} with --weights, found {command.method}")
     if command.out.suffix != ".npz":
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():

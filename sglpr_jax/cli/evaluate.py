@@ -1,4 +1,4 @@
-"""bin/evaluate: score what any method says of a recording, or of several sessions, by chosen protocols."""
+"""bin/evaluate: score the results of any method on a recording or on several sessions."""
 
 import dataclasses
 import sys
@@ -13,13 +13,13 @@ from sglpr_jax.data.choices import PoseFormat
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateCommand:
-    """Print what a method scores by each protocol; write the table, its pictures and a page with all of them.
+    """Print the scores of a method by each protocol. Write the table, its pictures and a page with all of them.
 
-    FILE is a descriptor file that bin/embed wrote, a .npy of descriptors (a row per frame), or text: a top-k list with
-    lines `query: frame frame ...` or `query: frame=score ...`, or scored pairs with lines `i j score [label]`. Frames
-    are numbered from 0, and a higher score is closer.
+    FILE is a descriptor file of bin/embed, a .npy file of descriptors (one row per frame), or text. Text is a top-k
+    list with lines `query: frame frame ...` or `query: frame=score ...`, or scored pairs with lines `i j score
+    [label]`. Frames are numbered from 0, and a higher score is closer.
 
-    Examples:
+    Example:
       bin/evaluate 08.npz
       bin/evaluate mine.npy --poses poses/08.txt --pose-format kitti --times times.txt --distance cosine
       bin/evaluate mine.npy --data KITTI --seq 08 --protocol all --compare 08.npz
@@ -29,41 +29,40 @@ class EvaluateCommand:
     file: tyro.conf.Positional[Path]
     """Descriptors, a top-k list or scored pairs."""
     more: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """With --database: descriptor files of further sessions; the table then has a column for each."""
+    """With --database: descriptor files of further sessions. The table has a column for each."""
     database: Path | None = None
-    """The descriptor file of the session in which the frames of FILE are searched, by the protocols across sessions
+    """Descriptor file of the database session. The frames of FILE are searched in it, by the protocols across sessions
     (bevplace-nclt-recall, pointnetvlad-recall)."""
     published: bool = False
-    """Print the paper's numbers as well, marked as published: those of table 1 for the sequence, or of table 3."""
+    """Also print the paper's numbers, marked as published: table 1 for the sequence, or table 3 with --database."""
     out: Path | None = None
-    """Folder for results.json, report.html and the pictures. None: FILE without its ending."""
+    """Folder for results.json, report.html and the pictures. None: FILE without its suffix."""
     poses: Path | None = None
-    """Where the frames were taken, a row each; of a descriptor file with times also poses of other times, which are
-    interpolated, and of one that --skip-bad left scans out of a row for each scan. None: as the descriptor file says,
-    or the sequence of --data."""
+    """Pose file with one row per frame. If FILE has times, poses at other times are interpolated. If --skip-bad skipped
+    scans of FILE, a row for every scan is accepted, too. None: the poses in FILE, or those of --data."""
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
-    """Seconds, one number a line, beside --poses."""
+    """File of timestamps for --poses: seconds, one number a line."""
     distance: str | None = None
-    """How the descriptors of a .npy are compared: l2 (None), cosine, ... A descriptor file says it itself."""
+    """Distance between descriptors of a .npy file: l2 (None), cosine, ... Descriptor files define it themselves."""
     protocol: tuple[str, ...] = ()
-    """Their names, or `all`. None named: top1-f1max, pairs-f1max and bevplace-recall-at-1."""
+    """Names of protocols, or `all`. If omitted, top1-f1max, pairs-f1max and bevplace-recall-at-1."""
     compare: tuple[Path, ...] = ()
-    """Files of other methods on the same frames, to stand beside FILE, whose poses and times they get if they have none
-    of their own."""
+    """Files of other methods on the same frames, to compare with FILE. Without poses or times of their own, they use
+    those of FILE."""
     data: Path | None = None
-    """A dataset with the frames as scans or images: the page then shows them. --seq says which of its sequences, and
-    names a FILE that has no name of its own; published splits go by it."""
+    """Dataset with the scans or images of the frames; the page then shows them. --seq selects the sequence. It also
+    names the sequence if FILE does not; published splits depend on this name."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     weights: str | None = None
-    """The name of shipped weights or a training run's folder: with --data the page then shows semantic maps and feature
+    """Name of shipped weights or folder of a training run. With --data, the page then shows semantic maps and feature
     heat maps."""
 
 
 def evaluate_file(command: EvaluateCommand) -> Path:
-    """Do what the command says; returns the folder written."""
-    from sglpr_jax.evaluation.page.writing import write_sessions  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the output folder."""
+    from sglpr_jax.evaluation.page.writing import write_sessions  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_session_files
 
     _check_options(command)
@@ -81,7 +80,7 @@ def evaluate_file(command: EvaluateCommand) -> Path:
 
 
 def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
-    """Score, print and write; returns the paths written."""
+    """Score the methods, print the table and write the results. Returns the paths written."""
     from sglpr_jax.data.formats.trajectory import read_trajectory
     from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.inputs.methods import read_methods
@@ -114,29 +113,29 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
 
 
 def _check_options(command: EvaluateCommand) -> None:
-    """Raise ValueError for options that do not go together."""
+    """Raises ValueError if options exclude each other."""
     from sglpr_jax.evaluation.protocols.choice import check_names
 
     if command.database is not None:
         silent = ("poses", "times", "distance", "compare", "data", "weights")
         given = [name for name in silent if getattr(command, name)] + ["seq"] * bool(command.source.seq)
         if given:
-            raise ValueError(f"expected descriptor files alone beside --database, found --{given[0]}")
+            raise ValueError(f"expected only descriptor files with --database, found --{given[0]}")
         return
     if command.more:
         raise ValueError(
-            f"expected --database beside several files, found {command.more[0]} without; methods to stand "
-            "beside FILE are given by --compare"
+            f"expected --database with several files, found {command.more[0]} without it; "
+            "to compare methods, use --compare"
         )
     if command.weights is not None and command.data is None:
-        raise ValueError(f"{command.weights}: expected --data beside --weights, found none")
+        raise ValueError(f"{command.weights}: expected --data with --weights, found none")
     if command.times is not None and command.poses is None:
-        raise ValueError(f"{command.times}: expected --poses beside --times, found none")
+        raise ValueError(f"{command.times}: expected --poses with --times, found none")
     check_names(command.protocol)
 
 
 def _folder(file: Path) -> Path:
-    """Return the file without its ending; a file that has none keeps its name and the folder gets another."""
+    """Return the file without its suffix. If it has no suffix, append "-results"."""
     return file.with_suffix("") if file.suffix else file.with_name(f"{file.name}-results")
 
 

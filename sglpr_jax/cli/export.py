@@ -1,4 +1,4 @@
-"""bin/export: weights to hand out, without what only training needs."""
+"""bin/export: prepare weights for use by others, without the parts that only training needs."""
 
 import dataclasses
 from pathlib import Path
@@ -15,44 +15,45 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class ExportCommand:
-    """Write weights to hand out: what describes places, without the segmentation head; or a program with them inside.
+    """Write weights that describe places, without the segmentation head, or a program that contains them.
 
-    Examples:
+    Example:
       bin/export --weights runs/small-08 --out mine --half
-      bin/export --whiten my_scans/ --out mine      for one's own sensor, without labels or poses
+      bin/export --whiten my_scans/ --out mine      for your own sensor, without labels or poses
       bin/export --format onnx --out mine           for other runtimes
       bin/export --weights runs/b --average runs/a --shares 0.6 0.4 --out mine
     """
 
     out: Path
-    """The folder to write; there must be none yet."""
+    """Output folder. It must not exist."""
     weights: str = DEFAULT_WEIGHTS
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     average: tuple[str, ...] = ()
-    """More weights of the same model, of trainings of which one began with another's: every parameter becomes the mean
-    of all, without a whitening layer."""
+    """Further weights of the same model. Every parameter becomes the mean over all of them, without a whitening layer.
+    One of the trainings must have started from the weights of the other."""
     shares: tuple[NotNegative, ...] = ()
-    """How much each counts in that mean, those of --weights first; (): all alike."""
+    """Weight of each model in the mean, --weights first. If omitted, all are equal."""
     format: Literal["weights", "stablehlo", "onnx"] = "weights"
-    """`weights` for this package. `stablehlo` (what jax.export reads) and `onnx` are programs that make descriptors of
-    images, with the weights inside, for runtimes that do not know this package."""
+    """`weights` is for this package. `stablehlo` (read by jax.export) and `onnx` are programs that compute descriptors
+    from images. They contain the weights and run without this package."""
     half: bool = False
-    """Store float16 numbers, in half the room; they are read as float32."""
+    """Store float16 numbers, which take half the space. They are read as float32."""
     keep_segmentation: bool = False
     """Keep the segmentation head, for semantic maps."""
     image: Literal["points", "density"] | None = None
-    """What raw scans are made into, where config.json says something else: `density` for weights that were trained on
-    ready-made density images."""
+    """Image made of raw scans, if config.json has the wrong value: `density` for weights trained on ready-made density
+    images."""
     whiten: tuple[Path, ...] = ()
-    """Datasets or folders of scans; to their descriptors a last layer is fitted that evens out the spread over the
-    directions (models/whitening.py), in place of one that is there."""
+    """Datasets or folders of scans. A last layer is fitted to their descriptors, which evens out their spread over all
+    directions (models/whitening.py). It replaces an existing whitening layer."""
     whiten_power: NotNegative = WHITENING_POWER
-    """By which power of its spread a principal component is divided: 1 evens out all."""
+    """Exponent of the whitening: each principal component is divided by this power of its spread. 1 evens out all
+    components."""
 
 
 def export(command: ExportCommand) -> Path:
-    """Do what the command says; returns the folder written. Raises FileExistsError where there is one."""
-    from sglpr_jax.data import open_recording, recording_names  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the output folder. Raises FileExistsError if it exists."""
+    from sglpr_jax.data import open_recording, recording_names  # slow imports, not needed for --help
     from sglpr_jax.models.params import Params
     from sglpr_jax.models.program import save_program
     from sglpr_jax.models.weights_file import save
@@ -62,7 +63,7 @@ def export(command: ExportCommand) -> Path:
         raise FileExistsError(f"{command.out}: expected a folder that does not exist yet, found one")
     if command.format != "weights" and (command.half or command.keep_segmentation):
         flag = "half" if command.half else "keep-segmentation"
-        raise ValueError(f"expected --{flag} with --format weights alone, found it with {command.format}")
+        raise ValueError(f"expected --{flag} only with --format weights, found it with {command.format}")
     params = _load(command)
     if command.image is not None:
         params = Params(params.weights, dataclasses.replace(params.config, image=command.image))
@@ -80,13 +81,13 @@ def export(command: ExportCommand) -> Path:
 
 
 def _load(command: ExportCommand) -> "Params":
-    """The weights, or the average of several, with the segmentation head where it is kept."""
+    """Load the weights, or the mean of several, with the segmentation head if it is kept."""
     from sglpr_jax.models.average import average
     from sglpr_jax.models.weights import for_places
     from sglpr_jax.models.weights_file import load
 
     if command.shares and not command.average:
-        raise ValueError("expected --shares with --average alone, found it without")
+        raise ValueError("expected --shares only with --average, found it without")
     models = [load(name) for name in (command.weights, *command.average)]
     models = models if command.keep_segmentation else [for_places(model) for model in models]
     return average(models, shares=command.shares or None) if command.average else models[0]

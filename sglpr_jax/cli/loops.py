@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sglpr_jax.loops.detector import DetectorConfig
 
 UNFINISHED = "unfinished"
-"""Folder of intermediate results, inside the folder of the results, until the run has ended."""
+"""Checkpoint directory of a running command, inside the output folder."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,9 @@ class LoopsCommand:
 
     Writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons) and index.html. With
     odometry also trajectory.tum and trajectory.kitti, with --optimize also the corrected trajectory.
-    Ctrl-C keeps the loops found so far. The same command continues after that, and after a run that was killed.
+    Ctrl-C writes the loops found until then. The same command continues after that, and after a run that was killed.
 
-    Examples:
+    Example:
       bin/loops my_scans --out found
       bin/loops my_scans --odometry odometry.tum --out found
       bin/loops drive.mcap --odometry drive.mcap --out found
@@ -71,7 +71,7 @@ def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
     from sglpr_jax.loops.detector import DetectorConfig
     from sglpr_jax.loops.drift import DriftModel
-    from sglpr_jax.loops.unfinished import alone  # these bring JAX and more, which --help does not need
+    from sglpr_jax.loops.unfinished import alone  # slow imports, not needed for --help
 
     _check(command)
     drift = DriftModel(command.drift_percent / 100, command.drift_deg_per_100m / 100)
@@ -87,12 +87,14 @@ def _check(command: LoopsCommand) -> None:
 
     written = {(command.out / name).resolve() for name in TRAJECTORIES}
     if command.optimize and command.odometry is None:
-        raise ValueError("--optimize corrects odometry: expected --odometry beside it, found none")
+        raise ValueError("--optimize corrects odometry: expected --odometry, found none")
     if command.optimize:
         check_installed()
     for path in (command.odometry, command.source.poses, command.source.times):
         if path is not None and path.resolve() in written:
-            raise ValueError(f"{path}: expected a file that stays, found one that this run may write anew")
+            raise ValueError(
+                f"{path}: expected an input that is no output file, found one that this run would overwrite"
+            )
 
 
 def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
@@ -135,7 +137,7 @@ def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
         print(corrected)
     print(f"{command.out}: {', '.join(path.name for path in paths)}")
     if not found.whole:
-        print("the same command goes on from here", file=sys.stderr)
+        print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(command.out / UNFINISHED)
     return 0

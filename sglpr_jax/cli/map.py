@@ -1,4 +1,4 @@
-"""bin/map: keep the places of a recording whose poses are known, so that later scans find themselves."""
+"""bin/map: store the places of a recording with known poses, so that later scans can be located."""
 
 import dataclasses
 import sys
@@ -17,51 +17,51 @@ if TYPE_CHECKING:
     from sglpr_jax.models.params import Params
 
 UNFINISHED = ".unfinished"
-"""The ending of the folder, beside the map, of a run that has not ended."""
+"""Suffix of the checkpoint directory of a running command, beside the map."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MapCommand:
-    """Keep the places of a recording: of each a descriptor, an image and a pose, in one file.
+    """Store the places of a recording in one file. Each place has a descriptor, an image and a pose.
 
-    Ctrl-C keeps what was found; the same command goes on after it, and after a run that was killed.
+    Ctrl-C writes the places found until then. The same command continues after that, and after a run that was killed.
 
-    Examples:
+    Example:
       bin/map my_scans --poses poses.tum --out town.safetensors
       bin/map today --poses today.tum --add-to town.safetensors --out town.safetensors
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
-    """A dataset, a bag or a folder of scans, of any layout that is known."""
+    """A dataset, a bag or a folder of scans, in any supported layout."""
     poses: Path
-    """A pose in the world for each scan, or poses of other times (tum), which are interpolated: a corrected trajectory,
-    not raw odometry; or the bag itself."""
+    """A pose in the world frame for each scan, or poses at other times (tum), which are interpolated, or the bag
+    itself. Use a corrected trajectory, not raw odometry."""
     out: Path
-    """The map to write (.safetensors)."""
+    """Map to write (.safetensors)."""
     pose_format: OdometryFormat = "auto"
-    """12 numbers a line are kitti (camera axes) or lidar (z up); 8 are tum; .g2o is known by its ending."""
+    """Files with 12 numbers a line are kitti (camera axes) or lidar (z up), with 8 numbers tum; .g2o is recognised."""
     add_to: Path | None = None
-    """A map in the same world frame, of the same weights, whose places the new one has too."""
+    """Existing map in the same world frame, made with the same weights. The new map also contains its places."""
     spacing_m: NotNegative = SPACING_M
-    """Scans nearer than this to the last place are left out."""
+    """Minimum distance between places, in metres. Scans closer to the last place are skipped."""
     weights: str = DEFAULT_WEIGHTS
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     skip_bad: bool = False
-    """Report scans that cannot be read and go on without them."""
+    """Report unreadable scans and skip them."""
 
 
 def write_map(command: MapCommand) -> int:
-    """Do what the command says; returns the exit status."""
+    """Run the command. Returns the exit status."""
     from sglpr_jax.loops.unfinished import alone
-    from sglpr_jax.models.weights_file import load  # these bring JAX and more, which --help does not need
+    from sglpr_jax.models.weights_file import load  # slow imports, not needed for --help
 
     if command.out.suffix != ".safetensors":
         raise ValueError(f"expected --out to end in .safetensors, found {command.out}")
     if command.out.is_dir():
         raise IsADirectoryError(f"{command.out}: expected a file to write, found a folder")
     params = load(command.weights)
-    with alone(command.out.with_suffix(UNFINISHED)):  # from reading the map that is added to until it is written
+    with alone(command.out.with_suffix(UNFINISHED)):  # locked from reading the old map until the new one is written
         return _add_places(command, params)
 
 
@@ -90,7 +90,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if len(places):
         whole = places if before is None else before.merged(places, drive=poses_by_id(recording, poses))
         if stopped and _holds_more(command.out, len(whole)):
-            print(f"{command.out}: stays as it is, with more places than the {len(whole)} of so few scans")
+            print(f"{command.out}: unchanged, because it has more places than the {len(whole)} found until now")
         else:
             whole.save(command.out)
             new = len(whole) - (0 if before is None else len(before))
@@ -98,14 +98,14 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             of = f"{scans} of {len(recording)}" if stopped else f"{scans}"
             print(f"{command.out}: {len(whole)} places, {new} of them from {of} scans of {recording.name}{left_out}")
     if stopped:
-        print("the same command goes on from here", file=sys.stderr)
+        print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(unfinished)
     return 0
 
 
 def _holds_more(path: Path, places: int) -> bool:
-    """Whether a map lies there already with more places: whoever uses it would be lost with fewer."""
+    """Whether the path already holds a map with more places. A smaller map must not replace it."""
     from sglpr_jax.loops.places import PlaceMap
 
     try:

@@ -1,4 +1,4 @@
-"""The flags that open a recording, the same for every command that works on one."""
+"""Flags that select and open a recording, shared by several commands."""
 
 import dataclasses
 import sys
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingOptions:
-    """Which recording of a folder, and how it is read."""
+    """Selection of a recording in a folder, and options for reading it."""
 
     seq: str | None = None
-    """Which sequence, or session of NCLT (2012-01-15); may be left out where there is only one."""
+    """Sequence, or session of NCLT (2012-01-15). May be omitted if there is only one."""
     pose_source: PoseChoice = "auto"
-    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    """Pose files of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    """Point format of .bin files. `auto` detects it from the names or the content of the files."""
     sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scans.
+    `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
     pose_topic: str | None = None
-    """The topic of a bag's poses, where it has several: /odom."""
+    """Pose topic of a bag that has several, for example /odom."""
 
     def open(self, root: Path) -> "Recording":
-        """Open the recording, and say what was found. Raises what `data.open_recording` does."""
-        from sglpr_jax.cli.datasets import open_recording  # this brings JAX and more, which --help does not need
+        """Open the recording and describe it on stderr. Raises the errors of `data.open_recording`."""
+        from sglpr_jax.cli.datasets import open_recording  # slow import, not needed for --help
 
         options: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"}
         return open_recording(root, self.seq, **options)
@@ -41,29 +41,29 @@ class RecordingOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PosedRecordingOptions(RecordingOptions):
-    """Which recording of a folder, how it is read, and where a plain folder of scans was taken."""
+    """Selection of a recording in a folder, options for reading it, and the poses of a plain folder of scans."""
 
     poses: Path | None = None
-    """The pose file of a plain folder, where none lies beside the scans: a row for each scan, or poses of other times,
-    which are interpolated where the scans have times too."""
+    """Pose file of a plain folder, if it is not beside the scans: one row per scan, or poses at other times. These are
+    interpolated if the scans have times."""
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
-    """Seconds, one number a line, where no times.txt lies beside the scans."""
+    """File of timestamps, if no times.txt is beside the scans: seconds, one number a line."""
 
 
 def open_with_poses(
     source: RecordingOptions, root: Path, path: Path, *, format: "OdometryFormat"
 ) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']]":
-    """Open a recording, with a pose for each scan from the file at `path` or, where that is the bag itself, from it.
+    """Open a recording, with a pose for each scan from the file at `path`, or from the bag if `path` is the bag itself.
 
-    Poses of other times than the scans' are interpolated; scans without one are left out, which is said.
+    Poses at other times are interpolated. Scans without a pose are removed and reported on stderr.
     """
     from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
 
     if is_own(path, root):
         return own_odometry(source.open(root), root)
-    odometry = read_odometry(path, format=format)  # first, since a bag takes its time to open
+    odometry = read_odometry(path, format=format)  # read first, because a bag opens slowly
     opened = source.open(root)
     recording, poses = at_scans(opened, odometry, path, format=format)
     if recording is not opened:
@@ -72,5 +72,5 @@ def open_with_poses(
 
 
 def report_bad_scan(scan: str, error: Exception) -> None:
-    """Say on stderr that a scan is left out, and why."""
+    """Report on stderr that a scan is skipped, with the reason."""
     print(f"skipped {scan}: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""bin/relocalize: where in a map was a scan taken?"""
+"""bin/relocalize: find the pose of a scan in a map."""
 
 import dataclasses
 import math
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class RelocalizeCommand:
-    """Find the pose of a scan in a map that bin/map wrote, with its probability, by each of the places most like it.
+    """Find the pose of a scan in a map of bin/map. Each of the most similar places gives a pose with its probability.
 
     Answers more than 20 m apart share the probability: if several places fit equally well, none of them is probable.
 
-    Examples:
+    Example:
       bin/relocalize my_scans/000003.bin --map town.safetensors
       bin/relocalize my_scans/000003.bin --map town.safetensors --out pose.json
     """
@@ -34,24 +34,24 @@ class RelocalizeCommand:
     scan: Annotated[Path, tyro.conf.Positional]
     """A scan (.bin, .pcd, .ply, .npy, .npz, .las) or a ready-made image (.png)."""
     map: Path
-    """The map."""
+    """Map of bin/map."""
     out: Path | None = None
-    """A JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
+    """JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
     candidates: Size = CANDIDATES
-    """Maximum number of answers: the scan is compared with this many places of the map. Answers more than 20 m apart
+    """Maximum number of answers. The scan is compared with this many places of the map. Answers more than 20 m apart
     exclude each other, and their probabilities add up to 1 at most."""
     weights: str = DEFAULT_WEIGHTS
-    """The weights that made the map."""
+    """Weights that the map was made with."""
     format: ScanFormat = "auto"
-    """What the scan is, where neither its name nor a look into it tells."""
+    """Format of the scan. `auto` detects it from the name or the content of the file."""
     sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scan, and `auto`
-    takes that of the map's last place."""
+    """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scan.
+    `auto` takes the mounting of the map's last place."""
 
 
 def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
-    """Do what the command says; returns the answers, the most probable first."""
-    from sglpr_jax.files import write_json  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the answers, the most probable first."""
+    from sglpr_jax.files import write_json  # slow imports, not needed for --help
     from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.loops.query import read_query
     from sglpr_jax.models.weights import weights_hash
@@ -62,7 +62,7 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
     found = places.relocate(params, record, candidates=command.candidates)
     if not found:
-        raise ValueError(f"{command.scan}: expected a scan that shows something, found one that shows next to nothing")
+        raise ValueError(f"{command.scan}: expected a scan that shows a place, found an almost empty one")
     if command.out is not None:
         write_json(command.out, [_as_json(one) for one in found])
     console().print(_table(command.scan, found))
@@ -75,7 +75,7 @@ def _as_json(found: "Relocated") -> dict:
 
 
 def _table(scan: Path, found: "list[Relocated]") -> Table:
-    title = escape(f"{scan.name} in the map")  # rich takes what stands in brackets for a style
+    title = escape(f"{scan.name} in the map")  # rich interprets brackets as styles
     shared = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
     caption = shared if len(found) > 1 else None
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)

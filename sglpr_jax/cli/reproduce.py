@@ -1,4 +1,4 @@
-"""bin/reproduce: the paper's tables and figures, made anew on any dataset, beside the paper's numbers."""
+"""bin/reproduce: reproduce the paper's tables and figures on any dataset, beside the paper's numbers."""
 
 import dataclasses
 import json
@@ -27,50 +27,51 @@ PAPER_SEQUENCES = ("00", "02", "05", "06", "07", "08")
 
 @dataclasses.dataclass(frozen=True)
 class ReproduceCommand:
-    """Make tables and figures of the paper anew: train what is missing, embed, evaluate, print ours beside the paper's.
+    """Reproduce tables and figures of the paper: train missing models, embed, evaluate, print the results beside the
+    paper's.
 
-    Every test recording has models of its own, trained on all the others (leave-one-out), one for each variant that a
-    table compares. Finished runs are kept in --out and used again; an interrupted one goes on.
+    Every test recording has its own models, trained on all other recordings (leave-one-out), one for each variant of a
+    table. Finished runs in --out are reused; an interrupted run is resumed.
 
-    Examples:
-      bin/reproduce table4 figure9 --plan                          says what would be trained, and how long it takes
+    Example:
+      bin/reproduce table4 figure9 --plan                          prints the missing trainings and their duration
       bin/reproduce all                                            on the simulated recordings, preset small
       bin/reproduce table1 table2 --data KITTI --preset paper
     """
 
     what: tyro.conf.Positional[tuple[What, ...]]
-    """Which tables and figures."""
+    """Names of tables and figures."""
     data: Path | None = None
-    """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
+    """Folder of the dataset: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
     nclt: Path | None = None
-    """Sessions in NCLT's layout, for table 3 and figure 8; the first is the database. None: simulated ones."""
+    """Sessions in NCLT's layout, for table 3 and figure 8. The first is the database. None: simulated sessions."""
     preset: str = "small"
-    """A file of configs/ by name, or a path to one of your own."""
+    """Name of a file in configs/, or path of your own file."""
     seq: tuple[str, ...] = ()
-    """The recordings to test on. None named: those of 00, 02, 05, 06, 07 and 08 that the dataset has."""
+    """Recordings to test on. If omitted, those of 00, 02, 05, 06, 07 and 08 that the dataset contains."""
     out: Path = Path("runs/reproduce")
     """Folder for the runs, tables and pictures."""
     method: tuple[str, ...] = ("m2dp", "scan-context", "lidar-iris", "ssc", "solid", "polar-fft")
-    """Handcrafted methods in tables 1 to 3 and figure 5; on ready-made images only polar-fft and thumbnail go."""
+    """Handcrafted methods in tables 1 to 3 and figure 5. On ready-made images, only polar-fft and thumbnail work."""
     pose_source: PoseChoice = "auto"
-    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    """Pose files of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     plan: bool = False
-    """Only say what would be trained."""
+    """Only print the missing trainings."""
     config: Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff, tyro.conf.AvoidSubcommands] = (
         dataclasses.field(default_factory=TrainConfig)
     )
 
 
 def parse(arguments: list[str] | None = None) -> ReproduceCommand:
-    """Defaults, overridden by the preset, overridden by the flags."""
+    """Parse the command line. The preset overrides the defaults, and the flags override the preset."""
     preset = preset_asked_for(arguments, default=ReproduceCommand.preset)
     default = ReproduceCommand(what=(), preset=preset, config=load_preset(preset))
     return parse_command(ReproduceCommand, "reproduce", arguments, default=default)
 
 
 def reproduce(command: ReproduceCommand) -> Path:
-    """Do what the command says; returns its folder."""
-    from sglpr_jax.cli.datasets import dataset_root  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the output folder."""
+    from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
     from sglpr_jax.data import recording_names
     from sglpr_jax.reproduce.check import check
     from sglpr_jax.reproduce.plan import make_plan, time_a_step
@@ -91,17 +92,17 @@ def reproduce(command: ReproduceCommand) -> Path:
 
 
 def _train(runs: "Runs", plan: "Plan") -> None:
-    """Train what is missing; where that is asked to stop, exit with what was made saved."""
+    """Train the missing runs. If a run is asked to stop, save it and exit."""
     for done, (variant, seq) in enumerate(plan.missing):
         print(f"run {done + 1} of {len(plan.missing)}: {variant}, {seq}", file=sys.stderr)
         with stop_on_signal() as stopped:
             result = runs.train(variant, seq, stopped=stopped)
         print(result, file=sys.stderr)
-        exit_unless_finished(result, stopped, go_on="the same command goes on")
+        exit_unless_finished(result, stopped, go_on="run the same command again to continue")
 
 
 def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tuple[str, ...]) -> None:
-    """Make the tables and figures of finished runs; write and print them."""
+    """Compute, write and print the tables and figures of finished runs."""
     from sglpr_jax.cli.datasets import cached_sessions
     from sglpr_jax.files import write_json
     from sglpr_jax.reproduce.reproduction import Reproduction, write_experiment

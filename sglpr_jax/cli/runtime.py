@@ -1,4 +1,4 @@
-"""What every command does around its work: a compilation cache, orderly interruption, errors in one line."""
+"""Common parts of all commands: compilation cache, orderly interruption, one-line errors."""
 
 import argparse
 import contextlib
@@ -26,28 +26,29 @@ from sglpr_jax.fields import check_value, field_types, has_bounds
 
 _TABLE_WIDTH = 140
 _INSTALLED_AS = "sglpr-"
-"""What `pip install` puts before the names of the commands."""
+"""Prefix of the commands that `pip install` creates."""
 _OBJECTS_BETWEEN_COLLECTIONS = 100_000
-"""Imports and tracing make objects that stay: with Python's 700 an eighth of a start went by looking for garbage."""
+"""Allocations between garbage collections. Imports and tracing create permanent objects; with Python's default of 700,
+the collections took an eighth of the start-up time."""
 T = TypeVar("T")
 
 
 def cache_folder() -> Path:
-    """Where this user's compiled programs and simulated recordings are kept."""
+    """Return the user's folder for compiled programs and simulated recordings."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax"
 
 
 def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
-    """What --preset says, read before the other flags are, because it sets their defaults."""
+    """Read --preset before the other flags, because the preset sets their defaults."""
     chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     chooser.add_argument("--preset", default=default)
     return chooser.parse_known_args(arguments)[0].preset
 
 
 def own_names(text: str) -> str:
-    """`text` with the commands as whoever started this one knows them: sglpr-embed, where bin/embed is not there.
+    """Replace command names in `text` by those of this installation: bin/embed by sglpr-embed after `pip install`.
 
-    Paths stay as they are: /home/me/bin/embed, bin/08.npz, bin/map/08.npz.
+    Paths stay unchanged: /home/me/bin/embed, bin/08.npz, bin/map/08.npz.
     """
     if not Path(sys.argv[0]).name.startswith(_INSTALLED_AS):
         return text
@@ -57,15 +58,15 @@ def own_names(text: str) -> str:
 
 @functools.cache
 def _installed_commands() -> tuple[str, ...]:
-    """The commands that `pip install` gives, as bin/ has them."""
+    """Return the names of the commands that `pip install` creates, without their prefix."""
     scripts = distribution("sglpr-jax").entry_points.select(group="console_scripts")
     return tuple(script.name.removeprefix(_INSTALLED_AS) for script in scripts)
 
 
 def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:
-    """What the flags say; the help speaks of the commands by their own names. `options` are those of `tyro.cli`.
+    """Parse the flags of a command. `options` are passed to `tyro.cli`.
 
-    Raises ValueError for a number that its annotation (`fields.py`) does not allow.
+    Raises ValueError if a number is outside the bounds of its annotation (`fields.py`).
     """
     about = {"prog": own_names(f"bin/{name}"), "description": own_names(inspect.getdoc(command) or ""), **options}
     found = tyro.cli(command, args=arguments, **about)
@@ -74,18 +75,21 @@ def parse_command(command: type[T], name: str, arguments: list[str] | None = Non
 
 
 def _check_numbers(command: Any) -> None:
-    """Raise ValueError, which begins with the flag, for a number that is not within the bounds of its annotation."""
+    """Raises ValueError, which begins with the flag, if a number is outside the bounds of its annotation."""
     for name, annotation in field_types(type(command)).items():
         if has_bounds(annotation):
             check_value(getattr(command, name), annotation, f"--{name.replace('_', '-')}")
 
 
 def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
-    """Parse a command line and do its work: wrong input ends in one line on stderr and exit status 1, Ctrl-C in 130."""
+    """Parse a command line and run the command. Invalid input gives one line on stderr and exit status 1, Ctrl-C gives
+    130."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    for chatty in ("absl", "asyncio"):  # pages about a checkpoint that failed, which orbax raises too
+    for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
-    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)  # the same at the very end
+    warnings.filterwarnings(
+        "ignore", "coroutine .* was never awaited", RuntimeWarning
+    )  # a failed checkpoint again, at exit
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", DataWarning)
     if sys.unraisablehook is sys.__unraisablehook__:
@@ -101,16 +105,16 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
 
 
 def _keep_compiled_programs() -> None:
-    """For the next start; where the user has chosen a place for them, JAX has read it."""
+    """Cache compiled programs for the next start, unless the user has set JAX's own cache folder."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        import jax  # takes most of a second, which --help and a wrong flag need not wait for
+        import jax  # slow import, not needed for --help or a wrong flag
 
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    """What Python does; of what is wrong with the data in one line."""
+    """Print warnings as Python does, but warnings about data on one line."""
     if issubclass(category, DataWarning):
         print(f"warning: {message}", file=sys.stderr)
     else:
@@ -118,19 +122,19 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
 
 
 def _show_unraisable(unraisable) -> None:
-    """What Python does, but for what a failed checkpoint leaves behind: each of its writes finds nobody waiting."""
+    """Report errors as Python does, except those of the pending writes of a failed checkpoint."""
     if str(unraisable.exc_value) != "Event loop is closed":
         sys.__unraisablehook__(unraisable)
 
 
 def console() -> Console:
-    """Standard output; wide enough for the tables where it is no terminal with a width of its own."""
+    """Return a console for standard output. Without a terminal it is wide enough for the tables."""
     return Console(width=None if sys.stdout.isatty() else _TABLE_WIDTH, highlight=False)
 
 
 @dataclasses.dataclass
 class StopRequest:
-    """Whether work was asked to stop (call it), and by which signal."""
+    """Callable that returns whether the work was asked to stop. It also stores the signal."""
 
     signal: int | None = None
 
@@ -139,20 +143,20 @@ class StopRequest:
 
     @property
     def exit_status(self) -> int:
-        """130 after Ctrl-C, as shells have it; 0 after SIGTERM, for whoever ends a run so that it can go on later."""
+        """130 after Ctrl-C, as in shells. 0 after SIGTERM, which ends a run that will be resumed later."""
         return 130 if self.signal == signal.SIGINT else 0
 
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[StopRequest]:
-    """Turn the first Ctrl-C or SIGTERM into a request, so that work ends where nothing is lost; a second one kills."""
+    """Turn the first Ctrl-C or SIGTERM into a stop request, so that work ends without losses. A second one kills it."""
     request = StopRequest()
 
     def ask(number, _frame):
         if request():
             raise KeyboardInterrupt
         request.signal = number
-        print("stopping after this step; once more to stop at once", file=sys.stderr)
+        print("stopping after this step; repeat to stop at once", file=sys.stderr)
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -164,7 +168,8 @@ def stop_on_signal() -> Iterator[StopRequest]:
 
 @contextlib.contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that is told how much is done; nothing where stderr is no terminal."""
+    """Show a bar on stderr. The context returns a function that sets the finished count. Without a terminal nothing is
+    shown."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:

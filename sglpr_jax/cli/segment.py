@@ -1,4 +1,4 @@
-"""bin/segment: write the semantic map of every scan or image of a sequence; score them where there are labels."""
+"""bin/segment: write the semantic map of every scan or image of a sequence, and score the maps if there are labels."""
 
 import dataclasses
 from pathlib import Path
@@ -15,30 +15,31 @@ RESULT_FILE = "segmentation.json"
 
 @dataclasses.dataclass(frozen=True)
 class SegmentCommand:
-    """Write each scan's semantic map as seen from above, one PNG of class ids (docs/reference/labels.md) per scan.
+    """Write the semantic map of each scan, seen from above, as a PNG of class ids (docs/reference/labels.md).
 
-    Of a ready-made image it is a label image, pixel for pixel on the image, as bin/train --pseudo-labels reads it. With
-    labels, also the intersection over union of every class and a picture of one scan (figure 7).
+    For a ready-made image, the map is a label image with the same pixels, which bin/train --pseudo-labels reads. If
+    there are labels, the command also writes the intersection over union of every class and a picture of one scan
+    (figure 7).
 
-    Examples:
+    Example:
       bin/segment --data KITTI --seq 08 --out maps/
       bin/segment --weights runs/simulated --data IMAGES --seq 06 --min-confidence 0.8 --out pseudo/06
     """
 
     data: Path
-    """A dataset, a bag or a folder of scans or ready-made images, of any layout that is known."""
+    """A dataset, a bag or a folder of scans or ready-made images, in any supported layout."""
     out: Path
-    """The folder to write to; made if need be."""
+    """Output folder. It is created if it does not exist."""
     weights: str = DEFAULT_WEIGHTS
-    """The name of shipped weights, a training run's folder, or one with config.json and model.safetensors."""
+    """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     min_confidence: Share = 0.0
-    """Leave cells unlabelled, and out of the score, whose likeliest class has a smaller probability."""
+    """Minimum probability of the most likely class. Cells below it stay unlabelled and are not scored."""
 
 
 def segment_recording(command: SegmentCommand) -> Path:
-    """Do what the command says; returns the folder written."""
-    import numpy as np  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the output folder."""
+    import numpy as np  # slow imports, not needed for --help
 
     from sglpr_jax.evaluation.segmentation import map_confusion
     from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
@@ -49,7 +50,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     recording, least = command.source.open(command.data), command.min_confidence
     params = load(command.weights)
     if not params.config.segments:
-        raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none in them")
+        raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none")
     command.out.mkdir(parents=True, exist_ok=True)
     categories, classes, labelled, cells = params.config.categories, params.config.classes, 0, 0
     confusion = np.zeros((classes, classes), np.int64)

@@ -1,4 +1,4 @@
-"""bin/stress: how much every method loses when the scans are corrupted, by the same protocols."""
+"""bin/stress: measure how much each method loses when the scans are corrupted."""
 
 import dataclasses
 import sys
@@ -14,11 +14,11 @@ from sglpr_jax.methods.names import MethodName
 
 @dataclasses.dataclass(frozen=True)
 class StressCommand:
-    """Score methods on a recording as it is, and with every scan rotated, occluded, thinned, noisy or moved.
+    """Score methods on the clean recording, and with every scan rotated, occluded, thinned, noisy or moved.
 
-    An interrupted run goes on where it stopped: descriptors that are there are used again, if made alike.
+    The same command continues an interrupted run. Existing descriptor files with the same inputs are reused.
 
-    Examples:
+    Example:
       bin/stress --weights runs/small-08 --data KITTI --seq 08 --out stress-08
       bin/stress --method scan-context solid --data KITTI --seq 08 --out stress-08 --corruption rotation beams-16
     """
@@ -26,33 +26,33 @@ class StressCommand:
     data: Path
     """A dataset (KITTI's layout, ready-made BEV images) or a folder of scans with poses."""
     out: Path
-    """Folder for results.json, config.json, stress.png and the descriptors; made if need be."""
+    """Folder for results.json, config.json, stress.png and the descriptors. It is created if it does not exist."""
     weights: str | None = None
-    """The name of shipped weights or a training run's folder: the network is among the methods. None: sglpr, where no
-    --method is named."""
+    """Name of shipped weights or folder of a training run; adds the network to the methods. None: sglpr if --method is
+    not given, otherwise no network."""
     method: tuple[MethodName, ...] = ()
     """Methods that need no weights."""
     protocol: tuple[str, ...] = ()
-    """Their names, or `all`. None named: top1-f1max and pairs-f1max."""
+    """Names of protocols, or `all`. If omitted, top1-f1max and pairs-f1max."""
     corruption: tuple[str, ...] = ()
-    """Names (beams-16) or kinds (beams) of corruptions. None named: all; of ready-made images rotation alone."""
+    """Names (beams-16) or kinds (beams) of corruptions. If omitted, all; for ready-made images, only rotation."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     seed: CountOrNone = 0
-    """A scan's corruption is a function of it and the scan's number."""
+    """Seed of the corruptions. The seed and the scan's number determine the corruption of a scan."""
     batch: Size = 8
-    """Images described at a time."""
+    """Maximum number of images that are described at a time."""
 
 
 def run_stress_test(command: StressCommand) -> Path:
-    """Do what the command says; returns the folder written."""
+    """Run the command. Returns the output folder."""
     from sglpr_jax.data.corruption.corruptions import (
-        chosen_corruptions,  # these bring JAX and more, which --help does not need
+        chosen_corruptions,  # slow imports, not needed for --help
     )
     from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
     from sglpr_jax.methods.registry import methods_named
 
-    stress_protocols(command.protocol)  # what is wrong with these is said first
+    stress_protocols(command.protocol)  # report invalid names before the recording is opened
     chosen_corruptions(command.corruption)
     recording = command.source.open(command.data)
     if recording.has_images and not command.corruption:
@@ -68,7 +68,7 @@ def run_stress_test(command: StressCommand) -> Path:
         progress=progress_bar,
     )
     for name, reason in found.left_out.items():
-        print(f"{name} left out: {reason}", file=sys.stderr)
+        print(f"skipped {name}: {reason}", file=sys.stderr)
     console().print(found)
     for path in write_stress_test(found, command.out):
         print(f"written: {path}")

@@ -1,4 +1,4 @@
-"""bin/train: train on all recordings but one, then test on that one, beside other methods."""
+"""bin/train: train on all recordings but one, and test on that one, beside other methods."""
 
 import dataclasses
 import sys
@@ -29,77 +29,77 @@ if TYPE_CHECKING:
     from sglpr_jax.training.recipe import TrainResult
 
 SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source")
-"""Flags that a resumed run must have the same, beside its configuration."""
+"""Flags that must be equal in a resumed run, beside its configuration."""
 SETTINGS_SINCE = ("format", "sensor_height", "skip_bad")
-"""Such flags that older runs do not know: noted where they are set."""
-GO_ON = "go on with --resume"
-"""How a run that was stopped is gone on with."""
+"""More flags of this kind, which older runs do not know. They are stored only if they differ from their defaults."""
+GO_ON = "continue with --resume"
+"""Advice for continuing a stopped run."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainCommand:
     """Train a model on all recordings of a dataset but one, and test it on that one (leave-one-out).
 
-    Examples:
+    Example:
       bin/train --seq 08                                  on the simulated recordings, preset small
       bin/train --seq 08 --data KITTI --preset paper
-      bin/train --seq 08 --data KITTI --resume            goes on where the run was stopped
+      bin/train --seq 08 --data KITTI --resume            resumes a stopped run
       bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
       bin/train --seq 08 --optimizer.learning-rate 1e-4   any field of the preset can be set
-      bin/train --seq 08 --model.head.cbam False          an ablation; docs/guides/ablations.md has all
+      bin/train --seq 08 --model.head.cbam False          an ablation; docs/guides/ablations.md lists all
       bin/train --hosts 2 --host-index 0 --coordinator 10.0.0.1:1234    one of two hosts; docs/guides/training.md
     """
 
     seq: str = "08"
-    """The recording to test on; it is never trained on."""
+    """Recording to test on. It is never trained on."""
     data: Path | None = None
-    """The dataset's folder: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
+    """Folder of the dataset: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
     also: tuple[Path, ...] = ()
-    """Further datasets, all of whose recordings are trained on, with --also-tuples of a step's tuples: simulated scans
-    or images with labels, say, beside real images without."""
+    """Further datasets, which provide --also-tuples tuples of each step. All their recordings are trained on. They
+    can add labelled simulated images to real images without labels."""
     pseudo_labels: Path | None = None
-    """Label images NN/<id>.png that a model made of the images of --data, for its recordings without labels of
-    their own; never for the one tested."""
+    """Folder of label images NN/<id>.png that a model predicted for the images of --data. They are added to training
+    recordings of images without labels. The tested recording never uses them."""
     preset: str = "small"
-    """A file of configs/ by name, or a path to one of your own."""
+    """Name of a file in configs/, or path of your own file."""
     out: Path | None = None
-    """The run's folder. None: runs/PRESET-SEQ."""
+    """Folder of the run. None: runs/PRESET-SEQ."""
     resume: bool = False
-    """Go on from the run's newest checkpoint."""
+    """Continue from the newest checkpoint of the run."""
     weights: str | None = None
-    """Weights to begin with, fresh ones where these have none (the segmentation head, say): the name of shipped ones, a
-    run's folder, or a folder with config.json and model.safetensors."""
+    """Initial weights: name of shipped weights, folder of a run, or folder with config.json and model.safetensors.
+    Missing weights, such as those of a segmentation head, are random."""
     train_seq: tuple[str, ...] = ()
-    """The recordings to train on. Empty: all but the one tested."""
+    """Recordings to train on. If omitted, all except the tested one."""
     cache: Path | None = None
-    """A folder in which the training recordings are packed, each once, to be read faster; docs/guides/training.md."""
+    """Folder in which each training recording is packed on first use, for faster reading (docs/guides/training.md)."""
     method: tuple[BesideName, ...] = BESIDE
-    """Methods that are scored beside the trained network at the end; `untrained`: this network before training;
-    `shipped`: the weights that describe where none are named."""
+    """Methods that are scored beside the trained network at the end. `untrained` is this network before training;
+    `shipped` are the default weights."""
     tensorboard: bool = False
-    """Write event files for TensorBoard too (extra `tensorboard`)."""
+    """Also write event files for TensorBoard (extra `tensorboard`)."""
     pose_source: PoseChoice = "auto"
-    """Which poses of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
+    """Pose files of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     format: ScanFormat = "auto"
-    """What each point of a .bin is, where neither its name nor a look into the files tells."""
+    """Point format of .bin files. `auto` detects it from the names or the content of the files."""
     sensor_height: SensorHeight = "auto"
-    """How many metres the sensor is above the ground; `estimate` finds it, and the tilt, from the scans, and `auto`
-    does where the layout (a plain folder, a bag) does not tell."""
+    """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scans.
+    `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
     skip_bad: bool = False
-    """Read every scan before the training, report those that cannot be read and train without them."""
+    """Read every scan before the training, report unreadable ones and train without them."""
     hosts: int = 1
-    """How many hosts train together, each started with this same command and its own index."""
+    """Number of hosts that train together. Each host runs this command with its own index."""
     host_index: int = 0
-    """Which of them this one is, from 0; the first one writes the run."""
+    """Index of this host, from 0. The first host writes the run."""
     coordinator: str | None = None
-    """HOST:PORT of the first one, any free port, where they meet."""
+    """Address of the first host, HOST:PORT, with any free port."""
     config: Annotated[TrainConfig, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff, tyro.conf.AvoidSubcommands] = (
         dataclasses.field(default_factory=TrainConfig)
     )
 
 
 def parse(arguments: list[str] | None = None) -> TrainCommand:
-    """Defaults, overridden by the preset, overridden by the flags."""
+    """Parse the command line. The preset overrides the defaults, and the flags override the preset."""
     preset = preset_asked_for(arguments, default=TrainCommand.preset)
     description = f"{TrainCommand.__doc__}\nPresets: {', '.join(preset_names())}"
     default = TrainCommand(preset=preset, config=load_preset(preset))
@@ -108,8 +108,8 @@ def parse(arguments: list[str] | None = None) -> TrainCommand:
 
 
 def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
-    """Do what the command says; returns the run's folder. `go_on` says how a stopped training can go on."""
-    from sglpr_jax.evaluation.final_test import final_test  # these bring JAX and more, which --help does not need
+    """Run the command. Returns the folder of the run. `go_on` is printed as advice if the training is stopped."""
+    from sglpr_jax.evaluation.final_test import final_test  # slow imports, not needed for --help
     from sglpr_jax.training.hosts import connected, is_first_host
 
     folder = run_folder(command)
@@ -125,12 +125,12 @@ def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
 
 
 def run_folder(command: TrainCommand) -> Path:
-    """Where everything of the run goes."""
+    """Return the folder of the run."""
     return command.out or Path("runs") / f"{Path(command.preset).stem}-{command.seq}"
 
 
 def settings(command: TrainCommand) -> dict[str, object]:
-    """What is noted of the flags, beside the configuration."""
+    """Return the flags that the run stores beside its configuration."""
     newer = [name for name in SETTINGS_SINCE if getattr(command, name) != getattr(TrainCommand, name)]
     return {name: getattr(command, name) for name in (*SETTINGS, *newer)}
 
@@ -143,7 +143,7 @@ def _train(
     *,
     go_on: str,
 ) -> "TrainResult":
-    """Train; where that is asked to stop, exit with what was made saved."""
+    """Train. If the training is asked to stop, save its state and exit."""
     from sglpr_jax.evaluation.learning_curves import LearningCurves
     from sglpr_jax.training.callbacks import Callbacks
     from sglpr_jax.training.hosts import is_first_host
@@ -174,14 +174,15 @@ def _train(
 
 
 def exit_unless_finished(result: "TrainResult", stopped: StopRequest, *, go_on: str) -> None:
-    """End this process where a training was asked to stop: with 0 after SIGTERM, with 130 after Ctrl-C."""
+    """Exit if the training was asked to stop: with status 0 after SIGTERM, with 130 after Ctrl-C."""
     if not result.finished:
         print(f"stopped at step {result.steps} of {result.config.steps}; {go_on}", file=sys.stderr)
         sys.exit(stopped.exit_status)
 
 
 def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[Recording], Recording]":
-    """The recordings to train on, those of --also, and the one to test on. ValueError where one cannot be used."""
+    """Open the training recordings, those of --also, and the test recording. Raises ValueError if one cannot be
+    used."""
     from sglpr_jax.cli.datasets import all_recordings, dataset_root, leave_one_out, without_bad_scans
 
     root = dataset_root(command.data)
@@ -190,7 +191,7 @@ def _recordings(command: TrainCommand) -> "tuple[Sequence[Recording], Sequence[R
     also = [recording for folder in command.also for recording in all_recordings(folder, **options)]
     if any(folder.resolve() == root.resolve() for folder in command.also):
         raise ValueError(
-            f"--also {root}: expected another dataset than the one whose recording {command.seq} is tested"
+            f"--also {root}: expected a dataset other than --data, whose recording {command.seq} is tested"
         )
     if command.skip_bad:
         *read, test = without_bad_scans([*recordings, *also, test], on_bad_scan=report_bad_scan)
@@ -204,10 +205,12 @@ def _pseudo_labelled(recordings: "Sequence[Recording]", folder: Path, config: Tr
     from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 
     if not config.model.segments:
-        raise ValueError("--pseudo-labels are for the segmentation head: expected losses that train one, found none")
+        raise ValueError(
+            "--pseudo-labels train the segmentation head: expected a model with one and losses for it, found none"
+        )
     labelled = with_pseudo_labels(recordings, folder)
     images = sum(sum(recording.labelled) for recording in labelled)
-    print(f"{images} of {sum(map(len, labelled))} images have labels, with those of {folder}", file=sys.stderr)
+    print(f"{images} of {sum(map(len, labelled))} images have labels, including those of {folder}", file=sys.stderr)
     return labelled
 
 

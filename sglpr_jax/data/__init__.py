@@ -1,4 +1,4 @@
-"""Data: whatever lies on disk becomes a `Recording`, and each of its scans, read once, a `Record`."""
+"""Reads datasets from disk: a `Recording` is a sequence of scans, and a `Record` is one scan with its labels."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ _HOME_OF = {
     "read_scan": "formats.scan_files",
     "recording_names": "readers",
 }
-"""Where each name is defined, to be imported when it is first asked for."""
+"""Module that defines each public name. The module is imported when the name is first used."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,5 @@
-"""What a user may choose about files: here, because a command line names it in its help without reading any file."""
+"""Types of the options for reading files. They are in a separate module, so that command-line help imports no
+readers."""
 
 from typing import Literal
 
@@ -17,12 +18,13 @@ RecordFormat = Literal[
     "float64x5",
     "float64x6",
 ]
-"""kitti is float32x4; nuscenes is float32x5 with other axes and the laser in the last column."""
+"""Format of a point in a .bin file. `kitti` is `float32x4`. `nuscenes` is `float32x5` with other axes and the laser
+number in the last column."""
 ScanFormat = Literal["auto", "pcd", "ply", "npy", "npz", "las", RecordFormat]
-"""What a scan file is; "auto": what its name says."""
+"""Format of a scan file. "auto" takes the format from the file name."""
 PoseFormat = Literal["auto", "kitti", "lidar", "tum", "csv"]
 PoseChoice = Literal["auto", "semantickitti", "kitti"]
-"""Which of the two pose files of KITTI's layout."""
+"""Pose file to read from KITTI's layout, which may contain two."""
 SensorHeight = float | Literal["auto", "estimate"]
-"""Metres over the ground; "estimate" finds them, and the tilt, from the scans; "auto" does where the layout does not
-tell how the sensor was mounted."""
+"""Height of the sensor above the ground, in metres. "estimate" estimates the height and the tilt from the scans. "auto"
+estimates them only if the layout does not define the sensor mounting."""

@@ -1,8 +1,8 @@
-"""The image domain of BEVPlace's KITTI images: a scan as the 8-bit density image that stands in such a dataset.
+"""Density images in the format of BEVPlace's KITTI images (8-bit PNG).
 
-A scan is thinned to one centroid for each voxel, so that a pixel tells how much of its column is occupied and not how
-near the sensor is. The rows of the image run against x (forward), its columns against y (left); `density_bev` is the
-image as `bev_images.read_image` reads it, in the orientation of eq. 1 and on the scale of counts.
+A scan is reduced to one centroid per voxel. A pixel thus measures how much of its column is occupied, regardless of
+its distance to the sensor. The rows of the image point against x (forward), and its columns against y (left).
+`density_bev` returns the image as `bev_images.read_image` does, in the orientation of eq. 1 and on the scale of counts.
 """
 
 import numpy as np
@@ -12,26 +12,32 @@ from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M, SIZE
 from sglpr_jax.data.readers.bev_images import as_counts
 
 REACH_M = 25.0
-"""Points count where |x| and |y| are below this."""
+"""Maximum |x| and |y| of a point, in metres."""
 FLOOR_M = -1.2
-"""Points count above this height over the sensor: some 0.5 m over the road."""
+"""Minimum height of a point above the sensor, in metres. It is about 0.5 m above the road."""
 CEILING_M = 200.0
-"""Points count below this height, which no scan reaches, so that the number of a voxel fits 32 bits."""
+"""Maximum height of a point above the sensor, in metres. No scan reaches it; it keeps voxel numbers within 32 bits."""
 MAX_VOXELS = 6000
+"""Maximum number of voxels of a scan."""
 MOST_SPREAD = 2**25
-"""Voxels whose numbers are farther apart are counted by sorting them; 2**24 is usual, a point 30 m up makes 10**8."""
+"""Maximum range of voxel numbers to be counted in an array. Larger ranges are sorted. A usual range is 2**24; a point
+30 m above the sensor increases it to 10**8."""
 SOME_POINTS, SOME_VOXELS = 18_000, 2**16
-"""A quick count sees every n-th point, but at least so many, and voxels whose numbers differ by so many as one."""
+"""The quick voxel count samples at least `SOME_POINTS` points and takes voxel numbers modulo `SOME_VOXELS`."""
 EDGE_STEP_M = 0.05
 FIRST_EDGE_M = 0.10
+"""Smallest voxel edge, in metres. `EDGE_STEP_M` is its increment."""
 BEYOND_COUNTS = 2.0
-"""An image that was resized smoothly has counts a little below 0 or above 10; what is farther off is no count."""
+"""Tolerance for counts below 0 or above 10, which smooth resizing of an image produces."""
 
 
 def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 151"]:
-    """The density image of a scan (metres, LiDAR frame) in the orientation of eq. 1, as counts 0..10 in cells of 0.4 m.
+    """Compute the density image of a scan in the orientation of eq. 1, as counts from 0 to 10 in cells of 0.4 m.
 
-    Equal to writing `density_image` as a PNG and reading that as a ready-made image.
+    The result equals writing `density_image` to a PNG and reading it as a ready-made image.
+
+    Arguments:
+      points: Points in the LiDAR frame, in metres.
     """
     return as_counts(np.rot90(density_image(points), -1))
 
@@ -39,29 +45,36 @@ def density_bev(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "151 
 def density_label_bev(
     points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
 ) -> Int32[np.ndarray, "151 151"]:
-    """The map of classes that lies on `density_bev`; see `density_label_image`."""
+    """Compute the map of classes aligned with `density_bev`. See `density_label_image`."""
     return np.ascontiguousarray(np.rot90(density_label_image(points, classes), -1))
 
 
 def check_density_counts(image: Num[np.ndarray, "h w"], *, name: str) -> None:
-    """Raise ValueError, which begins with `name`, for floats that are no counts 0 to 10: grey values, counts of points.
+    """Raise ValueError if a float image contains grey values or point counts instead of counts from 0 to 10.
 
-    To a model they would be a place like any other.
+    A model would describe a wrong image without an error.
+
+    Arguments:
+      image: Image of any type. Only floats are checked.
+      name: Name of the image for the error message.
     """
     least, most = image.min(initial=0), image.max(initial=0)
-    within = least >= -BEYOND_COUNTS and most <= MAX_COUNT + BEYOND_COUNTS  # NaN is not
+    within = least >= -BEYOND_COUNTS and most <= MAX_COUNT + BEYOND_COUNTS  # False for NaN
     if np.issubdtype(image.dtype, np.floating) and not within:
         raise ValueError(
             f"{name}: expected a density image, floats from 0 to {MAX_COUNT}, found floats from {least:g} to {most:g};"
-            f" are these grey values, of which 255 stands for {MAX_COUNT}, or counts of points?"
+            f" does the image contain grey values (255 instead of {MAX_COUNT}) or uncapped point counts?"
         )
 
 
 def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 151"]:
-    """The density image of a scan (metres, LiDAR frame): voxel centroids per cell, capped at 10, the fullest cell 255.
+    """Compute the density image of a scan: voxel centroids per cell, capped at 10 and scaled to a maximum of 255.
 
-    The voxels' edge is the smallest of 0.10, 0.15, 0.20, ... m that leaves at most 6000 voxels. Points that are not
-    finite are dropped. Pixel for pixel what the ready-made images of KITTI show.
+    The edge of the voxels is the smallest of 0.10, 0.15, 0.20, ... m that gives at most 6000 voxels. Points that are
+    not finite are dropped. The result equals KITTI's ready-made images pixel for pixel.
+
+    Arguments:
+      points: Points in the LiDAR frame, in metres.
     """
     centroids = _voxel_centroids(points.T.take(np.flatnonzero(_in_crop(points)), axis=1))
     counts = np.bincount(_cell_of_point(centroids), minlength=SIZE**2).clip(max=MAX_COUNT)
@@ -71,14 +84,15 @@ def density_image(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "151 
 def density_label_image(
     points: Float32[np.ndarray, "n 3"], classes: Int[np.ndarray, " n"]
 ) -> Int32[np.ndarray, "151 151"]:
-    """The class of the last point that falls into each cell of the scan's density image, 0 where none does.
+    """Compute the class of the last point in each cell of the density image, or 0 for cells without points.
 
-    Only points of the image's crop count. A cell is that of the point itself and not of its voxel's centroid, so at
-    the rims of things a label may stand beside a pixel that is 0, and the other way round.
+    Only points within the crop count. A label belongs to the cell of its point, but a count belongs to the cell of the
+    voxel's centroid. At the edges of objects, a cell may therefore have a label without a count, or a count without a
+    label.
     """
     counted = _in_crop(points)
     labels = np.zeros(SIZE**2, np.int32)
-    labels[_cell_of_point(points[counted].T)] = classes[counted]  # numpy keeps the last of repeated assignments
+    labels[_cell_of_point(points[counted].T)] = classes[counted]  # NumPy keeps the last of repeated assignments.
     return labels.reshape(SIZE, SIZE)
 
 
@@ -88,13 +102,13 @@ def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
 
 
 def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
-    """The flat cell of every point. Truncation makes the row and the column through the sensor two cells wide."""
+    """Returns the flat cell index of each point. Truncation makes the central row and column two cells wide."""
     row, column = SIZE // 2 - np.trunc(points[:2] / RESOLUTION_M).astype(np.int64)
     return row * SIZE + column
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
-    """The mean x and y of the points in each voxel, with the smallest edge that leaves few enough voxels."""
+    """Returns the mean x and y of the points in each voxel."""
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))
@@ -103,9 +117,9 @@ def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2
 
 
 def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
-    """The voxel of every point, for the smallest edge with which there are at most `MAX_VOXELS` of them.
+    """Returns the voxel number of each point, for the smallest edge with at most `MAX_VOXELS` voxels.
 
-    Most edges are ruled out by the quick count, which never finds more voxels than there are.
+    The quick count rules out most edges. It never exceeds the true number of voxels.
     """
     some = np.ascontiguousarray(points[:, :: max(1, points.shape[1] // SOME_POINTS)])
     edge_m = FIRST_EDGE_M
@@ -122,7 +136,7 @@ def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
 
 
 def _numbered(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """The voxels numbered without gaps, in their order."""
+    """Renumbers voxels in ascending order without gaps."""
     found = _found(voxels)
     if found is None:
         return np.unique(voxels, return_inverse=True)[1]
@@ -130,9 +144,9 @@ def _numbered(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 
 
 def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Of the numbers from the smallest to the largest, which are there: faster than to sort them, as np.unique does.
+    """Marks the numbers between the smallest and the largest that occur. This is faster than sorting with np.unique.
 
-    None where a point high in the air spreads them so far that it would not be.
+    Returns None if the range exceeds `MOST_SPREAD`, for example because of a point high in the air.
     """
     if not len(numbers):
         return np.zeros(0, bool)
@@ -146,7 +160,7 @@ def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
 
 
 def _voxel_of_point(points: Float32[np.ndarray, "3 n"], edge_m: float) -> Int32[np.ndarray, " n"]:
-    """The voxel of every point as one number; the voxels' corners are multiples of `edge_m`."""
+    """Returns the voxel of each point as one number. Voxel corners are at multiples of `edge_m`."""
     x, y, z = np.floor(points * np.float32(1 / edge_m)).astype(np.int32)
-    side = 2 * int(REACH_M / edge_m) + 4  # with room for rounding
+    side = 2 * int(REACH_M / edge_m) + 4  # The margin allows for rounding.
     return (z * side + y) * side + x

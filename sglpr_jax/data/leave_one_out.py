@@ -1,4 +1,4 @@
-"""Which recordings of a dataset are trained on and which one is tested: all but one, and that one."""
+"""Splits the recordings of a dataset for leave-one-out training: one is tested, the others are trained on."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,17 +17,30 @@ def leave_one_out(
     format: ScanFormat = "auto",
     sensor_height: SensorHeight = "auto",
 ) -> tuple[list[Recording], Recording]:
-    """Return the recordings to train on (all but `test`, or those named) and the one to test on.
+    """Open the training recordings and the test recording of a dataset.
 
-    Of the other options see `open_recording`. Raises FileNotFoundError for a recording that does not exist, ValueError
-    where the test recording would be trained on, nothing is left to train on, or a recording has no positions.
+    Arguments:
+      root: Folder of the dataset.
+      test: Name of the test recording.
+      train: Names of the training recordings. If empty, all recordings except `test` are used.
+      pose_source: See `open_recording`.
+      format: See `open_recording`.
+      sensor_height: See `open_recording`.
+
+    Returns:
+      The training recordings and the test recording.
+
+    Raises:
+      FileNotFoundError: If a recording does not exist.
+      ValueError: If `test` is among the training recordings, no training recording remains, or a recording has no
+        positions.
     """
     options = {"pose_source": pose_source, "format": format, "sensor_height": sensor_height}
     tested = open_recording(root, test, **options)
     names = tuple(train) or tuple(name for name in recording_names(root) if name != test)
     if not names or test in names:
         raise ValueError(
-            f"{root}: expected recordings to train on other than {test!r}, found {', '.join(names) or 'none'}"
+            f"{root}: expected training recordings other than {test!r}, found {', '.join(names) or 'none'}"
         )
     recordings = [open_recording(root, name, **options) for name in names]
     _require_positions(root, [*recordings, tested])
@@ -41,7 +54,10 @@ def all_recordings(
     format: ScanFormat = "auto",
     sensor_height: SensorHeight = "auto",
 ) -> list[Recording]:
-    """Return every recording of a dataset; all must have positions. Options and errors as of `leave_one_out`."""
+    """Open every recording of a dataset. All recordings must have positions.
+
+    The options and errors are those of `leave_one_out`.
+    """
     options = {"pose_source": pose_source, "format": format, "sensor_height": sensor_height}
     recordings = [open_recording(root, name, **options) for name in recording_names(root)]
     _require_positions(root, recordings)

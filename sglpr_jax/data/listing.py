@@ -1,4 +1,4 @@
-"""Which files of a folder are its scans, in the order of their numbers."""
+"""Lists the scan files of a folder in natural order."""
 
 import re
 from collections import Counter
@@ -7,15 +7,17 @@ from decimal import Decimal
 from pathlib import Path
 
 _DECIMAL = re.compile(r"(\d+\.\d+)(\.[A-Za-z]\w*)*$")
-"""The name of a file that is called by its time, with its endings."""
+"""File name that is a decimal number, such as a timestamp, followed by its extensions."""
 
 
 def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
-    """Return the files of `folder` with one of these endings, small or in capitals, in natural order.
+    """Return the files of a folder with one of the given extensions, in natural order.
 
-    None where there is no such folder.
+    Hidden files are skipped: macOS writes a `._000003.bin` beside each scan that it copies.
 
-    Hidden files are none: a Mac leaves `._000003.bin` beside each scan that it copies.
+    Arguments:
+      folder: Folder to list. If it does not exist, the result is empty.
+      endings: Extensions in lower case. The case of the file names is ignored.
     """
     if not folder.is_dir():
         return ()
@@ -23,9 +25,9 @@ def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
 
 
 def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
-    """Return paths by name, numbers in the names as numbers: full2 before full10.
+    """Sort paths by name, with numbers in names compared as numbers: full2 before full10.
 
-    Where all names are decimal numbers, as of scans that are called by their times, 1.25 is before 1.5.
+    If all names are decimal numbers, such as timestamps, they are compared as decimals: 1.25 before 1.5.
     """
     found = list(paths)
     times = {path: time[1] for path in found if (time := _DECIMAL.match(path.name))}
@@ -35,12 +37,15 @@ def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
 
 
 def hidden(path: Path) -> bool:
-    """Whether the name begins with a dot."""
+    """Return whether the name begins with a dot."""
     return path.name.startswith(".")
 
 
 def left_aside(folder: Path, taken: Iterable[Path]) -> str:
-    """Return in words what else is in a folder: its subfolders, and other files by their endings; "" for nothing."""
+    """Return a summary of the other contents of a folder: numbers of files by extension, and subfolders.
+
+    The summary is empty if the folder contains nothing else.
+    """
     known = set(taken)
     others = [path for path in folder.iterdir() if path not in known and not hidden(path)]
     folders = in_order(path for path in others if path.is_dir())
@@ -53,6 +58,6 @@ def left_aside(folder: Path, taken: Iterable[Path]) -> str:
 
 
 def _natural(name: str) -> tuple[tuple[int, int, int, str], ...]:
-    """A sorting key: the name in parts, numbers before text, equal numbers by how many digits they have."""
+    """Sort key: the parts of a name, numbers before text, and equal numbers by their number of digits."""
     parts = re.findall(r"\d+|\D+", name)
     return tuple((0, int(part), len(part), "") if part.isdecimal() else (1, 0, 0, part) for part in parts)

@@ -1,4 +1,4 @@
-"""Recordings that know how their sensor was mounted: said by the user, or found from their scans."""
+"""Adds the sensor mounting to a recording, either from the user or estimated from the scans."""
 
 import dataclasses
 
@@ -11,18 +11,24 @@ from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import require
 
 SCANS = 11
-"""From so many scans, all over a recording, the mounting is found."""
+"""Number of scans for estimating the mounting, spread over the recording."""
 SCANS_CHECKED = 3
-"""So many tell whether a sensor stands where its layout has it."""
+"""Number of scans for checking the mounting that a layout defines."""
 ELSEWHERE_M, ELSEWHERE_DEG = 0.4, 10.0
-"""A sensor so much higher, lower or more tilted than that is another one."""
+"""Maximum height difference, in metres, and maximum tilt, in degrees, of a sensor that fits its layout."""
 
 
 def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recording:
-    """The recording with the mounting that `height` asks for, and what was found in words.
+    """Return the recording with its sensor mounting, and a description of the mounting in `Recording.found`.
 
-    `known` says that the layout tells how its scans are mounted; where their ground is elsewhere, a `DataWarning` says
-    so. Where the ground does not tell it nothing is changed.
+    Recordings of images are returned unchanged. If the ground does not show the mounting, it stays unknown, and
+    models assume a sensor 1.73 m above the ground.
+
+    Arguments:
+      recording: Recording of scans or images.
+      height: Height above the ground in metres, "estimate" or "auto". "auto" estimates the mounting only if the layout
+        does not define it.
+      known: Whether the layout defines the mounting. If the scans contradict it, "auto" issues a `DataWarning`.
     """
     if recording.has_images:
         return recording
@@ -33,7 +39,7 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
         return _estimated(recording)
     require(height, not isinstance(height, str), "metres over the ground, 'auto' or 'estimate'", "sensor_height")
     mounting = Mounting(float(height))
-    return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, f"sensor: {mounting}, as said"))
+    return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, f"sensor: {mounting}, as given"))
 
 
 def _estimated(recording: Recording) -> Recording:
@@ -41,7 +47,9 @@ def _estimated(recording: Recording) -> Recording:
     mounting = common_mounting(each)
     hanging = [scan.up[2] < 0 for scan in each if scan is not None]
     if mounting is None:
-        found = f"sensor: {_unclear(hanging, len(each))}, taken to be {MODEL_HEIGHT_M} m above it; say --sensor-height"
+        found = (
+            f"sensor: {_unclear(hanging, len(each))}, assumed {MODEL_HEIGHT_M} m above the ground; set --sensor-height"
+        )
     else:
         agreed = hanging.count(mounting.up[2] < 0)
         found = f"sensor: {mounting}, estimated from the ground in {agreed} of {len(each)} scans"
@@ -49,33 +57,37 @@ def _estimated(recording: Recording) -> Recording:
 
 
 def _unclear(hanging: list[bool], scans: int) -> str:
-    """Why the scans tell no mounting; `hanging` says of each that shows ground whether the sensor hangs there."""
+    """Explains why the scans show no mounting. `hanging` states for each scan with ground whether the sensor is upside
+    down."""
     if 2 * len(hanging) < scans:
         return f"ground found in {len(hanging)} of {scans} scans (is z up in these files?)"
-    return f"the ground is below it in {hanging.count(False)} of {scans} scans and above it in {hanging.count(True)}"
+    return (
+        f"the ground is below the sensor in {hanging.count(False)} of {scans} scans and above it in"
+        f" {hanging.count(True)}"
+    )
 
 
 def _check_layout(recording: Recording) -> None:
-    """Warn where the ground lies elsewhere than the layout has it: other sensors' scans are often put into KITTI's."""
+    """Warns if the scans contradict the mounting of the layout, as scans of other sensors in KITTI's layout do."""
     believed = recording.mounting or Mounting(MODEL_HEIGHT_M)
     found = common_mounting(_of_scans(recording, SCANS_CHECKED))
     if found is None:
         return
     if abs(found.height_m - believed.height_m) > ELSEWHERE_M or found.tilt_deg > ELSEWHERE_DEG:
         warn(
-            f"sequence {recording.name}: expected the sensor {believed}, as its layout has it, found it {found}; if it"
-            " is another sensor say --sensor-height estimate, or its height in metres"
+            f"sequence {recording.name}: expected the sensor {believed}, as its layout defines, found it {found}; for"
+            " another sensor pass --sensor-height estimate, or its height in metres"
         )
 
 
 def _of_scans(recording: Recording, scans: int) -> list[Mounting | None]:
-    """What so many scans tell, all over the recording."""
+    """Estimates the mounting from each of a number of scans, spread over the recording."""
     rows = np.unique(np.linspace(0, len(recording) - 1, scans).astype(int))
     return [_of_scan(recording, int(row)) for row in rows]
 
 
 def _of_scan(recording: Recording, row: int) -> Mounting | None:
-    """The mounting that one scan tells; a scan that cannot be read tells none."""
+    """Estimates the mounting from one scan, or returns None if the scan cannot be read."""
     try:
         return estimate_mounting(recording.points(row))
     except (ValueError, OSError):

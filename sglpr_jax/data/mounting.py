@@ -1,7 +1,7 @@
-"""How a sensor is mounted: its height over the ground, and where up is; and the ground that tells it.
+"""Mounting of a sensor: its height above the ground and the direction of up, and their estimation from the ground.
 
-A density image leaves out what lies more than 1.2 m below the sensor, which is right for a sensor 1.73 m above a road.
-Clouds of other sensors are brought there: turned upright, and moved up or down.
+A density image omits points more than 1.2 m below the sensor, which suits a sensor 1.73 m above a road. Points of other
+sensors are rotated to be gravity-aligned and shifted to this height.
 """
 
 import math
@@ -12,39 +12,44 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 MODEL_HEIGHT_M = 1.73
-"""Above the road: KITTI's Velodyne, that of the simulator, and so that of all weights that ship."""
+"""Sensor height that all shipped weights assume, in metres: that of KITTI's Velodyne and of the simulator."""
 HEIGHTS_M = (-0.5, 4.5)
-"""Between which a sensor's height is sought: points in the vehicle's own frame, a lorry's roof."""
+"""Range of possible sensor heights, in metres: from points in the vehicle's own frame to the roof of a lorry."""
 LEAST_HANGING_M = 0.2
-"""Of a sensor that hangs upside down."""
+"""Minimum height of an upside-down sensor, in metres."""
 STEEPEST_DEG = 35.0
-"""Farthest of the sensor's z axis from up, or from down."""
+"""Maximum angle between the sensor's z axis and up, or down, in degrees."""
 LEVEL_DEG = 2.0
-"""Less than this is the road's slope and the springs', not the mounting's."""
+"""Minimum tilt of a mounting, in degrees. Smaller tilts come from the slope of the road or the suspension and are
+ignored."""
 NEAR_M = (0.8, 25.0)
-"""The ground is sought where the points are so far from the sensor."""
+"""Range of distances from the sensor at which the ground is searched, in metres."""
 VOXEL_M = 0.4
-"""One point of each such voxel is taken, because most points lie on the nearest metres of ground."""
+"""Edge of a voxel, in metres. One point per voxel is used, because most points lie on the nearest metres of ground."""
 THICK_M = 0.12
-"""Points so far from the plane are of the ground."""
+"""Maximum distance of a ground point from the plane, in metres."""
 MOST_BELOW = 0.1
-"""Share of the points that may lie below the ground: mirror images, and slopes that go down."""
+"""Maximum fraction of points below the ground, such as reflections and descending slopes."""
 LEAST_SHARE = 0.05
 LEAST_POINTS = 40
-"""Of the voxels, and how many of them, must be of the ground."""
+"""Minimum fraction (`LEAST_SHARE`) and number of points on the ground."""
 MOST_POINTS = 6000
-"""As many of them are enough."""
+"""Maximum number of points for the search. Larger clouds are subsampled."""
 TRIALS = 400
+"""Number of point triples that RANSAC samples."""
 UPSIDE_DOWN = 2.0
-"""How many times as much ground must lie above a sensor as below for it to hang upside down: rooms have ceilings."""
+"""Minimum ratio of ground points above a sensor to those below if it hangs upside down. It exceeds 1 because rooms have
+ceilings."""
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """A sensor's height over the ground and, in its own frame, the direction of up (of length 1)."""
+    """Height of a sensor above the ground, and the direction of up in the sensor frame."""
 
     height_m: float
+    """Height above the ground, in metres."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction of up in the sensor frame, a unit vector."""
 
     def __post_init__(self):
         if not (math.isfinite(self.height_m) and -1 < self.height_m < 100):
@@ -52,19 +57,19 @@ class Mounting:
 
     @property
     def tilt_deg(self) -> float:
-        """The angle between the sensor's z axis and up; 180 where it hangs upside down."""
+        """Angle between the sensor's z axis and up, in degrees. It is 180 for an upside-down sensor."""
         return math.degrees(math.acos(min(1.0, max(-1.0, self.up[2]))))
 
     @property
     def upright_from_lidar(self) -> Float[np.ndarray, "3 3"]:
-        """The rotation that turns up to z, by the smallest angle; after half a turn about x for what hangs."""
+        """Smallest rotation that maps up to z. For an upside-down sensor, a half rotation about x comes first."""
         half = np.diag([1.0, -1.0, -1.0]) if self.up[2] < 0 else np.eye(3)
         x, y, z = half @ np.array(self.up)
         cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
         return (np.eye(3) + cross + cross @ cross / (1 + z)) @ half
 
     def level(self, points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
-        """Points (n, 3) as an upright sensor at `MODEL_HEIGHT_M` has them. Those that are not finite stay so."""
+        """Transform points (n, 3) to the frame of a gravity-aligned sensor at `MODEL_HEIGHT_M`. NaN stays NaN."""
         if self.up == (0.0, 0.0, 1.0):
             lifted = points.copy(order="K")
             lifted[:, 2] += np.float32(self.height_m - MODEL_HEIGHT_M)
@@ -81,10 +86,17 @@ class Mounting:
 
 
 def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
-    """Find the ground of one scan (metres): the plane below which next to nothing lies; None where there is none.
+    """Estimate the mounting of a sensor from the ground in one scan.
 
-    Planes through three points are tried (RANSAC, always the same ones of a cloud), the best one is fitted to all its
-    points. It may be tilted by 35 degrees against the sensor's z axis, and the sensor may hang upside down.
+    RANSAC searches for the plane with the most points and almost no points below it. A least-squares fit to the ground
+    points refines the plane. The plane may be tilted by up to 35 degrees against the sensor's z axis, and the sensor
+    may hang upside down. The result is deterministic.
+
+    Arguments:
+      points: Points in the LiDAR frame, in metres.
+
+    Returns:
+      The mounting, or None if no ground is found.
 
     Example:
       mounting = estimate_mounting(recording.points(0))
@@ -107,10 +119,16 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
 
 
 def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
-    """Return the median of what the scans of a recording tell; None where fewer than half of them tell anything.
+    """Combine the mountings estimated from the scans of a recording into their median.
 
-    Those that disagree with most on whether the sensor hangs upside down are left out; None too where as many say one
-    as the other. A tilt below 2 degrees counts as none.
+    If some scans show an upright sensor and others an upside-down one, only the majority counts. A tilt below 2 degrees
+    is set to zero.
+
+    Arguments:
+      found: Mounting of each scan, or None for scans without ground.
+
+    Returns:
+      The median, or None if fewer than half of the scans have a mounting, or if there is no majority.
     """
     scans = list(found)
     seen = [mounting for mounting in scans if mounting is not None]
@@ -126,17 +144,18 @@ def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
 
 
 def _on_one_side(seen: Sequence[Mounting]) -> Sequence[Mounting]:
-    """The upright ones or those that hang, whichever are more: opposite directions have no median. None at a tie."""
+    """Returns the upright or the upside-down mountings, whichever are more, because opposite directions have no
+    median."""
     hanging = [mounting for mounting in seen if mounting.up[2] < 0]
     upright = [mounting for mounting in seen if mounting.up[2] >= 0]
     return [] if len(hanging) == len(upright) else max(hanging, upright, key=len)
 
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """One point of every voxel near the sensor, the first in the file."""
+    """Returns the first point of each voxel near the sensor."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = points.T.astype(np.float64)
-        distance = np.sqrt(x * x + y * y + z * z)  # neither near nor far where a coordinate is not finite
+        distance = np.sqrt(x * x + y * y + z * z)  # NaN and infinity fail the next test.
         near = points[(distance > NEAR_M[0]) & (distance < NEAR_M[1])].astype(np.float64)
     if not len(near):
         return near
@@ -146,17 +165,21 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def _planes(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
-    """Planes that may be the ground: normals that point up, and the sensor's heights above the planes."""
+    """Samples planes that may be the ground. Returns normals that point up, and heights of the sensor above the
+    planes."""
     rng = np.random.default_rng(0)
     first = rng.integers(len(points), size=TRIALS)
-    near = rng.normal(scale=len(points) / 8, size=(2, TRIALS)).astype(int) + first  # neighbours in the file, often
+    near = rng.normal(scale=len(points) / 8, size=(2, TRIALS)).astype(int) + first  # often neighbours in the file
     a, b, c = (points[index % len(points)] for index in (first, *near))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     kept = np.abs(normals[:, 2]) > np.maximum(np.cos(np.radians(STEEPEST_DEG)) * lengths, 0.5)
     normals = (normals / np.copysign(np.maximum(lengths, 1e-9), normals[:, 2])[:, None])[kept]
     heights = -np.einsum("ti,ti->t", normals, a[kept])
-    normals, heights = np.concatenate([normals, -normals]), np.concatenate([heights, -heights])  # either side is up
+    normals, heights = (
+        np.concatenate([normals, -normals]),
+        np.concatenate([heights, -heights]),
+    )  # Either side may be up.
     kept = (heights >= np.where(normals[:, 2] > 0, HEIGHTS_M[0], LEAST_HANGING_M)) & (heights <= HEIGHTS_M[1])
     return normals[kept], heights[kept]
 
@@ -164,7 +187,7 @@ def _planes(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "t 3"],
 def _fitted(
     points: Float[np.ndarray, "n 3"], ground: Bool[np.ndarray, " n"], up: Float[np.ndarray, "3"]
 ) -> Mounting | None:
-    """The plane of least squares through the points of the ground, and those that are then of the ground."""
+    """Fits a plane to the ground points by least squares and selects the ground points again, four times."""
     normal, centre = up, np.zeros(3)
     for _ in range(4):
         if ground.sum() < LEAST_POINTS or ground.mean() < LEAST_SHARE:

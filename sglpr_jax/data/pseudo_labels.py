@@ -1,6 +1,6 @@
-"""Labels that a model made (pseudo-labels), beside images that have none of their own.
+"""Adds labels that a model predicted (pseudo-labels) to images without labels.
 
-06/000000.png   the label image (`label_images.py`) of image 000000 of recording 06; `bin/segment` writes such files
+06/000000.png   label image (`label_images.py`) of image 000000 of recording 06, as written by `bin/segment`
 """
 
 import dataclasses
@@ -11,16 +11,19 @@ from sglpr_jax.data.recording import Recording
 
 
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
-    """Return the recordings, those of images without any labels with the label images of `folder`.
+    """Return the recordings, with label images from `folder` added to recordings of images without labels.
 
-    An image without a label image stays unlabelled. Raises FileNotFoundError where `folder` has none for any recording.
+    An image without a label image stays unlabelled.
+
+    Raises:
+      FileNotFoundError: If `folder` has no label image for any recording.
     """
     labelled = [_labelled(recording, folder / recording.name) for recording in recordings]
     if not any(new is not old for new, old in zip(labelled, recordings, strict=True)):
         wanted = [each.name for each in recordings if each.has_images and not each.has_labels]
         raise FileNotFoundError(
-            f"{folder}: expected label images NN/<id>.png of recordings of images without labels of their own "
-            f"({', '.join(wanted) or 'of which there are none'}), found none"
+            f"{folder}: expected label images NN/<id>.png for the image recordings without labels "
+            f"({', '.join(wanted) or 'the data has no image recording without labels'}), found none"
         )
     return labelled
 

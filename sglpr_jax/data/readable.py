@@ -1,4 +1,4 @@
-"""A recording without the scans that cannot be read, for whoever reads it again and again in any order."""
+"""Removes unreadable scans from a recording, for programs that read the recording repeatedly and in any order."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -13,10 +13,17 @@ def readable(
     on_bad_scan: Callable[[str, Exception], None],
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Recording:
-    """Read every scan or image, with its labels, and return the recording of those that can be read and show a place.
+    """Read every scan or image with its labels, and return the recording without invalid scans.
 
-    The others are told to `on_bad_scan(id, error)`, and `on_progress` is told how many are done. Raises ValueError
-    where none can be read.
+    A scan is invalid if it cannot be read or shows no place (`check_cloud`).
+
+    Arguments:
+      recording: Recording to read.
+      on_bad_scan: Called with the id and the error of each invalid scan.
+      on_progress: Called with the number of scans read.
+
+    Raises:
+      ValueError: If all scans are invalid.
     """
     good = []
     for row, scan in enumerate(recording.ids):
@@ -34,7 +41,7 @@ def readable(
 
 
 def only(recording: Recording, rows: Sequence[int]) -> Recording:
-    """The recording of some of its scans or images."""
+    """Return the recording with only the given scans or images."""
     return dataclasses.replace(
         recording,
         ids=tuple(recording.ids[row] for row in rows),

@@ -1,4 +1,4 @@
-"""What a reader of a dataset's layout is: each file of `data/readers` defines one, under the name READER."""
+"""Interface of a dataset reader. Each file in `data/readers` defines a `Reader` with the name READER."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,18 +11,21 @@ from sglpr_jax.fields import check_value, field_types
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a user may say about a dataset; a reader uses what concerns it. Raises ValueError for an unknown choice."""
+    """User options for reading a dataset. A reader ignores options that do not apply to it.
+
+    Raises ValueError if a choice is unknown.
+    """
 
     pose_source: PoseChoice = "auto"
     format: ScanFormat = "auto"
-    """What each point of a .bin is, in a plain folder or KITTI's layout."""
+    """Format of the points in a .bin file, for a plain folder or KITTI's layout."""
     poses: Path | None = None
-    """The pose file of a plain folder, where it does not lie beside the scans."""
+    """Pose file of a plain folder, if it is not beside the scans."""
     pose_format: PoseFormat = "auto"
     times: Path | None = None
-    """Seconds, one number a line."""
+    """File with one time per line, in seconds."""
     pose_topic: str | None = None
-    """The topic of a bag's poses, where it has several."""
+    """Topic of the poses in a bag that has several."""
 
     def __post_init__(self):
         for name in ("pose_source", "format", "pose_format"):
@@ -31,19 +34,21 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class Reader:
-    """One layout of a dataset on disk."""
+    """Reader for one dataset layout."""
 
     layout: str
-    """How to recognise it, for a message: "sequences/NN/velodyne/*.bin (KITTI)"; empty where it is always refused."""
+    """Pattern of the files for error messages: "sequences/NN/velodyne/*.bin (KITTI)". Empty if the layout is always
+    rejected."""
     recording_names: Callable[[Path], tuple[str, ...]]
-    """The names of the recordings in a folder, in order; none where the folder has another layout."""
+    """Returns the names of the recordings in a folder, in order. Empty if the folder has another layout."""
     open: Callable[[Path, str, ReadOptions], Recording]
-    """Open one of them."""
+    """Opens the recording with the given name in a folder."""
     knows_mounting: bool = True
-    """Whether scans of this layout come from sensors as models know them; else the mounting is estimated."""
+    """Whether the layout defines the sensor mounting. Otherwise the mounting is estimated."""
     rank: int = 5
-    """Where two layouts fit one folder, that of the lower rank is taken; then the first by name of its file."""
+    """Priority if several layouts fit a folder. The lowest rank is used, then the first file name in alphabetical
+    order."""
     takes_poses: bool = False
-    """Whether `ReadOptions.poses` and `times` concern it; else the layout has pose files of its own."""
+    """Whether `ReadOptions.poses` and `times` apply. Otherwise the layout has its own pose files."""
     takes_pose_topic: bool = False
-    """Whether `ReadOptions.pose_topic` concerns it."""
+    """Whether `ReadOptions.pose_topic` applies."""

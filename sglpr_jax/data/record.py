@@ -1,4 +1,4 @@
-"""What was read of one scan, or of one ready-made image: its points or pixels, labels and lasers, from one read."""
+"""Data of one scan or one ready-made image: points or pixels, labels and lasers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,43 +16,50 @@ from sglpr_jax.labels import to_classes
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One scan (`points`) or one ready-made image (`image`); whatever it has not, or was not asked for, is None."""
+    """One scan (`points`) or one ready-made image (`image`). Missing or unrequested fields hold None."""
 
     points: Float32[np.ndarray, "n 3"] | None = None
-    """Metres in the LiDAR frame: x forward, y left, z up. Some may not be finite."""
+    """Points in the LiDAR frame, in metres: x forward, y left, z up. Some may not be finite."""
     image: Float32[np.ndarray, "h w"] | None = None
-    """In the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
+    """Image in the orientation of eq. 1 (`image[v, u]`, x to the right, y up), on the scale of counts."""
     labels: Int32[np.ndarray, "..."] | None = None
-    """Raw SemanticKITTI ids, one per point or pixel; 0 is a point or pixel whose class is not known."""
+    """Raw SemanticKITTI ids, one per point or pixel. 0 means an unknown class."""
     labels_file: Path | None = None
-    """Where they were read from, for messages."""
+    """File of the labels, for error messages."""
     lasers: Int32[np.ndarray, " n"] | None = None
-    """The number of the laser that each point is from, where the file says so."""
+    """Laser number of each point, if the file contains it."""
     name: str = ""
-    """For messages: "scan 000052 of sequence 08"."""
+    """Name for error messages: "scan 000052 of sequence 08"."""
     position: Float[np.ndarray, " 3"] | None = None
-    """Metres, z up."""
+    """Position in metres, z up."""
     time: float | None = None
-    """Seconds."""
+    """Time in seconds."""
     mounting: Mounting | None = None
-    """How the sensor was mounted; None: as models know it."""
+    """Mounting of the sensor. None means gravity-aligned, 1.73 m above the ground."""
 
     @property
     def upright_points(self) -> Float32[np.ndarray, "n 3"]:
-        """The points as an upright sensor 1.73 m above the ground has them, which is what models see of a scan."""
+        """Points as seen by a gravity-aligned sensor 1.73 m above the ground. Models use these points."""
         assert self.points is not None
         return self.points if self.mounting is None else self.mounting.level(self.points)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """That of the labels: (n,) of a scan, (h, w) of an image."""
+        """Shape of the labels: (n,) for a scan, (h, w) for an image."""
         seen = self.image if self.points is None else self.points[:, 0]
         return () if seen is None else seen.shape
 
     def classes(self, categories: int) -> Int32[np.ndarray, "..."] | None:
-        """The class of every point or pixel among so many (docs/reference/labels.md), or None without labels.
+        """Convert the labels to classes.
 
-        Raises ValueError, naming the file of the labels where it is known, for ids that do not exist.
+        Arguments:
+          categories: Number of classes (docs/reference/labels.md).
+
+        Returns:
+          The class of every point or pixel, or None without labels.
+
+        Raises:
+          ValueError: If a label id does not exist. The message names the label file if it is known.
         """
         if self.labels is None:
             return None
@@ -63,7 +70,7 @@ class Record:
 
 
 ReadRecord = Callable[[Path, Path | None, bool], Record]
-"""Reads a record: the file of the scan or image, that of its labels (None: without), and whether lasers are wanted."""
+"""Reads a record from the file of a scan or image, its label file (None: no labels), and whether to read lasers."""
 
 
 def scan_record(
@@ -74,9 +81,18 @@ def scan_record(
     format: ScanFormat = "auto",
     records: RecordFormat = "kitti",
 ) -> Record:
-    """Read a scan, each of its files once; "auto" takes a .bin whose name says nothing for `records`.
+    """Read a scan and its labels, each file once.
 
-    Raises what `read_scan` and `read_labels` raise: ValueError, for instance, where there is not one label per point.
+    Arguments:
+      path: File of the scan.
+      labels: File of the labels, or None.
+      lasers: Whether to return the laser numbers.
+      format: Format of the scan file.
+      records: Format of a .bin file that "auto" cannot determine from the name.
+
+    Raises:
+      ValueError: If a file is malformed, or the number of labels differs from the number of points. Other errors are
+        those of `read_scan` and `read_labels`.
     """
     points, laser_of_point = read_points_and_lasers(path, format=format, records=records)
     raw = None if labels is None else read_labels(labels, points=len(points))
@@ -86,6 +102,9 @@ def scan_record(
 def image_record(
     path: Path, labels: Path | None = None, lasers: bool = False, *, read: Callable[[Path], Float32[np.ndarray, "h w"]]
 ) -> Record:
-    """Read a ready-made image with `read`, and its label image. Raises what these raise. No image has lasers."""
+    """Read a ready-made image with `read`, and its label image. Images have no lasers.
+
+    Errors are those of `read` and `read_label_image`.
+    """
     image = read(path)
     return Record(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))

@@ -1,4 +1,4 @@
-"""What every reader returns: the scans, or ready-made BEV images, of one sequence. A file is read when asked for."""
+"""The `Recording` type that every reader returns: scans or ready-made BEV images of one sequence, read on access."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from sglpr_jax.data.record import ReadRecord, Record
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Scans, or ready-made images, in the order they were taken, with positions, times and labels where known.
+    """Scans or ready-made images in the order of recording, with positions, times and labels if known.
 
-    One type for what lies in files and for what is packed, corrupted or simulated: they differ in `read` alone.
+    Recordings from files, packs, corruptions and the simulator differ only in `read`.
 
     Example:
       recording = open_recording(root, "08")
@@ -24,46 +24,48 @@ class Recording:
 
     name: str
     ids: tuple[str, ...]
-    """The files' stems: "000052"."""
+    """Name of each scan, the stem of its file: "000052"."""
     positions: Float[np.ndarray, "n 3"] | None
-    """Metres, z up, or None where nothing tells them."""
+    """Positions in metres, z up, or None if unknown."""
     times: Float[np.ndarray, " n"] | None
-    """Seconds, or None."""
+    """Times in seconds, or None if unknown."""
     pose_source: str | None
-    """Where the positions come from."""
+    """Source of the positions, or None."""
     paths: tuple[Path, ...]
-    """The files of the scans or images."""
+    """Files of the scans or images."""
     read: ReadRecord
-    """How a record is read from its files."""
+    """Function that reads a record from its files."""
     label_paths: tuple[Path | None, ...] = ()
-    """The files of labels: None for each scan or image without; empty for none at all."""
+    """Label file of each scan or image, None if it has no labels. Empty if the recording has no labels."""
     resolution_m: float | None = None
-    """The edge of a pixel of ready-made images, in metres; None for scans."""
+    """Edge of a pixel of ready-made images, in metres. None for scans."""
     on_disk: bool = True
-    """Whether `read` gives what the files hold: not where it is packed, corrupted or simulated."""
+    """Whether `read` returns the content of the files. False for packed, corrupted and simulated recordings."""
     mounting: Mounting | None = None
-    """The sensor's height and tilt, where they are not those that models know; None: as the points are."""
+    """Height and tilt of the sensor. None means gravity-aligned, 1.73 m above the ground."""
     world_from_lidar: Float[np.ndarray, "n 4 4"] | None = None
-    """Poses of the LiDAR, where a bag's messages tell rotations too, in the frame of these; None of other layouts."""
+    """Poses of the LiDAR in the frame of a bag's messages, if these contain rotations. None for other layouts."""
     found: tuple[str, ...] = ()
-    """What the reader found, for a person: the format of the scans, what was left aside."""
+    """What the reader found, in words: the format of the scans and the ignored files."""
 
     def __post_init__(self):
-        """Raise ValueError where two scans have one id, or something is not there once for each scan."""
+        """Raises ValueError if two scans have the same id, or if a field does not have one entry per scan."""
         if len(set(self.ids)) < len(self.ids):
             twice = next(name for name in self.ids if self.ids.count(name) > 1)
-            raise ValueError(f"sequence {self.name}: expected an id of its own for each scan, found {twice!r} twice")
+            raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {twice!r} twice")
         for name in ("paths", "positions", "times", "label_paths", "world_from_lidar"):
             values = getattr(self, name)
             if values is not None and len(values) != len(self) and not (name == "label_paths" and not values):
-                raise ValueError(f"sequence {self.name}: expected {len(self)} {name}, one a scan, found {len(values)}")
+                raise ValueError(
+                    f"sequence {self.name}: expected {len(self)} {name}, one per scan, found {len(values)}"
+                )
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @property
     def description(self) -> tuple[str, ...]:
-        """Everything that was found, a line each: how many scans, their format, times, poses and their frame."""
+        """Description in words, one line each: number of scans, their format, times and poses."""
         times = "none" if self.times is None else f"over {np.ptp(self.times):.1f} s"
         return (
             f"{self.name}: {len(self)} {'images' if self.has_images else 'scans'}",
@@ -73,7 +75,7 @@ class Recording:
 
     @property
     def _extent(self) -> str:
-        """How far the positions reach, in words: a wrong frame shows in the height."""
+        """Extent of the positions in words. A large height indicates a wrong frame."""
         if self.positions is None or not len(self):
             return ""
         x, y, z = np.ptp(self.positions, axis=0)
@@ -81,12 +83,12 @@ class Recording:
 
     @property
     def has_images(self) -> bool:
-        """Whether these are ready-made images; else they are scans."""
+        """Whether the recording contains ready-made images instead of scans."""
         return self.resolution_m is not None
 
     @property
     def labelled(self) -> tuple[bool, ...]:
-        """Which scans or images have labels."""
+        """Whether each scan or image has labels."""
         return tuple(path is not None for path in self.label_paths) or (False,) * len(self)
 
     @property
@@ -96,14 +98,21 @@ class Recording:
 
     @property
     def read_options(self) -> dict[str, str]:
-        """The options with which files are read that can be named: the format of the scans, say."""
+        """Read options that are strings, such as the format of the scans."""
         options = getattr(self.read, "keywords", {})
         return {name: value for name, value in options.items() if isinstance(value, str)}
 
     def record(self, i: int, *, labels: bool = True, lasers: bool = False) -> Record:
-        """Read scan or image `i`, each of its files once; without `labels` the file of labels is left alone.
+        """Read scan or image `i`, each of its files once.
 
-        Raises FileNotFoundError, and ValueError where a file is malformed or the labels do not fit.
+        Arguments:
+          i: Index of the scan or image.
+          labels: Whether to read the labels.
+          lasers: Whether to return the laser numbers.
+
+        Raises:
+          FileNotFoundError: If a file does not exist.
+          ValueError: If a file is malformed or the labels do not fit.
         """
         label_path = self.label_paths[i] if labels and self.label_paths else None
         return dataclasses.replace(
@@ -115,19 +124,20 @@ class Recording:
         )
 
     def points(self, i: int) -> Float32[np.ndarray, "n 3"]:
-        """Read the points of scan `i`; ValueError where these are images."""
+        """Read the points of scan `i`. Raises ValueError if the recording contains images."""
         points = self.record(i, labels=False).points
         if points is None:
             raise ValueError(f"sequence {self.name}: expected scans, found ready-made images")
         return points
 
     def image(self, i: int) -> Float32[np.ndarray, "h w"]:
-        """Read image `i`; ValueError where these are scans."""
+        """Read image `i`. Raises ValueError if the recording contains scans."""
         image = self.record(i, labels=False).image
         if image is None:
             raise ValueError(f"sequence {self.name}: expected ready-made images, found scans")
         return image
 
     def labels(self, i: int) -> Int32[np.ndarray, "..."] | None:
-        """Read the labels of scan or image `i`, which is read too, since they must fit; `record` has both."""
+        """Read the labels of scan or image `i`. This also reads the scan, to check that the labels fit; see
+        `record`."""
         return self.record(i).labels if self.labelled[i] else None

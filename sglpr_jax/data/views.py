@@ -1,7 +1,7 @@
-"""From a record to what a model sees of it: its image and, where asked for, its map of classes.
+"""Converts a record to the input of a model: its image and, if requested, its map of classes.
 
-`view` does all of it for one record. Training takes the same road in two parts: `picture` or the points of a record on
-the host, then `image_view` or `cloud_view` of a whole batch, inside its compiled step.
+`view` converts one record. Training divides the work: the host computes `picture` or the points of each record, and the
+compiled step applies `image_view` or `cloud_view` to a whole batch.
 """
 
 from typing import Any, NamedTuple
@@ -26,15 +26,15 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.grid import Grid, ImageKind
 
 _POINTS_STEP = 16384
-"""Clouds are padded to a multiple of this, so that few sizes are compiled."""
+"""Clouds are padded to a multiple of this number of points, so that few sizes are compiled."""
 
 
 class View(NamedTuple):
-    """What a model sees."""
+    """Input of a model."""
 
     image: Float[Array | np.ndarray, "*b h w"]
     classes: Int[Array | np.ndarray, "*b h w"] | None = None
-    """The class of every cell, 0 where it is empty or not known; None where nobody asked."""
+    """Class of every cell, 0 for empty and unlabelled cells. None if no classes were requested."""
 
 
 def view(
@@ -45,12 +45,18 @@ def view(
     categories: int = 0,
     angle: Float[Array | np.ndarray, ""] | None = None,
 ) -> View:
-    """The image (h, w) of a record on `grid` and, with `categories`, its map of so many classes (h, w).
+    """Compute the image (h, w) of a record on a grid and, if requested, its map of classes (h, w).
 
-    `image` says what the points of a scan are made into; a ready-made image is cut to the grid, or left whole with
-    None. With `angle` (radians, counter-clockwise) the place is rotated first. Raises ValueError for a scan that shows
-    no place (`check_cloud`) or has no grid, for a grid that has no density image, for a ready-made image that is none
-    of densities where one is asked for, and for a record without the labels asked for.
+    Arguments:
+      record: Scan or ready-made image.
+      grid: Grid of the image. Ready-made images are cropped to it, or kept whole with None.
+      image: Kind of image to compute from the points of a scan.
+      categories: Number of classes of the map; 0 for no map.
+      angle: Angle by which the place is rotated first, in radians, counter-clockwise.
+
+    Raises:
+      ValueError: If a scan shows no place (`check_cloud`) or has no grid, if a density image is requested but the grid
+        or the ready-made image does not fit, or if requested labels are missing.
     """
     classes = classes_of(record, categories) if categories else None
     if record.points is None:
@@ -58,7 +64,7 @@ def view(
         return image_view(*picture(record, classes), grid, angle)
     check_cloud(record.points, name=record.name)
     if grid is None:
-        raise ValueError("scans need a grid to be rasterised on, found none")
+        raise ValueError("expected a grid for rasterising a scan, found none")
     if image == "density":
         check_density_grid(grid)
         points = record.upright_points if angle is None else rotated(record.upright_points, float(angle))
@@ -70,13 +76,13 @@ def view(
 
 
 def check_ready_made(record: Record, image: ImageKind) -> None:
-    """Raise ValueError for a record with a ready-made image that cannot be of this kind."""
+    """Raise ValueError if a record has a ready-made image that is not of the given kind."""
     if image == "density" and record.image is not None:
         check_density_counts(record.image, name=record.name)
 
 
 def classes_of(record: Record, categories: int) -> Int32[np.ndarray, "..."]:
-    """The class of every point or pixel; ValueError where the record has no labels."""
+    """Return the class of every point or pixel. Raises ValueError if the record has no labels."""
     classes = record.classes(categories)
     if classes is None:
         raise ValueError(f"{record.name}: expected labels, found none")
@@ -86,7 +92,7 @@ def classes_of(record: Record, categories: int) -> Int32[np.ndarray, "..."]:
 def picture(
     record: Record, classes: Int32[np.ndarray, "..."] | None
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"] | None]:
-    """A ready-made image, or the density image of a scan, whole; and the map of `classes` that lies on it."""
+    """Return the whole ready-made image, or the whole density image of a scan, and its map of `classes`."""
     if record.points is None:
         assert record.image is not None
         return record.image, classes
@@ -100,7 +106,11 @@ def image_view(
     grid: Grid | None,
     angle: Float[Array | np.ndarray, "*b"] | None = None,
 ) -> View:
-    """The view of whole images with their maps: on even cells, rotated by `angle`, cut to `grid` (None: left whole)."""
+    """Return the view of whole images and maps, rotated by `angle` and cropped to `grid`.
+
+    With a grid, the wide central row and column of density images are split first (`even_cells`). With `grid=None`,
+    images stay whole.
+    """
 
     def see(whole: Any, rotate: Any) -> Array | np.ndarray:
         whole = whole if grid is None else even_cells(whole)
@@ -117,14 +127,22 @@ def cloud_view(
     grid: Grid,
     angle: Float[Array | np.ndarray, "*b"] | None = None,
 ) -> View:
-    """The view of padded clouds, `count` points of each, with the classes of their points: eq. 1 after a rotation."""
+    """Return the view of padded clouds: a rotation, then rasterisation by eq. 1.
+
+    Arguments:
+      points: Points of each cloud, padded.
+      classes: Class of each point, or None.
+      count: Number of points of each cloud without padding.
+      grid: Grid of the image.
+      angle: Angle of each rotation in radians, or None.
+    """
     points = points if angle is None else rotate_points(points, angle)
     counts = rasterize(points, grid=grid, count=count).astype(jnp.float32)
     return View(counts, None if classes is None else rasterize_labels(points, classes, grid=grid, count=count))
 
 
 def rotated(points: Float32[np.ndarray, "n 3"], angle: float) -> Float32[np.ndarray, "n 3"]:
-    """What `bev.rotate_points` returns, without compiling for every number of points."""
+    """Return the result of `bev.rotate_points` without compiling for each number of points."""
     x, y, z = points.astype(np.float64).T
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1).astype(np.float32)

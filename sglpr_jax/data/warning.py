@@ -1,12 +1,12 @@
-"""What looks wrong in the data but can be read: told, not raised."""
+"""Warnings about data that looks wrong but can be read."""
 
 import warnings
 
 
 class DataWarning(UserWarning):
-    """Data can be read but does not look as expected; the message names the file, what was expected and found."""
+    """Data can be read but looks wrong. The message names the file, what was expected and what was found."""
 
 
 def warn(message: str) -> None:
-    """Tell whoever opened the data."""
+    """Issue a `DataWarning` for the caller of the current function."""
     warnings.warn(message, DataWarning, stacklevel=3)

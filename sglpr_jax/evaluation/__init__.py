@@ -1,1 +1,1 @@
-"""From descriptors to numbers and pictures: protocols, one call that scores, tables, figures and pages."""
+"""Evaluation of descriptors: protocols, scoring, tables, figures and HTML pages."""

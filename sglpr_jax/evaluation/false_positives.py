@@ -1,4 +1,4 @@
-"""The worst false positives: the wrong answers that a method is surest of."""
+"""Worst false positives: wrong answers with the smallest descriptor distance."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,25 @@ from jaxtyping import Float
 from sglpr_jax.evaluation.protocols import Decision, Result
 
 APART = 10
-"""Of mistakes so few frames from each other only the worst is shown: neighbouring frames make the same one."""
+"""Minimum gap between the queries of two shown mistakes, in frames. Neighbouring frames make the same mistake."""
 
 
 @dataclass(frozen=True)
 class FalsePositive:
-    """An answer accepted at the threshold of F1max that is of another place."""
+    """Answer that is accepted at the threshold of F1max but shows another place."""
 
     query: int
     answer: int
     metres: float
-    """How far apart the two frames were taken, in as many dimensions as the protocol has."""
+    """Distance between the positions of the two frames, in metres and in the dimensions of the protocol."""
     distance: float
-    """Of the descriptors."""
+    """Distance between the two descriptors."""
 
 
 def worst_false_positives(result: Result, positions: Float[np.ndarray, "n 3"], *, most: int = 6) -> list[FalsePositive]:
-    """Return up to `most` false positives, that of the smallest descriptor distance first.
+    """Return up to `most` false positives, in order of descriptor distance.
 
-    None are found where the protocol puts no threshold on answers, so that none is accepted.
+    The list is empty if the protocol applies no threshold to answers.
     """
     if result.answers is None or result.answer_distances is None or result.decisions is None:
         return []

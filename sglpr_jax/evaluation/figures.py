@@ -1,4 +1,4 @@
-"""The pictures of an evaluation, as matplotlib figures that nothing global knows of (extra `viz`)."""
+"""Figures of an evaluation (extra `viz`). They do not register with the global state of matplotlib."""
 
 import importlib.util
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 DOTS_PER_INCH = 150
 LOOP_COLOUR, WRONG_COLOUR = "#2b5fc4", "#d62728"
 MOST_INSIDE = 4
-"""So many lines are named inside the axes; more names would cover the lines."""
+"""Maximum number of lines with a legend inside the axes. A longer legend would cover the lines."""
 
 DECISIONS = {
     Decision.NOT_A_QUERY: ("not a query", "#c8c8c8", 4),
@@ -30,22 +30,25 @@ DECISIONS = {
     Decision.FALSE_NEGATIVE: ("false negative", "#000000", 12),
     Decision.FALSE_POSITIVE: ("false positive", "#f0a000", 12),
 }
-"""Name, colour (red, black, blue as in figure 6) and size in square points of each decision's dots; mistakes on top."""
+"""Name, colour and size (in square points) of the dots of each decision.
+
+Red, black and blue are the colours of figure 6. Decisions are drawn in this order, so mistakes are on top.
+"""
 
 
 def can_draw() -> bool:
-    """Return whether matplotlib is installed: the extra `viz` brings it."""
+    """Return whether matplotlib (extra `viz`) is installed."""
     return importlib.util.find_spec("matplotlib") is not None
 
 
 def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
-    """Write the figure, whole or not at all, in the format that the ending of `path` names."""
+    """Write the figure atomically, in the format given by the suffix of `path`."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:], dpi=DOTS_PER_INCH)
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
-    """Draw precision over recall, a line for each named curve with a dot where F1 is highest (figure 5)."""
+    """Draw precision over recall: one line for each named curve, with a dot at the highest F1 (figure 5)."""
     many = len(curves) > MOST_INSIDE
     figure = _figure(8.0 if many else 5.2, 4.8)
     axes = figure.add_subplot(title=title, xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
@@ -64,9 +67,9 @@ def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str =
 def trajectory(
     positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
-    """Draw every frame where it was taken, seen from above, coloured by its `Decision` (figure 6)."""
+    """Draw the position of every frame from above, coloured by its `Decision` (figure 6)."""
     across, along = np.ptp(positions[:, :2], axis=0)
-    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))  # a long street lies flat
+    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))  # flat for a long street
     axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
     for decision, (name, colour, size) in DECISIONS.items():
         x, y = positions[decisions == decision, :2].T
@@ -88,7 +91,7 @@ def learning_curve(
     references: Mapping[str, float] | None = None,
     title: str = "",
 ) -> "matplotlib.figure.Figure":
-    """Draw named curves of (step, value), and named values to compare with as dashed lines."""
+    """Draw named curves of (step, value), with named reference values as dashed lines."""
     figure = _figure(6.4, 4.2)
     axes = figure.add_subplot(title=title, xlabel=xlabel, ylabel=ylabel)
     for name, points in curves.items():
@@ -104,7 +107,7 @@ def learning_curve(
 
 
 def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]]]]) -> "matplotlib.figure.Figure":
-    """Draw named curves of (step, value), in one panel for each title, below each other over the same steps."""
+    """Draw named curves of (step, value) in stacked panels, one for each title, with a common axis of steps."""
     figure = _figure(6.4, 0.8 + 2.2 * len(panels))
     rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
     for axes, (title, curves) in zip(rows, panels.items(), strict=True):
@@ -121,9 +124,11 @@ def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]
 def stress(
     changes: Mapping[tuple[str, str], Mapping[str, Sequence[tuple[str, float]]]], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
-    """Draw how much each method's score changes with the strength of a corruption: a row of panels for each protocol.
+    """Draw the change of each method's score over the strength of a corruption, one row of panels for each protocol.
 
-    `changes` has by (protocol, kind of corruption), by method, the labels of the strengths and the changes.
+    Arguments:
+      changes: For each (protocol, kind of corruption) and each method, the labels of the strengths and the changes.
+      title: Title of the figure.
     """
     protocols, kinds = (list(dict.fromkeys(names)) for names in zip(*changes, strict=True))
     figure = _figure(max(1.6 + 1.9 * len(kinds), 4.0), 1.0 + 2.4 * len(protocols))
@@ -153,9 +158,15 @@ def segmentation_panel(
     categories: int = 20,
     title: str = "",
 ) -> "matplotlib.figure.Figure":
-    """Draw point counts, true classes and predicted classes side by side, in metres about the sensor (figure 7).
+    """Draw point counts, true classes and predicted classes side by side (figure 7).
 
-    Without a truth it has no panel. `categories` says which classes they are.
+    Arguments:
+      bev: Number of points in each cell.
+      truth: True class of each cell. If None, the figure has no panel of true classes.
+      prediction: Predicted class of each cell.
+      resolution_m: Side of a cell, in metres. The axes are in metres, with the sensor at the origin.
+      categories: Number of categories in the taxonomy of the classes (`labels.taxonomy`).
+      title: Title of the figure.
     """
     labels = taxonomy(categories)
     pictures = {"point counts": np.repeat(brightness(bev)[..., None], 3, axis=-1)}
@@ -176,7 +187,7 @@ def segmentation_panel(
 def heat_maps(
     bev: Num[np.ndarray, "h w"], maps: Mapping[str, Float[np.ndarray, "h w"]], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
-    """Draw point counts and named maps of how strongly features answer, each on its own scale (figure 8)."""
+    """Draw point counts and named maps of feature activations, each on its own scale (figure 8)."""
     figure = _figure(2.1 * (1 + len(maps)), 2.6)
     figure.suptitle(title)
     panels = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
@@ -191,12 +202,12 @@ def heat_maps(
 
 
 def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Return point counts as grey values from 0 to 1, by their logarithm."""
+    """Return the logarithm of point counts as grey values from 0 to 1."""
     return np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
 
 
 def _figure(width: float, height: float) -> "matplotlib.figure.Figure":
-    """Return an empty figure of this size in inches; ImportError with the remedy where matplotlib is missing."""
+    """Return an empty figure of this size in inches. Raises ImportError if matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -205,7 +216,7 @@ def _figure(width: float, height: float) -> "matplotlib.figure.Figure":
 
 
 def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:
-    """Draw thin lines through the points of equal F1."""
+    """Draw thin contour lines of equal F1."""
     for f1 in (0.2, 0.4, 0.6, 0.8):
         recall = np.linspace(f1 / (2 - f1), 1, 100)
         axes.plot(recall, f1 * recall / (2 * recall - f1), color="0.85", linewidth=0.8, zorder=0)
@@ -213,7 +224,7 @@ def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:
 
 
 def _add_class_legend(figure: "matplotlib.figure.Figure", labels: Taxonomy, classes: Int[np.ndarray, " k"]) -> None:
-    """Name the colour of each of these classes under the pictures."""
+    """Add a legend of these classes below the panels."""
     from matplotlib.patches import Patch
 
     patches = [Patch(facecolor=tuple(labels.colors[c] / 255), edgecolor="0.6", label=labels.names[c]) for c in classes]
@@ -223,7 +234,7 @@ def _add_class_legend(figure: "matplotlib.figure.Figure", labels: Taxonomy, clas
 def loops(
     positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
 ) -> "matplotlib.figure.Figure":
-    """Draw a trajectory from above and a line between the two frames of each loop.
+    """Draw a trajectory from above, with a line between the two frames of each loop.
 
     Arguments:
       positions: Position of each frame, in metres.
@@ -249,7 +260,7 @@ def loops(
 
 
 def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
-    """Draw named trajectories from above, the first one grey; a dot is where each ends."""
+    """Draw named trajectories from above. The first is grey; a dot marks the end of each."""
     across, along = np.ptp(np.concatenate(list(named.values()))[:, :2], axis=0)
     figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
     axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
@@ -264,9 +275,13 @@ def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.f
 
 
 def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
-    """Draw the share of loops over the probability that was said: (said, share, pairs) of each bin, by its count."""
+    """Draw the share of loops over the predicted probability.
+
+    Arguments:
+      bins: Mean predicted probability, share of loops and number of pairs of each bin. The number labels its point.
+    """
     figure = _figure(5.0, 4.6)
-    axes = figure.add_subplot(xlabel="probability that was said", ylabel="share of loops", xlim=(-0.03, 1.09))
+    axes = figure.add_subplot(xlabel="predicted probability", ylabel="share of loops", xlim=(-0.03, 1.09))
     axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
     said, share, _ = np.array(bins).T
     axes.plot(said, share, "o-", color="#2b5fc4", markersize=5, linewidth=1.4)
@@ -310,7 +325,7 @@ def loops_in_time(
 
 
 def overlays(pictures: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
-    """Draw coloured pictures with their titles, three in a row."""
+    """Draw coloured images with their titles, three in a row."""
     rows = -(-len(pictures) // 3)
     figure = _figure(9.0, 3.2 * rows)
     panels = figure.subplots(rows, 3, squeeze=False).ravel()

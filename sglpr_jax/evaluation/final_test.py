@@ -1,4 +1,4 @@
-"""The test after a training: on a recording never seen, raw and with every scan rotated, beside other methods."""
+"""Test of a trained network on a held-out recording, raw and with every scan rotated, compared with other methods."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,13 +25,13 @@ ROTATION_SEED = 0
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class FinalTest(report.PrintsItself):
-    """The scores of a trained network and of methods beside it. Prints itself as tables."""
+    """Scores of a trained network and of the methods it is compared with. Prints itself as tables."""
 
     sequence: str
     results: Mapping[str, Mapping[str, Sequence[Result]]]
-    """By `raw` and `rotated`, then by the method's name."""
+    """Results for `raw` and `rotated` scans, by the name of the method."""
     semantics: SemanticScore | None
-    """None where the network has no segmentation head, or the recording no labels."""
+    """Score of the segmentation head. None without such a head or without labels."""
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dump`."""
@@ -62,10 +62,19 @@ def final_test(
 ) -> FinalTest:
     """Score a trained network on a recording, raw and with every scan rotated at random.
 
-    Beside it stand `methods`: handcrafted ones by name, `untrained`, the same network with fresh weights made from
-    `seed`, or `shipped`, the weights `DEFAULT_WEIGHTS` of the package. Descriptors, pictures and results.json go to
-    `folder`. Raises ValueError where a method does not fit the recording, OSError where something cannot be read or
-    written.
+    Arguments:
+      params: Parameters of the trained network.
+      recording: Recording with poses.
+      folder: Folder for descriptors, figures and results.json.
+      methods: Names of the methods to compare with. `untrained` is the same network with random weights drawn from
+        `seed`. `shipped` is the network with the weights `DEFAULT_WEIGHTS` of the package. Other names are handcrafted
+        methods.
+      seed: Seed of the weights of `untrained`.
+      progress: Reports the progress of each embedding.
+
+    Raises:
+      ValueError: If a method does not fit the recording.
+      OSError: If a file cannot be read or written.
 
     Example:
       print(final_test(result.params, recording, result.folder / "test"))
@@ -105,7 +114,7 @@ def _score(
 def _draw(results: Mapping[str, Sequence[Result]], recording: Recording, folder: Path, title: str) -> None:
     top1 = {name: scored[0] for name, scored in results.items()}
     curves = {name: result.curve for name, result in top1.items() if result.curve is not None}
-    if curves:  # none where the recording has no revisit
+    if curves:  # empty if the recording has no revisit
         picture = figures.precision_recall(curves, title=f"{recording.name}, {title}: top-1")
         figures.save(picture, folder / f"precision-recall-{title}.png")
     decisions = top1[NETWORK].decisions

@@ -1,4 +1,4 @@
-"""learning-curves.png: a run's loss terms, its score and the norm of its gradient over the steps."""
+"""Plot of the loss terms, the score and the gradient norm of a training run (learning-curves.png)."""
 
 from pathlib import Path
 from typing import Any
@@ -15,22 +15,22 @@ _PANELS = {
     "score: recall@1 of held-out or training places": ("score",),
     "gradient norm": ("gradient_norm",),
 }
-"""What each panel shows, and the names of its measurements in the metrics."""
+"""Title of each panel, and the names of its curves in the metrics file."""
 
 
 class LearningCurves(Callback):
-    """Draws the learning curves of the run in `folder` at its end; nothing without matplotlib (extra `viz`)."""
+    """Draws the learning curves of the run in `folder` when training ends, if matplotlib (extra `viz`) is installed."""
 
     def __init__(self, folder: Path):
         self._folder = folder
 
     def on_end(self, step: int) -> None:
-        """Draw all that was measured, by this process or by earlier ones of the same run."""
+        """Draw the metrics of the whole run, including those of earlier processes."""
         draw_learning_curves(self._folder)
 
 
 def draw_learning_curves(folder: Path) -> None:
-    """Draw the metrics in a run's folder; nothing without matplotlib, or where nothing was measured yet."""
+    """Draw the metrics in the folder of a run. Does nothing without matplotlib or without metrics."""
     lines = read_metrics(folder / METRICS_FILE)
     if lines and figures.can_draw():
         panels = {title: _curves(lines, names) for title, names in _PANELS.items()}
@@ -38,6 +38,6 @@ def draw_learning_curves(folder: Path) -> None:
 
 
 def _curves(lines: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[tuple[int, float]]]:
-    """The (step, value) of each measurement; one that was never made has no curve."""
+    """Return (step, value) points by name. A name without values has no curve."""
     curves = {name: [(line["step"], line[name]) for line in lines if line.get(name) is not None] for name in names}
     return {name: points for name, points in curves.items() if points}

@@ -1,17 +1,18 @@
-"""The numbers of the SG-LPR paper: tables 1 to 7, row by row as printed.
+"""Numbers of the SG-LPR paper: tables 1 to 7, row by row as printed.
 
-The rows of a table do not all rest on one protocol. By where a row comes from (the paper names the sources; which
-protocol lies behind them is our reading, see docs/concepts/protocols.md):
+The rows of a table do not share one protocol. The paper names the source of each row. The protocol of each source is
+our reading (docs/concepts/protocols.md):
 
-- RINET, "RINet's paper": F1max over pairs, 100 negatives per positive: `pairs-f1max`.
-- ITS_PAPER, "its own paper": top-1 F1max, 3 m and 20 m, 30 s: `top1-f1max`.
+- RINET, "RINet's paper": `pairs-f1max`, F1max over pairs with 100 negatives per positive.
+- ITS_PAPER, "its own paper": `top1-f1max`, top-1 F1max with 3 m, 20 m and 30 s.
 - NO_SOURCE: not known.
 - OWN_RUN, "run by SG-LPR's authors": not stated; most likely `top1-f1max`.
-- BEVPLACE_2, "BEVPlace++'s paper": Recall@1 across sessions of NCLT, 5 m: `bevplace-nclt-recall`.
+- BEVPLACE_2, "BEVPlace++'s paper": `bevplace-nclt-recall`, Recall@1 across sessions of NCLT with 5 m.
 
-In tables 1 and 2 the printed mean of SC_LPR, .850, is not that of its row, .853; all others agree within rounding.
+In tables 1 and 2 the printed mean of SC_LPR is .850, but the mean of its row is .853. All other means agree within
+rounding.
 
-So a number of ours stands beside one of these only under the same protocol, on the same poses and the real dataset.
+Our numbers are comparable with these only under the same protocol, on the same poses and on the real dataset.
 """
 
 from collections.abc import Mapping
@@ -26,25 +27,25 @@ BEVPLACE_2, NO_SOURCE = "BEVPlace++'s paper", "no source named"
 KITTI = ("00", "02", "05", "06", "07", "08")
 NCLT = ("2012-02-04", "2012-03-17", "2012-06-15", "2012-09-28", "2012-11-16", "2013-02-23")
 NCLT_DATABASE = "2012-01-15"
-"""The session that is the database of table 3."""
+"""Database session of table 3."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method's, or one variant's, scores in the order of its table's columns."""
+    """Scores of one method or variant, in the order of the columns of its table."""
 
     method: str
     scores: tuple[float, ...]
     mean: float
-    """As printed: it may differ from the mean of the rounded scores."""
+    """Mean as printed. It may differ from the mean of the rounded scores."""
     kind: Kind
     source: str
-    """Where the authors of the table have the numbers from, which says how they were measured."""
+    """Source of the numbers according to the paper. It determines the protocol."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """One table of the paper; the columns are sequences."""
+    """One table of the paper. The columns are sequences."""
 
     number: int
     title: str
@@ -53,7 +54,7 @@ class Table:
     rows: tuple[Row, ...]
 
     def column(self, sequence: str, *, kind: Kind | None = None) -> Mapping[str, float]:
-        """Return the scores on one sequence by method, of one kind or of all; none where there is no such column."""
+        """Return the scores on one sequence by method, optionally of one kind. Empty for an unknown sequence."""
         if sequence not in self.columns:
             return {}
         i = self.columns.index(sequence)
@@ -146,7 +147,7 @@ TABLE_5 = Table(
 
 TABLE_6 = Table(
     6,
-    "What the place branch is given, F1max on KITTI",
+    "Input of the place branch, F1max on KITTI",
     "real KITTI",
     KITTI,
     (

@@ -1,4 +1,4 @@
-"""Results as tables and as JSON."""
+"""Tables and JSON of results."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,19 +12,19 @@ from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
 
 WIDTH = 140
-"""Characters of a line, where results are made into text."""
+"""Width of printed results, in characters."""
 MOST_COLUMNS = 6
-"""More protocols side by side would not fit a terminal."""
+"""Maximum number of protocols side by side. More do not fit a terminal."""
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
 PUBLISHED_COLUMNS = ("method", "published F1max", "numbers from")
 PUBLISHED_NOTE = (
     f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
-    "protocol: those of RINet's paper are pairs-f1max, the others top1-f1max as far as is known."
+    "protocol: rows from RINet's paper use pairs-f1max, the others top1-f1max as far as is known."
 )
 
 
 def table(results: Sequence[Result], *, title: str = "") -> Table:
-    """Return one row per protocol: what it is, its score, and what that rests on."""
+    """Return a table with one row per protocol: rule, score, interval, counts, distance and poses."""
     rows = Table(*COLUMNS, title=title)
     for result in results:
         rows.add_row(*map(escape, cells(result)))
@@ -32,7 +32,7 @@ def table(results: Sequence[Result], *, title: str = "") -> Table:
 
 
 def cells(result: Result) -> tuple[str, ...]:
-    """Return what a table says of a result, one text for each of `COLUMNS`."""
+    """Return the cells of one result, in the order of `COLUMNS`."""
     counts = "\n".join(f"{count} {name}" for name, count in result.counts.items())
     distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
     poses = result.pose_source or ""
@@ -40,9 +40,10 @@ def cells(result: Result) -> tuple[str, ...]:
 
 
 def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> Table:
-    """Return one row per method and one column per protocol; the other way round where that would be too wide.
+    """Return a table of scores with one row per method and one column per protocol.
 
-    The methods are scored on the same sequence.
+    If there are more than `MOST_COLUMNS` protocols, rows and columns are exchanged. All methods are scored on the same
+    sequence.
     """
     names = [result.name for result in next(iter(methods.values()))]
     scores = [[format_score(result) for result in results] for results in methods.values()]
@@ -58,7 +59,10 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
 
 
 def published_rows(sequence: str) -> list[tuple[str, ...]]:
-    """Return what table 1 of the paper has for a KITTI sequence, of the learned methods; ValueError where nothing."""
+    """Return method, score and source of the learned methods in table 1 of the paper, for one KITTI sequence.
+
+    Raises ValueError if table 1 does not have the sequence.
+    """
     if sequence not in TABLE_1.columns:
         raise ValueError(f"expected a sequence with published numbers, {', '.join(TABLE_1.columns)}, found {sequence}")
     sources = {row.method: row.source for row in TABLE_1.rows}
@@ -67,7 +71,7 @@ def published_rows(sequence: str) -> list[tuple[str, ...]]:
 
 
 def published_table(rows: Sequence[tuple[str, ...]]) -> Table:
-    """Return `published_rows` as a table of its own; `PUBLISHED_NOTE` belongs below it."""
+    """Return `published_rows` as a table. Print `PUBLISHED_NOTE` below it."""
     table = Table(*PUBLISHED_COLUMNS)
     for row in rows:
         table.add_row(*row)
@@ -75,7 +79,7 @@ def published_table(rows: Sequence[tuple[str, ...]]) -> Table:
 
 
 def as_text(found: Any, *, width: int) -> str:
-    """Return what a console of so many columns would show."""
+    """Return the text that a console of `width` characters would show."""
     console = Console(width=width, highlight=False, color_system=None)
     with console.capture() as capture:
         console.print(found)
@@ -83,7 +87,7 @@ def as_text(found: Any, *, width: int) -> str:
 
 
 class PrintsItself:
-    """A result that `print` shows as a console does: derive from it, and give `__rich__` or `__rich_console__`."""
+    """Base class of results that rich renders in `print`. Subclasses define `__rich__` or `__rich_console__`."""
 
     def __str__(self) -> str:
         return as_text(self, width=WIDTH)
@@ -92,17 +96,17 @@ class PrintsItself:
 
 
 def format_score(result: Result) -> str:
-    """Return the score to three places, or why there is none."""
+    """Return the score with three decimals, or "no revisit" if it is NaN."""
     return "no revisit" if math.isnan(result.score) else f"{result.score:.3f}"
 
 
 def _format_interval(result: Result) -> str:
-    """Return the bootstrap interval of the score to three places; empty where there is none."""
+    """Return the bootstrap interval with three decimals, or an empty string if the result has no interval."""
     return "" if result.interval is None else "{:.3f} to {:.3f}".format(*result.interval)
 
 
 def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return plain values for `json.dump`: the score (null: no revisit), its interval, rule, counts, curve in short."""
+    """Return values for `json.dump`: score (null without a revisit), interval, rule, counts and curve summary."""
     return [
         {
             "protocol": result.name,
@@ -122,7 +126,7 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
 
 
 def _at_f1max(result: Result) -> dict[str, float] | None:
-    """Return precision, recall and the largest descriptor distance accepted, where F1 is highest."""
+    """Return precision, recall and largest accepted descriptor distance at the highest F1."""
     curve = result.curve
     if curve is None:
         return None

@@ -1,4 +1,4 @@
-"""Scoring what methods say of a recording: one call, and a result that prints itself."""
+"""Scoring of descriptors, top-k lists and scored pairs, with a result that prints itself."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,28 +27,28 @@ from sglpr_jax.retrieval.distances import distance_function
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(report.PrintsItself):
-    """The results of one method, and of those it is compared with, by the same protocols. Prints itself as tables."""
+    """Results of one method and of the methods it is compared with, by the same protocols. Prints itself as tables."""
 
     title: str
     about: str
-    """What was scored and how it is compared, in a line."""
+    """Description of the input and its distance, in one line."""
     methods: Mapping[str, Sequence[Result]]
-    """By the name of the method; the first is the one in question."""
+    """Results by the name of the method. The first method is the evaluated one; the others are for comparison."""
     positions: Float[np.ndarray, "n 3"] | None
-    """Metres, z up; None where pairs came with labels alone."""
+    """Position of each frame in metres, z up. None for labelled pairs without positions."""
     published: Sequence[tuple[str, ...]] = ()
-    """`report.published_rows` of the sequence, where they were asked for."""
+    """`report.published_rows` of the sequence, if requested."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
-    """The file, and the configuration, weights and distance of its descriptors, as JSON can hold them."""
+    """JSON values: the file, and the configuration, weights and distance of its descriptors."""
 
     @property
     def results(self) -> Sequence[Result]:
-        """Those of the method in question, one for each protocol."""
+        """Results of the evaluated method, one for each protocol."""
         return next(iter(self.methods.values()))
 
     @cached_property
     def judged(self) -> Result | None:
-        """The first result that accepts answers by a threshold; None where there is none."""
+        """First result of a protocol that accepts answers by a threshold, or None."""
         return next((result for result in self.results if result.answers is not None), None)
 
     @cached_property
@@ -89,13 +89,18 @@ def evaluate(
 ) -> Evaluation:
     """Score descriptors, a top-k list or scored pairs.
 
-    `source` is a file of any kind that `evaluation.inputs` reads, what it was read to, or descriptors (n, d) as an
-    array of numpy, of JAX or of any kind that numpy understands.
-    `protocols` are names in `PROTOCOLS`; none stands for the headlines that fit, `all` for all that do. `positions`
-    (n, 3) (metres, z up) and `times` (n,) (seconds) are those of the frames, in place of any that `source` has;
-    `distance` names how descriptors are compared (unless given, as `source` says; those of an array by L2). With
-    `published` the paper's numbers for the sequence stand beside. Raises ValueError where positions are missing, and
-    where a protocol or an option does not fit.
+    Arguments:
+      source: A file that `evaluation.inputs` can read, an input read from one, or descriptors (n, d) as an array of
+        numpy, of JAX or of any type that numpy converts.
+      protocols: Names in `PROTOCOLS`. `all` selects every protocol that fits the source. An empty sequence selects
+        the default protocols that fit, or every protocol that fits if no default does.
+      positions: Positions (n, 3) of the frames in metres, z up. They replace the positions of `source`.
+      times: Times (n,) of the frames in seconds. They replace the times of `source`.
+      distance: Name of the distance between descriptors. By default the distance of `source`, or L2 for an array.
+      published: Whether to add the numbers of the paper for the sequence.
+
+    Raises:
+      ValueError: If positions are missing, or if a protocol or an option does not fit the source.
 
     Example:
       print(sglpr_jax.evaluate("08.npz"))
@@ -118,7 +123,7 @@ def evaluate(
 
 
 def _with_options(source: Input, *, where: str = "", **options: Any) -> Input:
-    """Return the source with those options that are given in place of its own; ValueError where one does not fit."""
+    """Return the source with the given options in place of its own. Raises ValueError if an option does not fit."""
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if not hasattr(source, name):
@@ -130,10 +135,10 @@ def _with_options(source: Input, *, where: str = "", **options: Any) -> Input:
 
 
 def _of_array(rows: ArrayLike, trajectory: Trajectory | None, distance: str) -> DescriptorFile:
-    """Return descriptors of no name; ValueError where they are no matrix or positions are missing."""
+    """Return an array as unnamed descriptors. Raises ValueError without a matrix or without positions."""
     rows = np.asarray(rows)
     if rows.ndim != 2:
-        raise ValueError(f"expected a file, what was read from one or descriptors (n, d), found {rows.shape}")
+        raise ValueError(f"expected a file, an input read from one, or descriptors (n, d), found {rows.shape}")
     if trajectory is None:
         raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
     return as_descriptors(rows, trajectory, sequence="", method="", distance=distance)
@@ -142,10 +147,16 @@ def _of_array(rows: ArrayLike, trajectory: Trajectory | None, distance: str) -> 
 def evaluate_methods(
     methods: Mapping[str, Input], protocols: Sequence[str] = (), *, published: bool = False, file: Path | None = None
 ) -> Evaluation:
-    """Score several methods by the same protocols: those that fit the first one, where none is named or `all` are.
+    """Score several methods by the same protocols.
 
-    `file` is what the first was read from. Raises ValueError, naming the method, where one cannot be scored or is of
-    other frames than the first.
+    Arguments:
+      methods: Input of each method, by name. The first method is the evaluated one.
+      protocols: Names in `PROTOCOLS`. Without names, or with `all`, they are chosen to fit the first method.
+      published: Whether to add the numbers of the paper for the sequence.
+      file: File of the first method.
+
+    Raises:
+      ValueError: If a method cannot be scored, or has other frames than the first. The message names the method.
     """
     source = next(iter(methods.values()))
     chosen = chosen_protocols(source, protocols)
@@ -167,9 +178,9 @@ def evaluate_methods(
 
 
 def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
-    """Return the result of each named protocol; none named: of the headlines that fit.
+    """Return the result of each named protocol. Without names, the default protocols that fit are used.
 
-    Raises ValueError where there are no positions, or a name is no protocol that `source` can be scored by.
+    Raises ValueError if positions are missing or if a protocol does not exist or does not fit `source`.
     """
     known = protocols_taking(kind_of(source))
     return [protocol_named(name, known)(source) for name in protocols or chosen_protocols(source, ())]
@@ -186,7 +197,7 @@ def _sequence_of(source: Input) -> str:
 
 
 def _about(source: Input, file: Path | None) -> str:
-    """Say what the source holds and how it is compared."""
+    """Describe the source and its distance."""
     where = "" if file is None else f"{file}: "
     if isinstance(source, ScoredPairs):
         return f"{where}scored pairs" + (" with labels" if source.labels is not None else "")

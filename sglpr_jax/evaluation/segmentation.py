@@ -1,4 +1,4 @@
-"""How well semantic maps are predicted: intersection over union, beside what the commonest class alone would score."""
+"""Intersection over union (IoU) of semantic maps, and the IoU of predicting the most frequent class everywhere."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,32 +13,32 @@ from sglpr_jax.retrieval.semantic_maps import SemanticMap
 
 @dataclass(frozen=True, eq=False)
 class SegmentationResult:
-    """Scores over all cells that were counted."""
+    """Segmentation scores over all counted cells."""
 
     iou: Float[np.ndarray, " k"]
-    """Intersection over union of each class, NaN where no cell has it."""
+    """Intersection over union of each class, NaN for a class without cells."""
     shares: Float[np.ndarray, " k"]
-    """Which part of the cells each class has."""
+    """Fraction of the cells that belong to each class."""
     cells: int
 
     @property
     def mean_iou(self) -> float:
-        """The mean over the classes that occur."""
+        """Mean IoU over the classes that occur."""
         return float(np.nanmean(self.iou))
 
     @property
     def present(self) -> int:
-        """How many classes occur."""
+        """Number of classes that occur."""
         return int((self.shares > 0).sum())
 
     @property
     def majority(self) -> int:
-        """The commonest class."""
+        """Id of the most frequent class."""
         return int(self.shares.argmax())
 
     @property
     def majority_mean_iou(self) -> float:
-        """The mean IoU of predicting the commonest class everywhere."""
+        """Mean IoU of predicting the most frequent class everywhere."""
         return float(self.shares.max() / self.present)
 
 
@@ -49,9 +49,9 @@ def confusion_matrix(
     counted: Bool[np.ndarray, "*b h w"],
     classes: int,
 ) -> Int[np.ndarray, "k k"]:
-    """How many counted cells of true class i are predicted as class j; those of several scans add up.
+    """Return the number of counted cells of true class i that are predicted as class j.
 
-    As in SemanticKITTI, class 0 (unlabelled) is no class to be found: such cells are left out.
+    As in SemanticKITTI, cells of class 0 (unlabelled) are ignored. Matrices of several scans may be added.
     """
     counted = counted & (truth != UNLABELLED)
     pairs = truth[counted].astype(np.int64) * classes + prediction[counted]
@@ -59,7 +59,7 @@ def confusion_matrix(
 
 
 def score_confusion(confusion: Int[np.ndarray, "k k"]) -> SegmentationResult:
-    """The scores of a confusion matrix. Raises ValueError where no cell was counted."""
+    """Return the scores of a confusion matrix. Raises ValueError if no cell was counted."""
     cells_of_class = confusion.sum(1)
     cells = int(cells_of_class.sum())
     if not cells:
@@ -70,14 +70,16 @@ def score_confusion(confusion: Int[np.ndarray, "k k"]) -> SegmentationResult:
 
 
 def map_confusion(found: SemanticMap, *, categories: int) -> Int[np.ndarray, "k k"]:
-    """The confusion matrix of one semantic map: over the cells of which the network says something and the truth is
-    known; all 0 for a scan without labels."""
+    """Return the confusion matrix of one semantic map, over the cells that have a prediction and a label.
+
+    It is all zeros for a scan without labels.
+    """
     classes = len(taxonomy(categories).names)
     return confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
 
 
 def segmentation_table(result: SegmentationResult, *, categories: int, title: str = "") -> Table:
-    """Return a row for each class that occurs, and the means."""
+    """Return a table with a row for each class that occurs, and rows for the means."""
     names = taxonomy(categories).names
     table = Table(title=title, caption=f"{result.cells} cells with points and a label")
     for column in ("class", "share of the cells", "IoU"):
@@ -92,7 +94,7 @@ def segmentation_table(result: SegmentationResult, *, categories: int, title: st
 
 
 def segmentation_json(result: SegmentationResult, *, categories: int) -> dict[str, Any]:
-    """Return plain values for `json.dump`; null for the score of a class that does not occur."""
+    """Return values for `json.dump`. The score of a class that does not occur is null."""
     names = taxonomy(categories).names
 
     def by_name(values: np.ndarray) -> dict[str, float | None]:

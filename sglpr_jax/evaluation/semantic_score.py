@@ -1,4 +1,4 @@
-"""The segmentation head scored on a recording with labels: a result that prints itself, and a picture."""
+"""Score of the segmentation head on a labelled recording, with a result that prints itself and a figure."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -28,14 +28,14 @@ PICTURE = "segmentation.png"
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SemanticScore(report.PrintsItself):
-    """Intersection over union of the classes of a recording's semantic maps. Prints itself as a table."""
+    """Intersection over union of each class over the semantic maps of a recording. Prints itself as a table."""
 
     title: str
     categories: int
     result: SegmentationResult
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values for `json.dump`."""
+        """Return values for `json.dump`."""
         return segmentation_json(self.result, categories=self.categories)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
@@ -52,8 +52,15 @@ def score_semantics(
 ) -> SemanticScore:
     """Score the segmentation head on every labelled scan of a recording.
 
-    Input, truth and prediction of one scan are drawn into `folder`, where there is one and matplotlib. Cells whose
-    likeliest class is less probable than `min_confidence` are not counted. Raises ValueError where none is counted.
+    Arguments:
+      params: Parameters of a network with a segmentation head.
+      recording: Recording with labels.
+      folder: Folder for a figure of one scan. The figure needs matplotlib.
+      min_confidence: Minimum probability of the predicted class. Cells with a lower probability are not counted.
+      progress: Reports the progress.
+
+    Raises:
+      ValueError: If no cell is counted.
     """
     rows, config = _labelled_rows(recording), params.config
     confusion = np.zeros((config.classes, config.classes), np.int64)
@@ -67,16 +74,16 @@ def score_semantics(
 
 
 def semantic_score(confusion: Int[np.ndarray, "k k"], recording: Recording, *, categories: int) -> SemanticScore:
-    """The score of a recording from the sum of the confusion matrices of its semantic maps (`map_confusion`).
+    """Return the score of a recording from the sum of the confusion matrices of its semantic maps (`map_confusion`).
 
-    Raises ValueError where no cell was counted.
+    Raises ValueError if no cell was counted.
     """
     title = f"segmentation of {len(_labelled_rows(recording))} scans of {recording.name}"
     return SemanticScore(title, categories, score_confusion(confusion))
 
 
 def draw_semantics(params: Params, recording: Recording, folder: Path, *, min_confidence: float = 0.0) -> None:
-    """Draw input, truth and prediction of the labelled scan in the middle into `folder`; nothing without matplotlib."""
+    """Draw input, truth and prediction of the middle labelled scan into `folder`. Does nothing without matplotlib."""
     if not figures.can_draw():
         return
     rows = _labelled_rows(recording)

@@ -1,4 +1,4 @@
-"""One session as the database, others as queries: a column for each and their mean, as in table 3 of the paper."""
+"""Evaluation across sessions: one session is the database, the others are queries, as in table 3 of the paper."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,49 +19,49 @@ from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_js
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
 APART_M = 25.0
-"""The largest distance at which a protocol here calls two frames one place."""
+"""Largest distance, in metres, at which a protocol across sessions considers two frames the same place."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AcrossSessions(PrintsItself):
-    """The results of one method for every session of queries, all searched in one database. Prints itself as tables."""
+    """Results of one method for several query sessions, searched in one database. Prints itself as tables."""
 
     database: str
-    """The session that is searched."""
+    """Name of the database session."""
     sessions: tuple[str, ...]
-    """Those of the queries."""
+    """Names of the query sessions."""
     protocols: Mapping[str, Sequence[Result]]
-    """By the protocol's name: one result for each session."""
+    """Results by protocol name, one for each query session."""
     about: str = ""
-    """What was scored and how it is compared, in a line."""
+    """Description of the input and its distance, in one line."""
     published: Sequence[tuple[str, ...]] = ()
-    """`published_rows`, where they were asked for."""
+    """`published_rows`, if requested."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
-    """The files, as JSON can hold them."""
+    """Paths of the files, as JSON values."""
 
     @property
     def title(self) -> str:
-        """What stands over the tables."""
+        """Title of the tables."""
         return f"database {self.database}; queries of {len(self.sessions)} sessions"
 
     @property
     def results(self) -> list[Result]:
-        """All results, protocol by protocol."""
+        """Results of all protocols and sessions, in order of protocol."""
         return [result for of_one in self.protocols.values() for result in of_one]
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """What stands over `rows`."""
+        """Header of `rows`."""
         return ("", *self.sessions, "mean")
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a row for each protocol: its name, the score of each session, the mean of those that have one."""
+        """Return one row for each protocol: name, score of each session, and mean over the sessions with a score."""
         return [
             (name, *map(format_score, results), _text(mean_score(results))) for name, results in self.protocols.items()
         ]
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values for `json.dump`."""
+        """Return values for `json.dump`."""
         results = {
             name: {
                 "mean": None if math.isnan(mean_score(of_one)) else mean_score(of_one),
@@ -92,10 +92,17 @@ PUBLISHED_NOTE = f"Published: table 3 of the SG-LPR paper, on {TABLE_3.dataset},
 def evaluate_sessions(
     database: DescriptorFile, queries: Sequence[DescriptorFile], names: Sequence[str] = (), *, published: bool = False
 ) -> AcrossSessions:
-    """Search every session of `queries` in the database and score by each named protocol; none or `all`: by all.
+    """Score the retrieval of several query sessions in one database session.
 
-    With `published` the rows of table 3 stand beside. Raises ValueError where a session occurs twice, has no positions,
-    lies elsewhere than the database or has other descriptors, and for an unknown protocol.
+    Arguments:
+      database: Descriptors of the database session.
+      queries: Descriptors of each query session.
+      names: Names of the protocols. Without names, or with `all`, every protocol across sessions is used.
+      published: Whether to add the rows of table 3 of the paper.
+
+    Raises:
+      ValueError: If a session occurs twice, has no positions, does not overlap with the database or has descriptors
+        of another method, or if a protocol is unknown.
     """
     known = protocols_taking("sessions")
     chosen = list(dict.fromkeys(names)) if names and ALL not in names else list(known)
@@ -118,7 +125,7 @@ def evaluate_sessions(
 def evaluate_session_files(
     database: Path, queries: Sequence[Path], names: Sequence[str] = (), *, published: bool = False
 ) -> AcrossSessions:
-    """Do as `evaluate_sessions` with descriptor files. Raises ValueError for files of another kind too."""
+    """Run `evaluate_sessions` on paths of descriptor files. Raises ValueError for other kinds of files, too."""
     files = [_read(path) for path in (database, *queries)]
     for path, file in zip(queries, files[1:], strict=True):
         try:
@@ -137,10 +144,10 @@ def _read(path: Path) -> DescriptorFile:
 
 
 def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the rows of table 3 for these sessions, marked as published; the mean is that of the columns shown.
+    """Return the rows of table 3 for these sessions, marked as published.
 
-    Sessions that the table does not have are left empty. Raises ValueError where it has none of them, or another
-    database.
+    Cells of sessions that are not in the table are empty and do not count in the mean. Raises ValueError if the
+    database is not that of the table, or if the table has none of the sessions.
     """
     shown = [session for session in sessions if session in TABLE_3.columns]
     if database != NCLT_DATABASE or not shown:
@@ -159,7 +166,7 @@ def published_rows(database: str, sessions: Sequence[str]) -> list[tuple[str, ..
 
 
 def check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
-    """Raise ValueError where the two sessions do not overlap in x and y at all: their positions are in two frames."""
+    """Raise ValueError if the areas of the two sessions do not overlap. Their positions then have different frames."""
     corners = [(places.min(axis=0), places.max(axis=0)) for places in map(_plane, (database, queries))]
     (low, high), (low_q, high_q) = corners
     if np.any(low_q > high + APART_M) or np.any(high_q < low - APART_M):
@@ -171,7 +178,7 @@ def check_one_world(database: DescriptorFile, queries: DescriptorFile) -> None:
 
 
 def mean_score(results: Sequence[Result]) -> float:
-    """Return the mean over the sessions with something to find; NaN where none has."""
+    """Return the mean score over the sessions with a revisit, or NaN if no session has one."""
     scores = [result.score for result in results if not math.isnan(result.score)]
     return float(np.mean(scores)) if scores else math.nan
 

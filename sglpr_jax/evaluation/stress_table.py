@@ -1,4 +1,4 @@
-"""Methods on a clean recording and on corrupted ones by the same protocols, side by side."""
+"""Tables of the scores of several methods on a clean recording and under corruptions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,29 +13,29 @@ from sglpr_jax.evaluation.report import PrintsItself, format_score, to_json
 
 @dataclass(frozen=True, eq=False)
 class StressRow:
-    """What the methods score under one corruption. Of several rows the first is the clean recording."""
+    """Scores of the methods under one corruption. The first row of a test is the clean recording."""
 
     name: str
     kind: str
     label: str
-    """The strength, with its unit."""
+    """Strength of the corruption, with its unit."""
     results: Mapping[str, Sequence[Result]]
-    """By method, one for each protocol: the same methods and protocols in every row."""
+    """Results by method, one for each protocol. Every row has the same methods and protocols."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StressTest(PrintsItself):
-    """What several methods score on a recording as it is and under corruptions. Prints itself as a table."""
+    """Scores of several methods on a clean recording and under corruptions. Prints itself as a table."""
 
     title: str
     rows: Sequence[StressRow]
     config: Mapping[str, Any]
-    """What was tested, as JSON can hold it."""
+    """Configuration of the test, as JSON values."""
     left_out: Mapping[str, str] = field(default_factory=dict)
-    """Why which corruptions were left out, by their names."""
+    """Reasons why corruptions were skipped, by the name of the corruption."""
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return plain values for `json.dump`, a row each."""
+        """Return values for `json.dump`, one item per row."""
         return stress_json(self.rows)
 
     def __rich__(self) -> Table:
@@ -43,7 +43,7 @@ class StressTest(PrintsItself):
 
 
 def score_changes(row: StressRow, clean: StressRow) -> dict[str, list[float]]:
-    """Return by method the change of every protocol's score against the clean recording; NaN without a revisit."""
+    """Return the change of each score relative to the clean recording, by method. NaN without a revisit."""
     return {
         method: [there.score - here.score for there, here in zip(results, clean.results[method], strict=True)]
         for method, results in row.results.items()
@@ -51,7 +51,10 @@ def score_changes(row: StressRow, clean: StressRow) -> dict[str, list[float]]:
 
 
 def stress_table(rows: Sequence[StressRow], *, title: str = "") -> Table:
-    """Return one row per corruption, one column per method and protocol: the score, and its change against clean."""
+    """Return a table with one row per corruption and one column per method and protocol.
+
+    Each cell has the score and its change relative to the clean recording.
+    """
     table = Table("corruption", title=title)
     for method, results in rows[0].results.items():
         for result in results:
@@ -68,11 +71,11 @@ def stress_table(rows: Sequence[StressRow], *, title: str = "") -> Table:
 
 
 def _signed(change: float) -> str:
-    return f"{round(change, 3) + 0.0:+.3f}"  # + 0.0: a loss that rounds to none is no minus zero
+    return f"{round(change, 3) + 0.0:+.3f}"  # + 0.0 turns -0.0 into 0.0
 
 
 def stress_json(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
-    """Return plain values for `json.dump`: of every row the results, each with its `change` (null: no revisit)."""
+    """Return values for `json.dump`: the results of each row, each with its `change` (null without a revisit)."""
     return [
         {
             "corruption": row.name,
@@ -89,7 +92,7 @@ def stress_json(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
 
 
 def changes_by_kind(rows: Sequence[StressRow]) -> dict[tuple[str, str], dict[str, list[tuple[str, float]]]]:
-    """Return what `figures.stress` draws: by protocol and kind of corruption, by method, labels and changes."""
+    """Return the input of `figures.stress`: labels and changes by (protocol, kind of corruption) and by method."""
     found: dict[tuple[str, str], dict[str, list[tuple[str, float]]]] = {}
     for row in rows[1:]:
         for method, changes in score_changes(row, rows[0]).items():

@@ -1,4 +1,4 @@
-"""The stress test: every method described and scored on a recording as it is, and on corrupted ones."""
+"""Stress test: scores of several methods on a recording, clean and corrupted."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -34,13 +34,23 @@ def stress_test(
     batch: int = 8,
     progress: Progress = no_progress,
 ) -> StressTest:
-    """Score every method on the recording as it is and under each corruption.
+    """Score every method on the clean recording and under each corruption.
 
-    `corruptions` are names or kinds of them; none named: all, of ready-made images rotation alone. `protocols` are
-    names of those that score descriptors; none named: top-1 F1max and pairs F1max. Descriptors are kept in `folder` and
-    used again where they were made alike. `progress` shows how far each embedding is. A corruption that needs the rings
-    of the lasers is left out of a recording that does not tell them; the result says so. Raises ValueError where the
-    recording has no poses or no revisit, another corruption or a method does not fit it, or no corruption is left.
+    A corruption that needs the laser rings is skipped if the recording has no rings (`StressTest.left_out`).
+
+    Arguments:
+      recording: Recording with poses and at least one revisit.
+      methods: Methods by name.
+      folder: Folder for descriptors. Descriptors with the same settings are reused.
+      corruptions: Names or kinds of corruptions. By default all; for ready-made images only rotation.
+      protocols: Names of protocols that score descriptors. By default top-1 F1max and pairs F1max.
+      seed: Seed of the corruptions.
+      batch: Number of scans described at a time.
+      progress: Reports the progress of each embedding.
+
+    Raises:
+      ValueError: If the recording has no poses or no revisit, if a method or another corruption does not fit the
+        recording, or if all corruptions were skipped.
     """
     chosen = stress_protocols(protocols)
     fitting, left_out = fitting_corruptions(recording, corruptions, seed)
@@ -68,7 +78,10 @@ def stress_test(
 
 
 def stress_protocols(names: Sequence[str]) -> list[str]:
-    """Return the protocols asked for; `all` stands for every one that scores descriptors. ValueError for others."""
+    """Return the named protocols, or `DEFAULT_PROTOCOLS`. `all` selects every protocol that scores descriptors.
+
+    Raises ValueError for other protocols.
+    """
     check_names(names)
     known = protocols_taking("descriptors")
     chosen = list(known) if ALL in names else list(dict.fromkeys(names or DEFAULT_PROTOCOLS))
@@ -80,10 +93,17 @@ def stress_protocols(names: Sequence[str]) -> list[str]:
 def fitting_corruptions(
     recording: Recording, names: Sequence[str], seed: int
 ) -> tuple[tuple[Corruption, ...], dict[str, str]]:
-    """Return the corruptions asked for, each tried on three scans; of ready-made images rotation where none is.
+    """Return the corruptions that fit the recording, and the reasons why others were skipped.
 
-    Beside them, why which others were left out: those that need rings, where the scans have none. Raises ValueError
-    where the recording has no poses, another one does not fit it, or none is left.
+    Each corruption is tried on three scans. Corruptions that need laser rings are skipped if the scans have no rings.
+
+    Arguments:
+      recording: Recording with poses.
+      names: Names or kinds of corruptions. By default all; for ready-made images only rotation.
+      seed: Seed of the corruptions.
+
+    Raises:
+      ValueError: If the recording has no poses, if another corruption does not fit, or if all corruptions were skipped.
     """
     if recording.positions is None:
         raise ValueError(f"sequence {recording.name}: expected poses to score against, found none")
@@ -104,7 +124,7 @@ def fitting_corruptions(
 
 
 def _try_on(recording: Recording, corruption: Corruption, seed: int) -> None:
-    """Corrupt the first, the middle and the last scan. Raises what that raises."""
+    """Corrupt the first, the middle and the last scan. Raises ValueError if the corruption does not fit them."""
     if corruption != ROTATION:
         scans = corrupted(recording, corruption, seed=seed)
         for row in sorted({0, len(recording) // 2, len(recording) - 1}):
@@ -112,7 +132,7 @@ def _try_on(recording: Recording, corruption: Corruption, seed: int) -> None:
 
 
 def write_stress_test(found: StressTest, folder: Path) -> list[Path]:
-    """Write configuration, numbers and, with matplotlib, the plot. Returns the paths of numbers and plot."""
+    """Write configuration, results and, with matplotlib, the plot. Returns the paths of the results and the plot."""
     write_json(folder / "config.json", found.config)
     write_json(folder / "results.json", found.to_json())
     if not figures.can_draw():
@@ -122,11 +142,11 @@ def write_stress_test(found: StressTest, folder: Path) -> list[Path]:
 
 
 def _check_revisits(recording: Recording, results: Sequence[Result], protocols: Sequence[str]) -> None:
-    """Raise ValueError where no protocol has a score: without a revisit there is nothing to lose."""
+    """Raise ValueError if no protocol has a score, because the recording has no revisit."""
     if np.isnan([result.score for result in results]).all():
         raise ValueError(
-            f"sequence {recording.name}: expected a place that is visited twice, found none under "
-            f"{', '.join(protocols)}, so there is nothing to lose"
+            f"sequence {recording.name}: expected a place that is visited twice, found none for "
+            f"protocols {', '.join(protocols)}, so no score can drop"
         )
 
 

@@ -1,1 +1,1 @@
-"""Loops: from places that look alike to verified poses between scans, as a stream, as files, and in a saved map."""
+"""Loop closures: retrieval, verification and relative poses, for streams, recordings and saved maps."""

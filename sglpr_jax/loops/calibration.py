@@ -1,8 +1,8 @@
-"""The probability of loops fitted to one's own drive, without knowing a single loop of it.
+"""Calibration of loop probabilities on a drive with odometry, without labelled loops.
 
-Pairs of frames farther apart than the odometry can have drifted are certainly no loops: of these the ones that look
-most alike are taken. Frames some metres apart in one pass, one of them turned, certainly show one place. They are
-easier than a revisit: what stands about has not moved meanwhile.
+Negative pairs are farther apart than the odometry can drift; those with the nearest descriptors are used. Positive
+pairs are some metres apart in one pass, with one scan rotated. They are easier than revisits, because nothing has moved
+between the two scans.
 """
 
 from collections.abc import Callable
@@ -27,11 +27,11 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.same_place import NEGATIVE_M
 
 NEAR_M = (2.0, 10.0)
-"""How far apart the frames of a certain loop are."""
+"""Minimum and maximum distance of a positive pair, in metres."""
 RIVALS = 10
-"""Number of other places that a query is compared with."""
+"""Maximum number of rivals of a query."""
 SAME_PASS_M = 50.0
-"""Of way between them, at most."""
+"""Maximum travelled distance between the frames of a positive pair, in metres."""
 
 
 def calibrated(
@@ -45,10 +45,20 @@ def calibrated(
     config: CandidateConfig = CandidateConfig(),
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> LoopModel:
-    """The shipped `model` (or the one given), with its log odds stretched and shifted to fit a drive with odometry.
+    """Scale and shift the log odds of a loop model to fit a drive with odometry.
 
-    `pairs` frames are drawn for loops, and as many for others. `odometry` has a pose of the LiDAR for each scan.
-    Raises ValueError for odometry of another length, and for a drive that is too short to have either kind of pair.
+    Arguments:
+      params: Weights of the model that describes the scans.
+      recording: The scans.
+      odometry: Pose of the LiDAR at each scan.
+      pairs: Number of frames drawn for positive pairs, and number of frames drawn for negative pairs.
+      seed: Seed of the random choice.
+      model: Model to calibrate, by default the one shipped for the weights.
+      config: Settings of the retrieval.
+      on_progress: Called with the number of frames done.
+
+    Raises:
+      ValueError: If the odometry has another length, or if the drive has no pairs of one kind.
     """
     evidence, is_loop = certain_pairs(
         params, recording, odometry, pairs=pairs, seed=seed, config=config, on_progress=on_progress
@@ -68,7 +78,7 @@ def certain_pairs(
     config: CandidateConfig = CandidateConfig(),
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
-    """Evidence of pairs of a drive that are certainly loops or certainly none, and which they are."""
+    """Evidence of positive and negative pairs of a drive, and whether each pair is a loop. See `calibrated`."""
     n = len(recording)
     if len(odometry) != n:
         raise ValueError(
@@ -87,14 +97,14 @@ def certain_pairs(
         on_progress(done + 1)
     if not evidence or all(is_loop) or not any(is_loop):
         raise ValueError(
-            f"{recording.name}: expected a drive with frames {NEAR_M[0]:g} to {NEAR_M[1]:g} m apart, and with frames "
-            "farther apart than odometry drifts, found none of one kind: it is too short to calibrate on"
+            f"{recording.name}: expected frames {NEAR_M[0]:g} to {NEAR_M[1]:g} m apart, and frames farther apart than "
+            "the odometry can drift, found no pairs of at least one kind; calibrate on a longer drive"
         )
     return Evidence.stack(evidence), np.array(is_loop)
 
 
 class _Places:
-    """All frames of a drive, described, with what the odometry says of every two."""
+    """Descriptors, images and odometry of all frames of a drive."""
 
     def __init__(
         self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], config: CandidateConfig
@@ -110,23 +120,23 @@ class _Places:
         return np.linalg.norm(self.positions - self.positions[frame], axis=1)
 
     def near(self, frame: int) -> Bool[np.ndarray, " n"]:
-        """Which frames certainly show the same place, seen from elsewhere."""
+        """Frames that make a positive pair with `frame`."""
         apart = self.apart(frame)
         return (apart >= NEAR_M[0]) & (apart <= NEAR_M[1]) & (np.abs(self.way - self.way[frame]) <= SAME_PASS_M)
 
     def far(self, frame: int) -> Bool[np.ndarray, " n"]:
-        """Which frames certainly show another place."""
+        """Frames that certainly show another place than `frame`."""
         drift = self.finder.drift
         drifted = position_deviations(self.positions, frame, drift=drift)
         return self.apart(frame) > NEGATIVE_M + drift.max_deviation * drifted
 
     def nearest(self, descriptor: Float32[np.ndarray, " d"], among: Bool[np.ndarray, " n"]) -> np.ndarray:
-        """The frame of these that looks most like a descriptor; none where there are none."""
+        """The frame among these with the nearest descriptor, or an empty array."""
         rows = self.finder.index.query(descriptor, exclude=~among).rows
         return rows[rows >= 0]
 
     def turned(self, frame: int, angle: float) -> Seen:
-        """What is seen of a frame turned by `angle`."""
+        """Descriptor and image of a frame rotated by `angle` (radians)."""
         record = self.recording.record(frame, labels=False)
         if record.points is not None:
             return self.finder.seen(Record(points=rotated(record.upright_points, angle)))
@@ -134,7 +144,7 @@ class _Places:
         return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
 
     def evidence(self, frame: int, query: Seen, row: int) -> Evidence:
-        """The evidence of a pair. Its rivals are the nearest frames that show neither place."""
+        """Evidence of a pair. Its rivals are the frames with the nearest descriptors that show neither place."""
         finder = self.finder
         elsewhere = self.far(frame) & (self.apart(row) > NEGATIVE_M)
         found = finder.index.query(query.descriptor, RIVALS, exclude=~elsewhere).rows

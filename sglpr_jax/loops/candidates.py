@@ -1,4 +1,4 @@
-"""From a scan to the earlier scan that may show its place: description, retrieval, and comparison of the images."""
+"""Candidate matches of a scan: description, retrieval of earlier scans, and comparison of images."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -44,12 +44,13 @@ from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
 @dataclasses.dataclass(frozen=True)
 class CandidateConfig:
-    """Selection of candidate matches, and of the frames that they are compared with."""
+    """Selection of candidate matches and of their rivals."""
 
     candidates: int = 3
-    """Number of nearest descriptors whose images are compared. The best fit is the candidate."""
+    """Number of nearest descriptors whose images are compared."""
     elsewhere: int = 2
-    """Number of frames at other times (`rivals.age`) with the nearest descriptors, whose images are compared, too."""
+    """Number of nearest descriptors from other times (`rivals.age`) whose images are compared. The best fit of all
+    compared frames is the candidate."""
     exclude_s: float = EXCLUDED_S
     exclude_frames: int = EXCLUDED_FRAMES
     """Minimum age of a match in seconds, or in frames if there are no times."""
@@ -58,12 +59,11 @@ class CandidateConfig:
     min_cells: int = 20
     """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
     background_frames: int = 16
-    """Number of keyframes over which images are averaged. What they have in common is not compared
-    (`loops.background`)."""
+    """Number of keyframes in the average image, which is subtracted before comparisons (`loops.background`)."""
     min_background_frames: int = 4
-    """Minimum number of keyframes for that."""
+    """Minimum number of keyframes before the average is subtracted."""
     min_rival_correlation: float = 0.25
-    """Candidates with a lower correlation are no loops whatever else fits, and have no rivals."""
+    """Minimum correlation of a candidate that is compared with rivals. Candidates below it are not loops."""
     rivals: RivalConfig = RivalConfig()
     motion: MotionConfig = MotionConfig()
 
@@ -73,9 +73,9 @@ class Candidate(NamedTuple):
 
     query: int
     match: int
-    """Frames, counted from 0; the match is the earlier one."""
+    """Frame numbers, counted from 0. The match is the earlier frame."""
     alignment: Alignment
-    """Pose of the query's image in the match's."""
+    """Pose of the query's image in the frame of the match's image."""
     evidence: Evidence
 
 
@@ -83,23 +83,23 @@ class Compared(NamedTuple):
     """The results of all image comparisons of a frame."""
 
     candidates: list[Candidate]
-    """One, or none."""
+    """The candidate of the frame, or an empty list."""
     link: Peak | None
-    """Pose over the keyframe, which the motion without odometry is made of."""
+    """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
 class Seen(NamedTuple):
-    """What is kept of a scan or ready-made image."""
+    """Descriptor and image of a scan or ready-made image."""
 
     descriptor: Float32[np.ndarray, " d"]
     image: UInt8[np.ndarray, "n n"]
-    """Its density image."""
+    """Density image."""
     mounting: Mounting | None
-    """Of the sensor that was turned upright for both."""
+    """Mounting of the sensor. Descriptor and image are gravity-aligned."""
 
 
 class CandidateFinder:
-    """Takes scans as they come, and remembers descriptor and image of each."""
+    """Finds candidates in a stream of scans. Stores descriptor and image of each scan."""
 
     def __init__(
         self,
@@ -116,27 +116,27 @@ class CandidateFinder:
         self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.images: list[UInt8[np.ndarray, "n n"]] = []
         self.details: list[UInt8[np.ndarray, "m m"]] = []
-        """What is compared: the middle of each image, without the background."""
+        """Centre of each image without the background, for comparison."""
         self.odometry: list[Float[np.ndarray, "4 4"]] = []
         self.mounting: Mounting | None = None
-        """Of the sensor, one for all frames."""
+        """Mounting of the sensor, the same for all frames."""
         self.empty: list[bool] = []
-        """Which frames show next to nothing."""
+        """Whether each frame is almost empty (`is_empty`)."""
         self.motion = Motion(config.motion)
         self.background = Background(frames=config.background_frames, least=config.min_background_frames)
         self.links: list[Peak | None] = []
-        """Pose of each frame over its keyframe, if there is no odometry."""
+        """Pose of each frame in the frame of its keyframe, if there is no odometry."""
         self.missing: list[int] = []
-        """The frames whose scans could not be read."""
+        """Frames whose scans cannot be read."""
 
     def add(
         self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
     ) -> list[Candidate]:
-        """Describe a scan or image, add it, and return its candidate, if there is one.
+        """Describe a scan or image, add it, and return its candidate, or an empty list.
 
         Arguments:
           record: The scan or image.
-          time: Its time, in seconds.
+          time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in any fixed frame.
 
         Raises:
@@ -152,9 +152,13 @@ class CandidateFinder:
         odometry: Float[np.ndarray, "4 4"] | None = None,
         compared: Compared | None = None,
     ) -> list[Candidate]:
-        """Add a frame that is described already; None is a scan that cannot be read.
+        """Add a frame that is already described, and return its candidate. Raises the errors of `add`.
 
-        `compared` has the comparisons of an earlier run, which are not repeated. Errors are those of `add`.
+        Arguments:
+          seen: Descriptor and image, or None for a scan that cannot be read.
+          time: Time of the scan, in seconds.
+          odometry: Pose of the LiDAR in any fixed frame.
+          compared: Comparisons of an earlier run. If they are given, they are not repeated.
         """
         self._check(seen, time, odometry)
         if seen is None:
@@ -183,7 +187,7 @@ class CandidateFinder:
         return compared.candidates
 
     def seen(self, record: Record) -> Seen:
-        """The descriptor of a scan or image, and its density image as 8 bits; nothing is remembered."""
+        """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
         model = self.params.config
         check_ready_made(record, model.image)
         whole, _ = picture(record, None)
@@ -194,10 +198,10 @@ class CandidateFinder:
         return Seen(np.asarray(describe(self.params, bev)), _kept(whole), record.mounting)
 
     def seen_scan(self, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
-        """What is seen of a recording's scan; None where it cannot be read, which `on_bad_scan(id, error)` is told.
+        """Read and describe scan `i` of a recording.
 
-        So it is of a scan that cannot be one of a place: no finite points, no metres. Without `on_bad_scan` the error
-        is raised.
+        If the scan cannot be read or is invalid (no finite points, not in metres), `on_bad_scan(id, error)` is called
+        and None is returned. Without `on_bad_scan` the error is raised.
         """
         try:
             record = recording.record(i, labels=False)
@@ -211,7 +215,7 @@ class CandidateFinder:
             return None
 
     def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
-        """Whether an image shows too little to tell a place by."""
+        """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
     def _compared(
@@ -222,7 +226,7 @@ class CandidateFinder:
         pose: Float[np.ndarray, "4 4"] | None,
         clock: float,
     ) -> Compared:
-        """Compare the next frame with its nearest descriptors and the keyframe, and add it to the motion."""
+        """Compare the next frame with its nearest frames and the keyframe, and add it to the motion."""
         if self.is_empty(seen.image):
             self.motion.add(clock, pose=pose)
             return Compared([], None)
@@ -243,7 +247,7 @@ class CandidateFinder:
         return Compared([self._candidate(seen, spectra, rows, peaks.some(slice(len(rows))), best)], link)
 
     def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
-        """Frames with the nearest descriptors, and those with the nearest ones away from the first."""
+        """Frames with the nearest descriptors, and those with the nearest ones at other times than the first."""
         rows = self.nearest(descriptor, self.config.candidates, excluded)
         if not len(rows):
             return rows
@@ -253,14 +257,14 @@ class CandidateFinder:
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k frames with the nearest descriptors, in order."""
+        """Up to k frames with the nearest descriptors, nearest first."""
         rows = self.index.query(descriptor, k, exclude=excluded).rows
         return rows[rows >= 0]
 
     def _candidate(
         self, seen: Seen, spectra: Complex[Array, "s t f"], compared: Int[np.ndarray, " k"], peaks: Peak, best: int
     ) -> Candidate:
-        """The best of the compared frames. The others are rivals if they are known to show another place."""
+        """Candidate of the best compared frame. Compared frames that are known to show another place are rivals."""
         match, peak = int(compared[best]), peaks.one(best)
         distance = float(np.linalg.norm(self.index.descriptors[match] - seen.descriptor))
         alignment = jax.device_get(refined(seen.image, self.details[match], peak, config=self.verification))
@@ -289,7 +293,7 @@ class CandidateFinder:
         found: Peak,
         expected: Sequence[tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]],
     ) -> tuple[float, float]:
-        """Distance and correlation of a match beside those of its rivals `rows`; see `rival_share` for the rest."""
+        """`distance_share` and `rival_share` of a match, with the rivals `rows`."""
         rules, match_from_query = self.config.rivals, transform(float(peak.x), float(peak.y), float(peak.yaw))
         expected = [*expected, expected_poses(self.motion, match, rows, match_from_query, config=rules)]
         apart = np.linalg.norm(self.index.descriptors[rows] - seen.descriptor, axis=1)
@@ -305,7 +309,7 @@ class CandidateFinder:
         size: int,
         priors: Float[np.ndarray, "k 3"] | None = None,
     ) -> Peak:
-        """The poses of a query over some matches; `size` images are compared, so that it compiles once."""
+        """Poses of a query in the frames of some matches. The batch is padded to `size`, so that it compiles once."""
         if not matches:
             return NO_PEAKS
         chosen = np.arange(size) % len(matches)
@@ -318,7 +322,7 @@ class CandidateFinder:
         if not len(self.index):
             return
         if seen is not None and seen.mounting != self.mounting and len(self.missing) < len(self.index):
-            raise ValueError(f"expected one sensor, mounted {self.mounting}, found {seen.mounting}")
+            raise ValueError(f"expected one sensor mounting for all frames, {self.mounting}, found {seen.mounting}")
         for name, given, known in (
             ("a time", time is not None, self.index.times is not None),
             ("odometry", odometry is not None, bool(self.odometry)),
@@ -326,10 +330,10 @@ class CandidateFinder:
             if given != known:
                 raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self.index)})")
         if time is not None and self.index.times is not None and time < self.index.times[-1]:
-            raise ValueError(f"expected times that do not go back, found {time} after {self.index.times[-1]}")
+            raise ValueError(f"expected times that do not decrease, found {time} after {self.index.times[-1]}")
 
     def _excluded(self, time: float | None, position: Float[np.ndarray, " 3"] | None) -> Bool[np.ndarray, " n"]:
-        """Frames that are no candidates of the next one: too recent, almost empty, or too far away by odometry."""
+        """Frames that cannot match the next one: too recent, almost empty, or too far away by odometry."""
         config, known = self.config, self.index.positions
         excluded = self.index.recent(time, seconds=config.exclude_s, frames=config.exclude_frames)
         excluded = excluded | np.array(self.empty, bool) | self.motion.near_last(config.min_travelled_m)
@@ -342,7 +346,7 @@ class CandidateFinder:
 
 
 def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
-    """The middle square of an image on even cells, on the scale of 8 bits."""
+    """Central square of an image, with an even number of cells, as 8 bits."""
     even = even_cells(jnp.asarray(image, jnp.float32))
     size = min(even.shape)
     grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / MAX_COUNT)
@@ -350,5 +354,5 @@ def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
 
 
 def square_image(record: Record) -> UInt8[np.ndarray, "n n"]:
-    """The image of a scan that loops are verified on: its density image, or the ready-made one, as 8 bits."""
+    """Image for the verification of loops: the density image or the ready-made image, as 8 bits."""
     return _kept(picture(record, None)[0])

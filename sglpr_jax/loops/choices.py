@@ -1,20 +1,22 @@
-"""What a user may choose about loops and maps, and what holds otherwise.
+"""Options and defaults of loops and maps.
 
-Here, because a command line names it in its help without importing the rest.
+They are a separate module, so that `--help` does not import the rest.
 """
 
 from typing import Literal
 
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
-"""kitti, lidar: 12 numbers a line, in KITTI's camera axes or z up; tum: time, position, quaternion; g2o: vertices."""
+"""Format of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum" has time,
+position and quaternion. "g2o" has the vertices of a graph."""
 Degenerate = Literal["keep", "drop"]
-"""Loops whose position is uncertain by more than 1 m along one direction, as between walls: kept or rejected."""
+"""Whether degenerate loops are kept or rejected. The position of a degenerate loop is uncertain by more than 1 m along
+one direction, as between walls."""
 MIN_PROBABILITY = 0.99
-"""Of a loop that is returned."""
+"""Minimum probability of a returned loop."""
 SPACING_M = 1.0
-"""Scans nearer than this to the last place of their own drive are left out of a map."""
+"""Minimum distance of consecutive places of a drive in a map, in metres."""
 CANDIDATES = 5
-"""How many places of a map are looked at."""
+"""Number of nearest places of a map that a query is compared with."""
 DRIFT_PERCENT = 1.0
 """Position drift of odometry: one standard deviation, in percent of the travelled distance."""
 DRIFT_DEG_PER_100M = 0.5

@@ -1,6 +1,6 @@
 """Consistency of loops with each other and with the odometry.
 
-Two loops and the odometry between their frames form a circle. If the circle does not close within the drift and the
+Two loops and the odometry between their frames form a cycle. If the cycle does not close within the drift and the
 loops' own errors, one of the two loops is wrong. After Mangelson et al., Pairwise Consistent Measurement Set
 Maximization (ICRA 2018), in the plane.
 """
@@ -18,7 +18,7 @@ from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar_
 from sglpr_jax.loops.transforms import travelled
 
 BLOCK = 64
-"""Number of loops that are compared with all others at a time, to bound memory."""
+"""Number of loops compared with all others at a time, to limit memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,9 +27,9 @@ class ConsistencyConfig:
 
     position_m: float = 0.5
     yaw_deg: float = 1.5
-    """Standard deviations of a circle of two loops in addition to their covariances, in metres and degrees."""
+    """Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
     deviations: float = 3.0
-    """Two loops are consistent if their circle closes within this number of standard deviations."""
+    """Maximum closure error of the cycle of two consistent loops, in standard deviations."""
 
 
 def agree(
@@ -50,6 +50,9 @@ def agree(
       mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
       drift: Drift model of the odometry.
       config: Thresholds.
+
+    Returns:
+      Whether loop i of `loops` is consistent with loop j of `others`.
     """
     way = travelled(odometry)
     flat = planar_odometry(odometry, mounting)
@@ -65,7 +68,7 @@ def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) 
     """Indices, in order, of a large set in which every pair is consistent.
 
     Finding the largest set is NP-hard. This search is greedy: it starts from each of the `starts` loops that are
-    consistent with most others, and always adds the loop that leaves most to choose from.
+    consistent with most others, and always adds the loop that leaves most candidates.
     """
     pairs = pairs & pairs.T
     degrees = pairs.sum(0)
@@ -80,13 +83,13 @@ def largest_consistent_set(pairs: Bool[np.ndarray, "n n"], *, starts: int = 20) 
 
 
 def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[np.ndarray, " n"]) -> list[np.int64]:
-    """One consistent set, greedy from `start`; `degrees` counts the loops that each loop is consistent with."""
+    """Greedy consistent set from `start`. `degrees` is the number of loops that each loop is consistent with."""
     members, chosen, left = [], start, np.ones(len(pairs), bool)
     while True:
         members.append(chosen)
         stay = left & pairs[chosen]
         stay[chosen] = False
-        # Each loop leaves once, so that to keep the degrees costs no more than to take them once.
+        # Each loop is removed once, so updating the degrees costs as much in total as computing them once.
         degrees = degrees - pairs[left & ~stay].sum(0)
         left = stay
         if not left.any():
@@ -113,8 +116,8 @@ def _columns(
 def _closes(
     a: dict[str, np.ndarray], b: dict[str, np.ndarray], drift: DriftModel, config: ConsistencyConfig
 ) -> Bool[np.ndarray, "a b"]:
-    """Whether the circle of each loop of a with each loop of b closes, from their `_columns`."""
-    # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: that is loop a again.
+    """Whether the cycle of each loop of a with each loop of b closes, from their `_columns`."""
+    # From a's query by odometry to b's query, by loop b to b's match, by odometry to a's match: should equal loop a.
     query_from_query = relative(a["query_pose"][:, None], b["query_pose"][None])
     match_from_match = relative(a["match_pose"][:, None], b["match_pose"][None])
     around = compose(match_from_match, compose(b["pose"][None], inverted(query_from_query)))

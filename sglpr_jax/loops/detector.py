@@ -1,4 +1,4 @@
-"""Loop closures of a stream: each scan as it comes, and the loops that it closes."""
+"""Loop detector for a stream of scans."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ class DetectorConfig:
     motion_drift: DriftModel = DriftModel(
         metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5, max_deviation=3.0
     )
-    """Drift of the motion that stands in for odometry (`loops.motion`)."""
+    """Drift of the motion that is used if there is no odometry (`loops.motion`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""
 
@@ -53,12 +53,12 @@ class DetectorConfig:
 
 
 class LoopDetector:
-    """Takes scans or images in order, with or without times and odometry.
+    """Finds loop closures in a stream of scans or images, with or without times and odometry.
 
-    `LoopModel` gives the probability of a pair from descriptors and images. The sequential test (`loops.sequence`) adds
-    the evidence of neighbouring frames, at least one of which must agree. Loops that contradict the odometry are
-    rejected; without odometry, those that contradict the motion estimated from the images. The first loop of a revisit
-    is returned one frame late or more, together with others.
+    `LoopModel` computes the probability of a pair from descriptors and images. The sequential test (`loops.sequence`)
+    adds the evidence of neighbouring frames; at least one neighbour must agree. Loops that contradict the odometry are
+    rejected. Without odometry, loops that contradict the motion estimated from the images are rejected. The first loop
+    of a revisit is returned at least one frame late, together with others.
 
     Example:
       detector = LoopDetector(sglpr_jax.load("sglpr"))
@@ -68,18 +68,24 @@ class LoopDetector:
     """
 
     def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
-        """`model` is the model of the probabilities, by default the one shipped for the weights."""
+        """Create a detector without frames.
+
+        Arguments:
+          params: Weights of the model that describes the scans.
+          model: Model of the probabilities, by default the one shipped for the weights.
+          config: Thresholds.
+        """
         self.finder = CandidateFinder(
             params, config=config.candidates, verification=config.verification, drift=config.drift
         )
         self.model = default_model(self.finder.index.weights_hash) if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
-        """All pairs that were compared."""
+        """All compared pairs."""
         self.loops: list[Loop] = []
         """All returned loops."""
         self.supported: list[Loop] = []
-        """Loops that pass the sequential test and the drift, whether or not other loops contradict them."""
+        """Loops that pass the sequential test and the drift test, even if other loops contradict them."""
         self.rejected: list[Rejected] = []
         """Pairs that looked like loops, each with the reason for its rejection."""
         self.by_scans: set[int] = set()
@@ -87,7 +93,7 @@ class LoopDetector:
         self._waiting: list[Loop] = []
 
     def __len__(self) -> int:
-        """How many frames were added."""
+        """Number of added frames."""
         return len(self.finder.index)
 
     def add(
@@ -97,12 +103,17 @@ class LoopDetector:
         time: float | None = None,
         odometry: ArrayLike | None = None,
     ) -> list[Loop]:
-        """Add the next frame; return the loops that it closes or confirms, of this and of the last few frames.
+        """Add the next frame. Returns the loops that it closes or confirms, of this and of the last few frames.
 
-        `scan` is a record (with the sensor's mounting, where it has one), points (n, 3) in metres or an image (h, w) as
-        `density_bev` makes them; `time` seconds; `odometry` the pose of the LiDAR in a frame that stays, drifting as it
-        may. Raises ValueError for values of another shape, for times that go back, and where some frames have a time or
-        odometry and others not; TypeError for what is no array of numbers, a path for instance.
+        Arguments:
+          scan: A record (with the mounting of its sensor), points (n, 3) in metres, or an image (h, w) from
+            `density_bev`.
+          time: Time of the scan, in seconds.
+          odometry: Pose of the LiDAR in a fixed frame. It may drift.
+
+        Raises:
+          ValueError: If a value has another shape, if times decrease, or if only some frames have a time or odometry.
+          TypeError: If a value is not an array of numbers, for instance a path.
         """
         record, pose = given_record(scan), given_pose(odometry)
         return self.add_seen(self.finder.seen(record), time=given_time(time), odometry=pose)
@@ -115,9 +126,13 @@ class LoopDetector:
         odometry: Float[np.ndarray, "4 4"] | None = None,
         compared: Compared | None = None,
     ) -> list[Loop]:
-        """Add a frame that is described already; None is a scan that cannot be read.
+        """Add a frame that is already described, and return loops as `add` does.
 
-        `compared` has the comparisons of an earlier run (see `loops.unfinished`).
+        Arguments:
+          seen: Descriptor and image, or None for a scan that cannot be read.
+          time: Time of the scan, in seconds.
+          odometry: Pose of the LiDAR in a fixed frame.
+          compared: Comparisons of an earlier run (`loops.unfinished`).
         """
         candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared)
         self.candidates += candidates
@@ -134,7 +149,7 @@ class LoopDetector:
         return new
 
     def _consider(self, one: Candidate) -> None:
-        """Let a candidate wait for its neighbours, unless it is improbable."""
+        """Keep a candidate until its neighbours are known, unless it is improbable."""
         log_odds, least = float(self.model.log_odds(one.evidence)), self.config.min_neighbour_probability
         loop = self._loop(one, float(expit(log_odds)))
         if log_odds >= logit(min(least, self.config.min_probability)):
@@ -147,7 +162,7 @@ class LoopDetector:
         self.rejected += [Rejected(loop, reason) for loop in loops if loop.query not in known]
 
     def _confirmed(self) -> list[Loop]:
-        """Loops of the last frames that the sequential test accepts and, with odometry, the drift and other loops."""
+        """Loops of the last frames that pass the sequential test, the drift test and, with odometry, other loops."""
         rules, motion = self.config.sequence, self.finder.motion
         self.by_scans |= {loop.query for loop in self._accepted(agree_in_order(self._waiting, config=rules))}
         found = self._accepted(agree_in_motion(self._waiting, motion, self.finder.mounting, config=rules))
@@ -159,7 +174,7 @@ class LoopDetector:
         return [loop for loop in found if self._agrees(loop)]
 
     def _accepted(self, agreeing: Bool[np.ndarray, "n n"]) -> list[Loop]:
-        """The loops of the last frames that are probable enough, given those that agree with them."""
+        """Loops of the last frames that are probable enough, given the loops that agree with them."""
         rules = self.config.sequence
         own = logit(np.array([loop.probability for loop in self._waiting]))
         log_odds = added_log_odds(self._waiting, own, agreeing, self.finder.motion, config=rules)
@@ -171,7 +186,7 @@ class LoopDetector:
         ]
 
     def _within_drift(self, loops: list[Loop]) -> list[Loop]:
-        """The loops that the drift of the odometry or, without it, of the motion explains. The others are rejected."""
+        """Loops within the drift of the odometry or, without odometry, of the motion. The others are rejected."""
         if not loops:
             return []
         motion, mounting, guessed_m = self.finder.motion, self.finder.mounting, None
@@ -191,9 +206,9 @@ class LoopDetector:
         return {"mounting": self.finder.mounting, "drift": config.drift, "config": config.consistency}
 
     def _agrees(self, loop: Loop) -> bool:
-        """Whether, with odometry, a loop agrees with at least half of the loops about it.
+        """Whether a loop is consistent with at least half of the loops nearby. True without odometry.
 
-        Loops that were held back count, too. Otherwise a few wrong loops, found first, would keep out all true ones.
+        Loops that were not returned count, too. Otherwise a few early wrong loops would block all true ones.
         """
         if not self.finder.odometry:
             return True

@@ -14,7 +14,7 @@ from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, pla
 from sglpr_jax.loops.transforms import travelled
 
 GRAPH_M = 100.0
-"""Travelled distance after which the drift of a pose graph is that of the model, in metres."""
+"""Travelled distance at which the drift of a pose graph equals that of the model, in metres."""
 STEP_M, STEP_DEG = 0.005, 0.005
 """Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
 
@@ -26,7 +26,7 @@ class DriftModel:
     metres_per_metre: float = DRIFT_PERCENT / 100
     """Position drift in the direction of travel."""
     degrees_per_metre: float = DRIFT_DEG_PER_100M / 100
-    """Heading drift. It turns the rest of the path and so moves the position, too."""
+    """Heading drift. It rotates the rest of the path and so moves the position, too."""
     sideways: float = 0.25
     """Position drift across the direction of travel, as a fraction of the drift along it."""
     position_m: float = 0.5
@@ -61,17 +61,19 @@ def deviations(
 ) -> Float[np.ndarray, " k"]:
     """Mahalanobis distance of each loop from the odometry between its frames.
 
-    The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom: e is x, y and yaw of the query by the loop minus those
-    by the odometry; S sums the drift along the path, the loop's covariance and the constants of the model. Without
-    errors of the loop, the distance is the smallest RMS drift along the path that explains the loop, as a multiple of
-    the model's: drift of constant rate f and g times the model's gives at most `sqrt(f^2 + g^2)`.
+    The distance is `sqrt(e' S^-1 e)` with 3 degrees of freedom. e is x, y and yaw of the query by the loop minus those
+    by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model.
+
+    If the loop has no errors, the distance is the smallest RMS drift along the path that explains the loop, as a
+    multiple of the model's drift. Drift of constant rate, f and g times that of the model, gives at most
+    `sqrt(f^2 + g^2)`.
 
     Arguments:
       loops: Loops between frames of the odometry.
       odometry: Pose of the LiDAR at each frame.
       drift: Drift model.
       mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
-      guessed_m: Distance up to each frame that drifts as the path does, but in no known direction (`Motion.guessed_m`).
+      guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
     """
     flat = planar_odometry(odometry, mounting)
     poses, covariances = planar_loops(loops, mounting)
@@ -102,8 +104,8 @@ def step_deviations(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Standard deviations of the steps of a pose graph, in metres and radians.
 
-    Steps of a graph are independent, so their variances add up in proportion to the distance. Those of the model grow
-    with its square. Both are equal after `GRAPH_M`.
+    Steps of a graph are independent, so their variances add up in proportion to the distance. The variances of the
+    model grow with the square of the distance. Both are equal after `GRAPH_M`.
     """
     root = np.sqrt(np.diff(travelled(odometry)) * GRAPH_M)
     metres, degrees = (
@@ -118,11 +120,11 @@ class _Path(NamedTuple):
 
     length: Float[np.ndarray, " n"]
     directions: Float[np.ndarray, "n d d"]
-    """Of the product of the direction of travel with itself."""
+    """Integral of the outer product of the direction of travel with itself."""
     first: Float[np.ndarray, "n d"]
-    """Of the position."""
+    """Integral of the position."""
     squares: Float[np.ndarray, "n d d"]
-    """Of the product of the position with itself."""
+    """Integral of the outer product of the position with itself."""
 
     @classmethod
     def of(cls, positions: Float[np.ndarray, "n d"], guessed_m: Float[np.ndarray, " n"] | None = None) -> "_Path":
@@ -165,7 +167,7 @@ def _drifted(
 
 
 def _turned(covariances: Float[np.ndarray, "k 3 3"], yaw: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3 3"]:
-    """Covariances in the frames of the queries, whose yaw is given, turned into the frame of the odometry."""
+    """Covariances rotated from the frames of the queries, whose yaw is given, to the frame of the odometry."""
     turn = np.zeros_like(covariances)
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(yaw)
     turn[:, 1, 0] = np.sin(yaw)

@@ -23,8 +23,8 @@ def why_none(found: FoundLoops) -> list[str]:
     if 2 * found.empty > found.frames:
         cells = found.config.candidates.min_cells
         reasons.append(
-            f"{found.empty} of {found.frames} scans show next to nothing (fewer than {cells} occupied cells of the "
-            "image): check the format and the range of the points, and whether the sensor was covered."
+            f"{found.empty} of {found.frames} scans are almost empty (fewer than {cells} occupied cells of the image): "
+            "check the format and the range of the points, and whether the sensor was covered."
         )
     if 2 * len(found.skipped) > found.frames:
         reasons.append(f"{len(found.skipped)} of {found.frames} scans cannot be read.")
@@ -52,7 +52,7 @@ def why_few_queries(recording: Recording, rules: CandidateConfig, *, frames: int
     times = recording.times[:frames]
     lasts, steps = float(times[-1] - times[0]), np.diff(times)
     if frames > 1 and not lasts:
-        return f"The times stand still: all {frames} frames have the time {times[0]:.12g} s. Give other ones: --times."
+        return f"The times do not advance: all {frames} frames have the time {times[0]:.12g} s; give --times."
     standing = int((steps == 0).sum())
     about = f" ({standing} of {len(steps)} times do not advance)" if 2 * standing > len(steps) else ""
     unit = " Times are expected in seconds." if lasts < 1e-3 * len(steps) else ""
@@ -71,7 +71,7 @@ def _queries(recording: Recording, rules: CandidateConfig, frames: int) -> int:
 
 
 def _of_pairs(found: FoundLoops, *, alone: bool) -> list[str]:
-    """What became of the pairs that were compared. With `alone`, there is no other reason."""
+    """Reasons why the compared pairs are not loops. With `alone`, there is no other reason."""
     if found.rejected:
         pairs = len(found.rejected)
         return [f"{pairs} pairs looked like loops, and all were rejected ({listed(counted(found.rejected))})."]
@@ -90,10 +90,11 @@ def _nothing_compared(found: FoundLoops) -> str:
     rules = found.config
     if found.odometry is None:
         return (
-            f"No pair was compared: by its images the sensor moved less than {rules.candidates.min_travelled_m:g} m "
-            "after the frames that are old enough."
+            "No pair was compared: according to the images, the sensor moved less than "
+            f"{rules.candidates.min_travelled_m:g} m after the frames that are old enough."
         )
     return (
-        f"No pair was compared: no earlier frame is near by the odometry, with {rules.drift.max_deviation:g} sigmas "
-        f"of drift ({rules.drift}), and at least {rules.candidates.min_travelled_m:g} m of way before the query."
+        "No pair was compared: according to the odometry, no earlier frame is near enough (within "
+        f"{rules.drift.max_deviation:g} sigmas of drift, {rules.drift}) and at least "
+        f"{rules.candidates.min_travelled_m:g} m of travelled distance before the query."
     )

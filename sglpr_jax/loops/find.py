@@ -1,4 +1,4 @@
-"""All loops of a recording: the detector over its scans, then the joint acceptance over the whole drive."""
+"""Search for the loops of a recording: detector over all scans, then joint acceptance over the whole drive."""
 
 import dataclasses
 import functools
@@ -29,7 +29,7 @@ from sglpr_jax.retrieval.embed import OnBadScan
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FoundLoops:
-    """The loops of a recording, and the trajectory that they belong to."""
+    """Loops of a recording, with the trajectory and the settings of the search."""
 
     recording: Recording
     frames: int
@@ -42,7 +42,7 @@ class FoundLoops:
     skipped: tuple[str, ...] = ()
     """Ids of scans that cannot be read."""
     candidates: tuple[Candidate, ...] = ()
-    """All pairs that were compared, loops or not."""
+    """All compared pairs."""
     model: LoopModel | None = None
     """Model of the probabilities."""
     unregistered: int = 0
@@ -50,7 +50,7 @@ class FoundLoops:
     config: DetectorConfig = DetectorConfig()
     """Settings of the search."""
     empty: int = 0
-    """Number of searched scans that show next to nothing."""
+    """Number of searched scans that are almost empty."""
 
     @property
     def drift(self) -> DriftModel:
@@ -59,7 +59,7 @@ class FoundLoops:
 
     @property
     def whole(self) -> bool:
-        """Whether the search was not stopped."""
+        """Whether the search was completed."""
         return self.frames == len(self.recording) and not self.unregistered
 
     def __str__(self) -> str:
@@ -93,28 +93,28 @@ def find_loops(
 ) -> FoundLoops:
     """Find the loops of a recording.
 
-    Poses are between LiDAR frames, as the points of the scans have them, however the sensor is mounted. Scans with
-    next to nothing in them have no loops. A warning says if the odometry contradicts most of the loops.
+    Poses are between LiDAR frames, the frames of the points, whatever the mounting of the sensor. Scans that are almost
+    empty have no loops. If the odometry contradicts most of the loops, a warning says so.
 
     Arguments:
       recording: The scans.
       params: Weights of the model that describes them.
       odometry: Pose of the LiDAR at each scan, with drift (`config.drift`). Candidates and loops beyond the drift are
-        rejected, and of the others the largest consistent set is kept.
+        rejected. Of the remaining loops the largest consistent set is kept.
       model: Model of the probabilities, by default the one shipped for the weights.
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom (extra `slam`). Loops with little overlap
         are rejected.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
-      kept_in: Folder for intermediate results. If recording, odometry, weights and settings are the same, a run that
-        was stopped continues from it. The folder stays.
-      should_stop: Ends the search with the loops found so far if it returns True. Loops not registered by then have no
-        overlap.
+      kept_in: Checkpoint directory. If recording, odometry, weights and settings are the same, the search resumes from
+        it. The directory is not removed.
+      should_stop: If it returns True, the search ends with the loops that were found. Loops that were not registered by
+        then have no overlap.
       on_progress: Called with the number of searched scans.
 
     Raises:
-      ValueError: If the odometry has another length or shape, or if no scan can be read or shows anything.
+      ValueError: If the odometry has another length or shape, if no scan can be read, or if all scans are empty.
       TypeError: If an argument is not a recording, parameters or an array.
       ImportError: If the extra is not installed.
 
@@ -154,11 +154,13 @@ def find_loops(
     if len(skipped) == len(recording):
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
     if all(detector.finder.empty) and len(detector) == len(recording):
-        raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
+        raise ValueError(
+            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
+        )
     loops, rejected = settled(
         recording, detector.supported, odometry, config, registered=registered, should_stop=should_stop
     )
-    supported = {loop.query for loop in detector.supported}  # which `settled` has accepted or rejected
+    supported = {loop.query for loop in detector.supported}  # `settled` accepted or rejected these
     rejected = _in_order([*rejected, *(one for one in detector.rejected if one.loop.query not in supported)])
     if odometry is not None:
         check_odometry(
@@ -191,7 +193,7 @@ def _recall(
     *,
     missing: bool,
 ) -> None:
-    """Add the frames of an earlier run to a detector. `given` returns time and odometry of a frame."""
+    """Add the frames of a checkpoint directory to a detector. `given` returns time and odometry of a frame."""
 
     def add(seen: Seen | None, compared: Compared) -> None:
         detector.add_seen(seen, **given(len(detector)), compared=compared)

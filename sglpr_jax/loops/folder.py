@@ -24,10 +24,10 @@ TRAJECTORIES = ("trajectory.tum", "trajectory.kitti", "trajectory-optimized.tum"
 def write_found(
     found: FoundLoops, folder: Path | str, *, optimized: Float[np.ndarray, "n 4 4"] | None = None
 ) -> list[Path]:
-    """Write loops as g2o, JSON lines and csv, rejected pairs as JSON lines and, with odometry, the trajectory.
+    """Write loops as g2o, JSON lines and csv, rejected pairs as JSON lines, and the trajectory if there is odometry.
 
     Trajectories are written as TUM and KITTI. Their times are those of the recording or, without times, the frame
-    numbers. Older trajectories in the folder that this call does not write stay, and a warning names them.
+    numbers. Trajectories of earlier runs that this call does not overwrite stay, and a warning names them.
 
     Arguments:
       found: Loops of a recording.
@@ -35,7 +35,7 @@ def write_found(
       optimized: Corrected pose of the LiDAR at each searched frame.
 
     Returns:
-      The paths written.
+      Paths of the written files.
 
     Raises:
       WriteError: If a file cannot be written.
@@ -56,5 +56,5 @@ def write_found(
             names += [f"{stem}.tum", f"{stem}.kitti"]
     others = [name for name in TRAJECTORIES if name not in names and (folder / name).exists()]
     if others:
-        warn(f"{folder}: {', '.join(others)} lay there before and have nothing to do with these loops")
+        warn(f"{folder}: {', '.join(others)} are from an earlier run and do not belong to these loops")
     return [folder / name for name in names]

@@ -1,4 +1,4 @@
-"""What is handed in from Python, as the loops need it: what it cannot be is one clear error, before any work."""
+"""Validation of arguments of the Python API, before any work starts."""
 
 import os
 from typing import Any
@@ -12,17 +12,17 @@ from sglpr_jax.files import in_short
 from sglpr_jax.poses import are_rotations
 
 MOST_COLUMNS = 8
-"""No image is as narrow; points with so many are rows of a file, with intensity and more."""
+"""Arrays with 4 to this number of columns are points with intensity or more, not images, which are wider."""
 
 
 def check_is(value: Any, kind: type, *, by: str) -> None:
-    """Raise TypeError unless a value is of this kind, which one gets `by` a function of the package."""
+    """Raises TypeError if `value` is not of type `kind`. The message names `by`, the function that returns one."""
     if not isinstance(value, kind):
-        raise TypeError(f"expected a {kind.__name__}, which sglpr_jax.{by} gives, found {_said(value)}")
+        raise TypeError(f"expected a {kind.__name__}, found {_said(value)}; sglpr_jax.{by} returns one")
 
 
 def given_record(scan: Any, *, mounting: Mounting | None = None) -> Record:
-    """A scan or image as a record: one already, points (n, 3) of a sensor mounted so, or an image (h, w)."""
+    """Convert points (n, 3) of a sensor with this `mounting`, or an image (h, w), to a record. Accepts records, too."""
     if isinstance(scan, Record):
         return scan
     expected = "points (n, 3) or an image (h, w)"
@@ -30,12 +30,12 @@ def given_record(scan: Any, *, mounting: Mounting | None = None) -> Record:
     if values.ndim != 2:
         raise ValueError(f"expected {expected}, found an array of shape {values.shape}")
     if 3 < values.shape[1] <= MOST_COLUMNS:
-        raise ValueError(f"expected points of x, y and z alone, (n, 3), found an array of shape {values.shape}")
+        raise ValueError(f"expected points (n, 3) of x, y and z only, found an array of shape {values.shape}")
     return Record(points=values, mounting=mounting) if values.shape[1] == 3 else Record(image=values)
 
 
 def given_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
-    """The pose of one frame, if there is one."""
+    """Convert a pose to a 4 x 4 array. Returns None for None."""
     if odometry is None:
         return None
     expected = "odometry as a 4 x 4 pose with a rotation"
@@ -46,7 +46,7 @@ def given_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:
 
 
 def given_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
-    """Poses as an array: an array already, or a list of 4 x 4 arrays; `of` says what they are: "odometry"."""
+    """Convert an array or a list of 4 x 4 arrays to poses. Errors name them by `of`, for instance "odometry"."""
     expected = f"{of} (n, 4, 4)"
     values = _numbers(poses, np.float64, expected, by="read_odometry")
     if values.ndim != 3 or values.shape[1:] != (4, 4):
@@ -59,7 +59,7 @@ def given_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
 
 
 def given_time(time: Any) -> float | None:
-    """Seconds, if they are said."""
+    """Convert a time to seconds. Returns None for None."""
     if time is None:
         return None
     try:
@@ -72,14 +72,14 @@ def given_time(time: Any) -> float | None:
 
 
 def _are_poses(poses: Float[np.ndarray, "*n 4 4"]) -> Bool[np.ndarray, "*n"]:
-    """Whether each is finite and has a rotation."""
+    """Whether each matrix is finite and contains a rotation."""
     return np.asarray(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[..., :3, :3]))
 
 
 def _numbers(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
-    """The numbers of an array or a list; TypeError for what holds none, `by` what they are read from a file."""
+    """Convert to an array of numbers, or raise TypeError. For a path, the message names the reader `by`."""
     if isinstance(values, str | os.PathLike):
-        raise TypeError(f"expected {expected}, found the path {values}: sglpr_jax.{by} reads it")
+        raise TypeError(f"expected {expected}, found the path {values}; read it with sglpr_jax.{by}")
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError) as error:
@@ -87,5 +87,5 @@ def _numbers(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:
 
 
 def _said(value: Any) -> str:
-    """The kind of a value, and what it is where that is short."""
+    """The value itself if it is a string or path, otherwise its type."""
     return f"{value!r}" if isinstance(value, str | os.PathLike) else f"a {type(value).__name__}"

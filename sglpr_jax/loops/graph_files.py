@@ -22,7 +22,7 @@ from sglpr_jax.poses import are_rotations
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 UPPER = np.triu_indices(6)
-"""The 21 numbers of an information matrix, row by row, translation before rotation."""
+"""Indices of the 21 numbers of an information matrix, row by row, translation before rotation."""
 COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
 
 
@@ -46,8 +46,8 @@ def write_g2o(
     Arguments:
       path: File to write.
       loops: Loops.
-      odometry: Pose of the LiDAR at each frame. Without it, the file has the edges of the loops alone.
-      drift: Drift of the odometry, from which the information of its edges is taken (`step_deviations`).
+      odometry: Pose of the LiDAR at each frame. Without it, the file has only the edges of the loops.
+      drift: Drift of the odometry, which determines the information matrices of its edges (`step_deviations`).
 
     Raises:
       WriteError: If the file cannot be written.
@@ -65,10 +65,10 @@ def write_g2o(
 
 
 def read_g2o(path: Path | str) -> Graph:
-    """Read vertices and edges of the kinds that `write_g2o` writes. Other lines are ignored.
+    """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Other lines are ignored.
 
     Raises:
-      FileNotFoundError: If there is no such file.
+      FileNotFoundError: If the file does not exist.
       ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
     """
     path, graph = Path(path), Graph({}, [])
@@ -80,7 +80,7 @@ def read_g2o(path: Path | str) -> Graph:
             values = numbers_of(words[1:], columns=8, where=where)
             (frame,) = _frames(values[:1], where)
             if frame in graph.poses:
-                raise ValueError(f"{where}: expected one vertex {frame}, found a second one")
+                raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
             graph.poses[frame] = _pose(values[1:], where)
         elif words and words[0] == EDGE:
             values = numbers_of(words[1:], columns=30, where=where)
@@ -93,13 +93,18 @@ def read_g2o(path: Path | str) -> Graph:
 
 
 def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:
-    """Write a line `time x y z qx qy qz qw` for each pose, in seconds and metres."""
+    """Write a TUM file: a line `time x y z qx qy qz qw` for each pose, in seconds and metres."""
     lines = (f"{time:.6f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
     write_text(Path(path), "".join(lines))
 
 
 def read_tum(path: Path | str) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"]]:
-    """Read poses and times of a TUM file. Raises FileNotFoundError, and ValueError naming the first wrong line."""
+    """Read poses and times of a TUM file.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line is invalid. The message names the line.
+    """
     path = Path(path)
     rows = read_rows(path, columns=8)
     check_times(path, rows[:, 0])
@@ -107,13 +112,13 @@ def read_tum(path: Path | str) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.nda
 
 
 def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
-    """Write 12 numbers a line, in KITTI's axes (x right, y down, z forward)."""
+    """Write a KITTI file: 12 numbers a line, in KITTI's camera axes (x right, y down, z forward)."""
     camera = CAMERA_FROM_LIDAR @ poses @ CAMERA_FROM_LIDAR.T
     write_text(Path(path), "".join(f"{_numbers(pose[:3].reshape(-1))}\n" for pose in camera))
 
 
 def read_kitti(path: Path | str, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
-    """Read 12 numbers a line, in KITTI's axes or, without `camera`, with z up. Raises the errors of `read_tum`."""
+    """Read 12 numbers a line, in KITTI's camera axes or, with `camera=False`, with z up. Errors as in `read_tum`."""
     rows = read_poses(Path(path))
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows
@@ -121,12 +126,12 @@ def read_kitti(path: Path | str, *, camera: bool = True) -> Float[np.ndarray, "n
 
 
 def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Sequence[str] | None = None) -> None:
-    """Write a JSON object a line, with the `ids` of the frames if they are given."""
+    """Write loops, one JSON object a line, with the `ids` of the frames if they are given."""
     write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids))}\n" for loop in loops))
 
 
 def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Sequence[str] | None = None) -> None:
-    """Write a JSON object a line: frames, `ids` if they are given, reason, probability, overlap, match_from_query."""
+    """Write rejected pairs, one JSON object a line, with the `ids` of the frames if they are given."""
     lines = []
     for one in rejected:
         pose = one.loop.match_from_query.tolist()
@@ -136,7 +141,7 @@ def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Se
 
 
 def read_loops_jsonl(path: Path | str) -> list[Loop]:
-    """Read what `write_loops_jsonl` wrote. Raises FileNotFoundError, and ValueError naming the first wrong line."""
+    """Read a file of `write_loops_jsonl`. Raises the errors of `read_tum`."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
@@ -145,7 +150,7 @@ def read_loops_jsonl(path: Path | str) -> list[Loop]:
 
 
 def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
-    """Write a table: frames, match_from_query as x y z and quaternion, probability, overlap (empty if unknown)."""
+    """Write a csv table with the columns `COLUMNS`. The overlap is empty if it is unknown."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -156,9 +161,9 @@ def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
 
 
 def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "4 4"], float]]:
-    """Read query, match, match_from_query and probability of each line of a table that `write_loops_csv` wrote.
+    """Read query, match, match_from_query and probability from a table of `write_loops_csv`.
 
-    Raises FileNotFoundError, and ValueError naming the first wrong line.
+    Raises the errors of `read_tum`.
     """
     path, found = Path(path), []
     if not path.is_file():
@@ -170,7 +175,7 @@ def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "
         )
     for i, line in enumerate(lines[1:]):
         words, where = line.split(","), f"{path}, line {i + 2}"
-        words = words[:-1] if len(words) == len(COLUMNS) and not words[-1] else words  # of a loop without an overlap
+        words = words[:-1] if len(words) == len(COLUMNS) and not words[-1] else words  # no overlap
         values = numbers_of(words, columns=len(words) if len(words) in (10, 11) else 10, where=where)
         query, match = _frames(values[:2], where)
         _check_loop(query, match, values[9:].tolist(), where)
@@ -247,9 +252,9 @@ def _from_json(line: bytes, where: str) -> Loop:
             raise ValueError(f"probability and overlap {shares}")
         pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
         if not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
-            raise ValueError(f"a pose that is none: {pose.tolist()}")
+            raise ValueError(f"an invalid pose: {pose.tolist()}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ValueError(f"{where}: expected a loop as JSON, found another line ({in_short(error)})") from error
+        raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
     _check_loop(query, match, shares, where)
     return Loop(query, match, pose, covariance, value["probability"], value["overlap"])
 
@@ -257,7 +262,7 @@ def _from_json(line: bytes, where: str) -> Loop:
 def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:
     """Rows of JSON as a matrix of finite numbers."""
     if not all(type(number) in (int, float) for row in rows for number in row):
-        raise ValueError(f"others than numbers: {rows}")
+        raise ValueError(f"values that are not numbers: {rows}")
     matrix = np.array(rows, np.float64)
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise ValueError(f"a matrix {matrix.shape}: {rows}")

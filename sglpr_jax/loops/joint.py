@@ -1,4 +1,4 @@
-"""Joint acceptance: which loops of a whole drive are kept, given the odometry and the full scans."""
+"""Joint acceptance of the loops of a whole drive, given the odometry and the full scans."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
@@ -19,9 +19,9 @@ from sglpr_jax.loops.registration import register
 from sglpr_jax.loops.transforms import travelled
 
 MIN_OVERLAP = 0.6
-"""Minimum overlap of two registered scans of one place. Measured: docs/decisions/loops.md."""
+"""Minimum overlap of two registered scans of one place. Measurements: docs/decisions/loops.md."""
 FEWEST_AGAINST = 5
-"""Minimum number of frames against the odometry for a warning."""
+"""Minimum number of frames whose loops contradict the odometry, for a warning."""
 AXES = "x forward, y left, z up, of the LiDAR, not of a camera."
 
 
@@ -35,8 +35,8 @@ def accepted(
 ) -> tuple[list[Loop], list[Rejected]]:
     """Accept the loops of a whole drive jointly against the odometry.
 
-    Loops that contradict the odometry are rejected, however many agree with each other: loops of repeating places do.
-    Among the others the largest consistent set is accepted.
+    Loops that contradict the odometry are rejected, even if many agree with each other, because loops of repeating
+    places agree with each other. Of the remaining loops the largest consistent set is accepted.
 
     Returns:
       The accepted and the rejected loops, each in the given order.
@@ -71,7 +71,7 @@ def check_odometry(
 ) -> None:
     """Warns if the odometry contradicts most of the frames that have a loop.
 
-    Drift and places that repeat both do that, so the message names both, and the option that states a larger drift.
+    Both drift and repeating places can be the cause. The message names both, and the options that state a larger drift.
 
     Arguments:
       name: Name of the recording.
@@ -93,13 +93,13 @@ def check_odometry(
     )
     if against:
         said += f" {_readings(against, odometry, config, mounting)}"
-    warn(f"{said} If the poses are not those of these scans, or in other axes, check the file: {AXES}")
+    warn(f"{said} Check also that the poses belong to these scans and use these axes: {AXES}")
 
 
 def _readings(
     against: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], config: DetectorConfig, mounting: Mounting | None
 ) -> str:
-    """Both readings of loops that contradict the odometry, with the drift that explains them."""
+    """Both explanations of loops that contradict the odometry, with the drift that would explain them."""
     found = deviations(against, odometry, drift=config.drift, mounting=mounting)
     drift = config.drift.scaled(float(f"{np.median(found):.2g}"))
     pairs = agree(against, odometry, mounting=mounting, drift=drift, config=config.consistency)
@@ -124,8 +124,8 @@ def settled(
 ) -> tuple[list[Loop], list[Rejected]]:
     """Accept the loops of a whole drive jointly and, with `registered`, check the overlap of their scans.
 
-    When `should_stop` returns True, the remaining loops are kept without registration. Without odometry, all loops
-    are consistent.
+    If `should_stop` returns True, the remaining loops are kept without registration. Without odometry, no loop is
+    rejected as inconsistent.
 
     Returns:
       The accepted and the rejected loops.
@@ -143,7 +143,7 @@ def settled(
 def _registered(
     recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
 ) -> tuple[list[Loop], list[Rejected]]:
-    """Loops with poses from full scans, and those whose scans do not overlap. After a stop the others as they are."""
+    """Registered loops, and loops whose scans overlap too little. After a stop, the remaining loops are unchanged."""
     kept, rejected = [], []
     for i, loop in enumerate(loops):
         if should_stop():

@@ -24,29 +24,29 @@ Reason = Literal[
 """Why a pair that looked like a loop closure was rejected."""
 UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M = 0.03, 0.018
 UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M = 1.2, 0.07
-"""Standard deviations of what an image from above does not show, of two scans at one spot and per metre between them:
-height, and pitch and roll. They hold for vehicles: simulated towns and outskirts, and KITTI's poses."""
+"""Standard deviations of height, and of pitch and roll, which images do not show: of two scans at one position, and per
+metre between them. They hold for vehicles, in simulated towns and outskirts and on KITTI."""
 DEGENERATE_M = 1.0
-"""A pose with a larger standard deviation of its position is degenerate, in metres."""
+"""Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loop:
-    """Two frames of one place."""
+    """Two frames of one place, with the pose between them."""
 
     query: int
     match: int
     """Frame numbers, counted from 0. The match is the earlier frame."""
     match_from_query: Float[np.ndarray, "4 4"]
-    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. The frames are those of the points, and
-    tilted if the sensor is."""
+    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. These are the frames of the points; they
+    are tilted if the sensor is."""
     covariance: Float[np.ndarray, "6 6"]
     """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
     radians."""
     probability: float
     """Probability that both frames show one place."""
     overlap: float | None = None
-    """Overlap of the scans, if they were registered in 6 degrees of freedom."""
+    """Overlap of the scans, from 0 to 1, if they were registered in 6 degrees of freedom."""
 
     @property
     def yaw(self) -> float:
@@ -65,9 +65,12 @@ class Loop:
 
 
 def unseen_covariance(apart_m: float) -> Float[np.ndarray, "6 6"]:
-    """Covariance of height, roll and pitch between two upright scans this far apart in the plane; zero elsewhere.
+    """Covariance of height, roll and pitch between two gravity-aligned scans. The other entries are zero.
 
-    Springs and bumps tilt both vehicles. A tilted vehicle, or a hill, raises what is far away.
+    Suspension and bumps tilt both vehicles. With a tilt or a slope, the height error grows with the distance.
+
+    Arguments:
+      apart_m: Distance between the two scans in the plane, in metres.
     """
     height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
     tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
@@ -78,17 +81,17 @@ def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
     """Largest standard deviation of the position in the plane, over all directions, in metres.
 
     Arguments:
-      covariance: of (x, y, yaw), as `Alignment` has it, or of all 6 degrees of freedom, as `Loop` has it.
+      covariance: Covariance of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
     """
     return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance, np.float64)[:2, :2])[-1], 0)))
 
 
 def is_degenerate(covariance: Float[np.ndarray | Array, "n n"], *, threshold_m: float = DEGENERATE_M) -> bool:
-    """Whether a pose is unknown along some direction of the plane, as along a plain wall.
+    """Whether the position of a pose is uncertain along some direction of the plane, as along a plain wall.
 
     Arguments:
-      covariance: see `position_deviation`.
-      threshold_m: the largest standard deviation of a pose that is known.
+      covariance: See `position_deviation`.
+      threshold_m: Maximum standard deviation of a pose that is not degenerate, in metres.
     """
     return position_deviation(covariance) > threshold_m
 
@@ -117,7 +120,7 @@ def planar_loop(
       match: Frame of the match.
       alignment: Pose of the query's image in the match's image, and its covariance.
       probability: Probability that both frames show one place.
-      query_mounting: Mounting of the query's sensor, whose points were turned upright for the image.
+      query_mounting: Mounting of the query's sensor. Its points were gravity-aligned for the image.
       match_mounting: Mounting of the match's sensor.
     """
     upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))

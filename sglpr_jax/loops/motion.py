@@ -1,9 +1,9 @@
-"""How the sensor moved from frame to frame: by odometry or, without it, by registering each scan with a keyframe.
+"""Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
 
-Evidence of repetition needs to know which earlier scans the query may resemble because they show the same place. The
-motion is good enough for that over some tens of metres; it is not an odometry. Where the surroundings do not tell how
-the sensor moved, as in a tunnel, the motion is unknown: a new segment begins. Its pose is guessed at the last known
-velocity, and the guess drifts fast.
+The test for repeating places needs to know which earlier scans resemble the query because they show the same place.
+The motion is accurate enough for that over some tens of metres; it does not replace odometry. Where the surroundings
+do not show how the sensor moved, as in a tunnel, the motion is unknown and a new segment begins. Its pose is
+extrapolated at the last known velocity, and its drift grows fast.
 """
 
 import dataclasses
@@ -17,46 +17,46 @@ from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import upright_from_lidar
 
 MOST_STEPS = 3.0
-"""After a longer gap, as a multiple of the last one, the pose of the next frame is not expected anywhere."""
+"""Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionConfig:
-    """When a registration with the keyframe is trusted, and when a frame becomes the next keyframe."""
+    """Thresholds for accepting a registration with the keyframe and for choosing the next keyframe."""
 
     min_correlation: float = 0.4
     """Minimum correlation of the two images."""
     max_ridge: float = 0.8
-    """Maximum ratio of the ridge to the peak, beyond which the images do not tell how far the sensor moved."""
+    """Maximum ratio of ridge to peak. Above it, the images do not show how far the sensor moved."""
     max_second: float = 0.8
     max_second_expected: float = 1.5
-    """Maximum ratio of the second peak to the best one, without and with an expected pose."""
+    """Maximum second-peak ratio, without and with an expected pose."""
     max_coasting: int = 3
-    """Maximum number of frames in a row that are not trusted and continue the motion before them."""
+    """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
     keyframe_m: float = 3.0
     keyframe_deg: float = 20.0
-    """A frame farther from the keyframe than this, in metres or degrees, is the next keyframe."""
+    """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
     guess_m_per_s: float = 80.0
-    """One second of guessed motion drifts as much as this many metres of a measured path."""
+    """Length of measured path with the same drift as one second of guessed motion, in metres."""
     standing_s: float = 5.0
-    """A keyframe accounts for at most this much time, in seconds: a vehicle that stands sees nothing new."""
+    """Maximum time that one keyframe adds to the clock, in seconds. A vehicle that stands sees nothing new."""
 
 
 class Motion:
-    """Planar poses of all frames so far, in order."""
+    """Planar poses of all added frames, in order."""
 
     def __init__(self, config: MotionConfig = MotionConfig()):
         self.config = config
         self.poses: list[Float[np.ndarray, "4 4"]] = []
-        """Pose of each frame in the frame of the first one; across segments a guess."""
+        """Pose of each frame in the frame of the first one. Across segments it is a guess."""
         self.segments: list[int] = []
-        """Frames of one segment have a known relative pose."""
+        """Segment of each frame. Relative poses are known within a segment."""
         self.travelled: list[float] = []
-        """Distance from keyframe to keyframe, in metres."""
+        """Travelled distance at each frame, from keyframe to keyframe, in metres."""
         self.guessed_m: list[float] = []
-        """All guesses up to each frame drift as much as this many metres of a measured path."""
+        """Length of measured path with the same drift as all guesses up to each frame, in metres."""
         self.clock: list[float] = []
-        """Seconds, without those in which the sensor stood still."""
+        """Time at each frame without the time in which the sensor stood still, in seconds."""
         self.keyframe = 0
         self._times: list[float] = []
         self._coasted = 0
@@ -67,7 +67,7 @@ class Motion:
         return len(self.poses)
 
     def add(self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None) -> None:
-        """Add a frame at `time` (seconds), by its `pose` from odometry or its peak over the keyframe's image."""
+        """Add a frame at `time` (seconds), by its `pose` from odometry or its peak `link` over the keyframe."""
         key, coasts = self.keyframe, False
         if (
             pose is None
@@ -93,11 +93,11 @@ class Motion:
         self.keyframe = len(self) - 1
 
     def link(self, anywhere: Peak, expected: Peak) -> Peak:
-        """Of the best peak over the keyframe and the best one near the prior, the one to trust."""
+        """Choose between the best peak over the keyframe, if it is accepted, and the best peak near the prior."""
         return anywhere if self._is_trusted(anywhere, expected=False) else expected
 
     def prior(self, time: float) -> Float[np.ndarray, " 3"]:
-        """The expected x, y and yaw over the keyframe at `time`, at constant velocity; NaN if that is not known."""
+        """Expected x, y and yaw in the frame of the keyframe, at constant velocity. NaN if unknown."""
         expected = self._expected(time)
         if expected is None:
             return np.full(3, np.nan)
@@ -129,7 +129,7 @@ class Motion:
         )
 
     def _drifted_m(self, time: float) -> float:
-        """The next `guessed_m`, if the motion since the last frame is a guess."""
+        """Next value of `guessed_m`, if the motion since the last frame is a guess."""
         return self.guessed_m[-1] + self.config.guess_m_per_s * (time - self._times[-1])
 
     def _append(
@@ -150,25 +150,25 @@ class Motion:
         self.clock.append(clock)
 
     def from_frame(self, frame: int, rows: np.ndarray) -> tuple[Float[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
-        """The poses of `frame` in the frames of `rows`, and which of them are known."""
+        """Poses of `frame` in the frames of `rows`, and whether each is known."""
         poses = np.stack([self.poses[row] for row in rows]) if len(rows) else np.zeros((0, 4, 4))
         return inverse(poses) @ self.poses[frame], self.same(frame, rows)
 
     def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
-        """Which frames were taken less than `seconds` of travel before or after a frame."""
+        """Whether each frame is less than `seconds` before or after a frame, without standing time."""
         clock = np.array(self.clock)
         return np.abs(clock - clock[frame]) < seconds
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
-        """Which of `rows` have a known pose relative to `frame`."""
+        """Whether each of `rows` has a known pose relative to `frame`."""
         return np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
 
     def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:
-        """The poses of the LiDAR, tilted as its mounting says."""
+        """Poses of the LiDAR, whose frame is tilted by its mounting."""
         return np.stack(self.poses) @ upright_from_lidar(mounting)
 
     def near_last(self, travelled_m: float) -> Bool[np.ndarray, " n"]:
-        """Which frames are known to be less than a travelled distance before the last frame."""
+        """Whether each frame is known to be less than `travelled_m` (metres) before the last frame."""
         if not len(self):
             return np.zeros(0, bool)
         known = np.array(self.segments) == self.segments[-1]
@@ -181,6 +181,6 @@ class Motion:
         return fits and float(link.ridge) <= config.max_ridge * best
 
     def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-        """Metres and radians from a keyframe to a pose."""
+        """Distance (metres) and rotation (radians) from a keyframe to a pose."""
         moved = inverse(self.poses[key]) @ pose
         return float(np.linalg.norm(moved[:3, 3])), abs(float(yaw_of(moved)))

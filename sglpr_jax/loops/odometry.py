@@ -1,4 +1,4 @@
-"""Odometry from files: a pose of the LiDAR for each scan, position and rotation, in a frame that stays."""
+"""Odometry from files: a pose of the LiDAR for each scan, in a fixed frame."""
 
 import dataclasses
 from pathlib import Path
@@ -19,10 +19,16 @@ BAGS = (".bag", ".mcap", ".db3")
 
 
 def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float[np.ndarray, "n 4 4"]:
-    """Read a pose for each scan, in order.
+    """Read a file of poses, in order.
 
-    "auto" knows g2o by its ending and tum by its 8 numbers a line; which axes 12 numbers have it does not guess. Raises
-    FileNotFoundError, and ValueError naming the file, what was expected and what was found.
+    Arguments:
+      path: File with a pose of the LiDAR in each line, or a g2o graph.
+      format: Format of the file. "auto" recognises g2o by its suffix and tum by 8 numbers a line. It does not guess the
+        axes of files with 12 numbers a line.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file has another format, no poses or invalid poses.
     """
     path = Path(path)
     check_value(format, OdometryFormat, f"{path}, format")
@@ -40,10 +46,23 @@ def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float
 def at_scans(
     recording: Recording, odometry: Float[np.ndarray, "n 4 4"], path: Path, *, format: OdometryFormat
 ) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
-    """The recording, and a pose for each of its scans from what `read_odometry` found at `path`.
+    """Match odometry to the scans of a recording.
 
-    Poses go with the scans row by row, or by the times of a tum file where these are others (`poses_at_scans`, whose
-    errors these are); scans without a pose are left out, which is told. Scans without times get those of a tum file.
+    Poses are matched row by row. If a tum file has other times than the scans, poses are interpolated at the times of
+    the scans (`poses_at_scans`). Scans without a pose are removed from the recording, and `Recording.found` says so. If
+    the scans have no times, they get the times of a tum file.
+
+    Arguments:
+      recording: The scans.
+      odometry: Poses that `read_odometry` read from `path`.
+      path: File of the odometry.
+      format: Format of the file.
+
+    Returns:
+      The recording, and a pose for each of its scans.
+
+    Raises:
+      ValueError: If most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
     tum = (_format_of(path) if format == "auto" else format) == "tum"
     stamps = read_tum(path)[1] if tum else None
@@ -51,7 +70,7 @@ def at_scans(
         str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
     )
     if recording.times is None and stamps is not None:
-        said = f"times: those of {path.name}"
+        said = f"times: from {path.name}"
         return dataclasses.replace(recording, times=stamps, found=(*recording.found, said)), found.poses
     if not found.said:
         return recording, found.poses
@@ -61,19 +80,22 @@ def at_scans(
 
 
 def is_own(path: Path, root: Path) -> bool:
-    """Whether a user who names `path` for odometry means the poses of the recording itself, a bag."""
+    """Whether `path` is the bag of the recording at `root`, so that its own poses are the odometry."""
     path, root = path.resolve(), root.resolve()
     return path.exists() and (path == root or (path.suffix in BAGS and path.parent == root))
 
 
 def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.ndarray, "n 4 4"]]:
-    """The poses that a recording has by the messages of its bag, and the recording without: they judge nothing then.
+    """Poses from the messages of the recording's bag, and the recording without them.
 
-    Raises ValueError where they tell no rotations.
+    The poses are removed, because loops found with them cannot be evaluated with them.
+
+    Raises:
+      ValueError: If the bag has no poses or the poses have no rotations.
     """
     if recording.world_from_lidar is None:
         raise ValueError(
-            f"{root}: expected a bag with poses (Odometry, PoseStamped or tf) that tell rotations, "
+            f"{root}: expected a bag with poses (Odometry, PoseStamped or tf) with rotations, "
             f"found {recording.pose_source or 'no poses'}"
         )
     return dataclasses.replace(recording, positions=None, pose_source=None), recording.world_from_lidar
@@ -81,7 +103,7 @@ def own_odometry(recording: Recording, root: Path) -> tuple[Recording, Float[np.
 
 def _format_of(path: Path) -> OdometryFormat:
     if path.suffix in BAGS:
-        raise ValueError(f"{path}: expected odometry from a file, or the bag that has the scans, found another bag")
+        raise ValueError(f"{path}: expected a file of odometry, or the bag of the scans, found another bag")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected odometry, found {'a folder' if path.is_dir() else 'no file'}")
     if path.suffix == ".g2o":
@@ -91,15 +113,15 @@ def _format_of(path: Path) -> OdometryFormat:
         return "tum"
     found = "an empty file" if not columns else f"{columns} numbers a line"
     raise ValueError(
-        f"{path}: expected odometry as tum (8 numbers a line) or g2o, or 12 numbers a line and their axes named, "
-        f"kitti (camera axes) or lidar (z up), by --odometry-format (of bin/map: --pose-format), found {found}"
+        f"{path}: expected odometry as tum (8 numbers a line) or g2o, found {found}; for 12 numbers a line, "
+        "name the axes with --odometry-format (bin/map: --pose-format): kitti (camera axes) or lidar (z up)"
     )
 
 
 def _vertices(path: Path) -> Float[np.ndarray, "n 4 4"]:
     poses = read_g2o(path).poses
     if sorted(poses) != list(range(len(poses))):
-        raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without a gap, found others")
+        raise ValueError(f"{path}: expected vertices 0, 1, 2, ... without gaps, found others")
     return np.array([poses[i] for i in range(len(poses))]).reshape(-1, 4, 4)
 
 

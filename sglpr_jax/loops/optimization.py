@@ -1,6 +1,6 @@
-"""Correction of a trajectory by its loops: a pose graph, solved by gtsam (extra `gtsam`).
+"""Correction of a trajectory by its loops: a pose graph, solved with gtsam (extra `gtsam`).
 
-Least squares bends the graph for every wrong loop. Graduated non-convexity (Yang et al., RA-L 2020) starts with a
+In least squares, every wrong loop bends the graph. Graduated non-convexity (Yang et al., RA-L 2020) starts with a
 convex cost and ends with one that ignores outliers. The result is compared with the stated drift of the odometry.
 """
 
@@ -22,14 +22,14 @@ from sglpr_jax.loops.transforms import inverse
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
 ROUNDS = 5
-"""Maximum number of solutions. Loops that bend a solution beyond the drift are dropped before the next one."""
+"""Maximum number of solutions. Before each next one, loops that bend the solution beyond the drift are dropped."""
 
 
 class OptimizedTrajectory(NamedTuple):
-    """A corrected trajectory, and how far it is from the odometry."""
+    """A corrected trajectory, and its distance from the odometry."""
 
     poses: Float[np.ndarray, "n 4 4"]
-    """Pose of the LiDAR at each searched frame, in the frame of the odometry. The first pose is the odometry's."""
+    """Pose of the LiDAR at each searched frame, in the frame of the odometry. The first pose is not changed."""
     inliers: Bool[np.ndarray, " k"]
     """Whether the corrected trajectory agrees with each loop."""
     moved_m: float = 0.0
@@ -37,7 +37,7 @@ class OptimizedTrajectory(NamedTuple):
     """Distance between corrected and given positions, maximum and root mean square, in metres."""
     deviation: float = 0.0
     """Largest deviation of the corrected trajectory from the odometry, in sigmas of the stated drift (`deviations`),
-    between the two frames of an inlier, and between consecutive frames of inliers."""
+    over the paths between the two frames of an inlier and between consecutive frames of inliers."""
     drift: DriftModel = DriftModel()
     """Stated drift."""
 
@@ -52,9 +52,9 @@ class OptimizedTrajectory(NamedTuple):
 
 
 def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
-    """Correct the odometry of a recording by its loops, within the drift that was stated.
+    """Correct the odometry of a recording by its loops, within the stated drift.
 
-    The solution takes a second for some hundred frames, and minutes for some thousand.
+    It takes about a second for a few hundred frames, and minutes for a few thousand.
 
     Arguments:
       found: Loops found with odometry.
@@ -68,7 +68,7 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
       corrected = optimize_trajectory(found).poses
     """
     if found.odometry is None:
-        raise ValueError(f"{found.recording.name}: expected loops found with odometry to correct, found none")
+        raise ValueError(f"{found.recording.name}: expected loops found with odometry, found loops without it")
     odometry = found.odometry[: found.frames]
     return optimized(odometry, found.loops, drift=found.drift, mounting=found.recording.mounting)
 
@@ -82,8 +82,9 @@ def optimized(
 ) -> OptimizedTrajectory:
     """Solve the graph of odometry and loops.
 
-    Loops that contradict the odometry, or between whose frames the solution does, are dropped, and the graph is solved
-    again. If a contradiction is left after `ROUNDS` solutions, the odometry is returned without inliers.
+    Loops that contradict the odometry are dropped. If the solution contradicts the odometry between the frames of a
+    loop, that loop is dropped, too, and the graph is solved again. If a contradiction remains after `ROUNDS` solutions,
+    the odometry is returned without inliers.
 
     Arguments:
       odometry: Pose of the LiDAR at each frame.
@@ -142,7 +143,8 @@ def _bend(
 ) -> Float[np.ndarray, " k"]:
     """Deviation of a solution from the odometry for each inlier, in sigmas.
 
-    The maximum over the path between its frames and the paths from these to the next frames of inliers.
+    It is the maximum over the path between the two frames of the inlier and the paths from them to neighbouring frames
+    of inliers.
     """
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
@@ -154,7 +156,7 @@ def _bend(
 
 
 def _touching(frames: np.ndarray, loop: Loop) -> Bool[np.ndarray, " m"]:
-    """Which of the paths between consecutive `frames` begin or end at a frame of the loop."""
+    """Whether each path between consecutive `frames` starts or ends at a frame of the loop."""
     ends = np.isin(frames, [loop.match, loop.query])
     return ends[:-1] | ends[1:]
 
@@ -168,7 +170,7 @@ def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndar
 
 
 def _rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """The covariance with rotation before translation, as in gtsam."""
+    """Covariance with rotation before translation, as in gtsam."""
     order = np.array([3, 4, 5, 0, 1, 2])
     return covariance[np.ix_(order, order)]
 

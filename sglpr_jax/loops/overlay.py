@@ -1,4 +1,4 @@
-"""Two images laid over each other, to look at."""
+"""Overlay of two images for display."""
 
 import numpy as np
 from jaxtyping import Float, Num
@@ -15,7 +15,10 @@ def overlaid(
     *,
     resolution_m: float = RESOLUTION_M,
 ) -> Float[np.ndarray, "n n 3"]:
-    """Colours from 0 to 1: the match red, the query, moved into the match's frame, cyan, white where both are."""
+    """Overlay a query on its match, as RGB colours from 0 to 1.
+
+    The match is red. The query, transformed to the frame of the match, is cyan. Cells occupied in both are white.
+    """
     size = len(match)
     down, right = np.mgrid[:size, :size] - (size - 1) / 2
     query_from_match = inverse(match_from_query)

@@ -1,8 +1,7 @@
-"""The covariance of a pose from the peak of a correlation of images: narrow at a corner, long beside a wall.
+"""Covariance of a pose from the shape of the correlation peak: small at a corner, long along a wall.
 
-Three parts are added: least squares at the peak (its curvature and the noise of the images), the extent of a ridge that
-the peak stands on, and small fixed errors. The constants were fitted on simulated drives
-(`benchmarks/covariance.py`).
+It is the sum of three parts: least squares at the peak (curvature and image noise), the extent of the ridge under the
+peak, and small fixed errors. The constants were fitted on simulated drives (`benchmarks/covariance.py`).
 """
 
 import functools
@@ -16,21 +15,21 @@ NOISE = 0.8
 NOISE_CELLS = 300.0
 NOISE_RANGE_M = 10.0
 """Noise of the correlation: `NOISE` (1 - c) / c for a peak of height c, times 1 / occupied cells + 1 / `NOISE_CELLS`.
-The second term says that errors of neighbouring cells are correlated. The noise doubles for scans `NOISE_RANGE_M`
-apart, because each scan sees other sides of things."""
+The second term accounts for correlated errors of neighbouring cells. The noise doubles for scans `NOISE_RANGE_M` apart,
+because each scan sees other sides of objects."""
 FLAT_M = 10.0
-"""Standard deviation along a direction in which a peak has no curvature: the search covers no more."""
+"""Standard deviation along a direction without curvature, in metres. The search covers no more."""
 RIDGE_DROP = 0.04
-"""Scale of the likelihood along the weak axis. It falls by a factor of e where the correlation, divided by the area
-that both images share, falls by this fraction of the peak."""
+"""Scale of the likelihood along the weak axis. The likelihood falls by a factor of e where the correlation, divided by
+the area that both images share, falls by this fraction of the peak."""
 RIDGE_STEP_M, RIDGE_START_M = 1.0, 1.5
-"""Spacing of the samples along the weak axis, and the distance up to which the curvature alone describes the peak."""
+"""Spacing of samples along the weak axis, and distance up to which the curvature alone counts, in metres."""
 RIDGE_BAND = 0.25
-"""Highest frequency of these samples, in cycles per cell. Higher ones cost time and change nothing."""
+"""Highest frequency of these samples, in cycles per cell. Higher frequencies take time and change nothing."""
 RIDGE_ACROSS, RIDGE_YAW = 0.02, 0.003
 """Standard deviations across the weak axis (metres) and in yaw (radians), per metre along it."""
 LEAST_POSITION_M, LEAST_YAW_DEG = 0.01, 0.03
-"""Standard deviations that no pose goes below: the grid of cells, and the tilt of a vehicle."""
+"""Fixed standard deviations from the cell size and the tilt of the vehicle, in metres and degrees."""
 
 
 def peak_covariance(
@@ -44,11 +43,11 @@ def peak_covariance(
     """Return the covariance of (x, y, yaw) at a peak, in metres and radians.
 
     Arguments:
-      curvature: minus the Hessian of the correlation at the peak.
-      correlation: the height of the peak.
-      occupied: the number of occupied cells of the emptier image.
-      apart_m: the distance between the two scans.
-      ridge: what `ridge_covariance` returns.
+      curvature: Negative Hessian of the correlation at the peak.
+      correlation: Height of the peak.
+      occupied: Number of occupied cells of the image that has fewer.
+      apart_m: Distance between the two scans, in metres.
+      ridge: Covariance from `ridge_covariance`.
     """
     height = jnp.clip(correlation, 0.05, 0.999)
     noise = NOISE * (1 - height) / height * (1 / jnp.maximum(occupied, 1) + 1 / NOISE_CELLS)
@@ -74,18 +73,18 @@ def ridge_covariance(
     """Return the covariance of (x, y, yaw) along the weak axis of a peak, as far as the correlation stays high there.
 
     Along a wall the correlation falls only because the two images share less area. A pattern that moves with the sensor
-    can leave a small peak on top of such a ridge. Along a bend the ridge turns with the distance, so the best of
-    several rotations counts. Samples beyond a dip belong to another peak and count no more than the dip.
+    can leave a small peak on top of this ridge. In a bend the ridge rotates with the distance, so the best of several
+    rotations counts. Samples beyond a minimum belong to another peak and count no more than the minimum.
 
     Arguments:
-      products: for each rotation of the query, the Fourier transform (`rfft2`) of the correlation; that of the peak
-        first.
-      pose: x (right) and y (up) of the peak in metres, and its yaw.
-      yaws: the rotations, in radians.
-      curvature: minus the Hessian of the correlation at the peak, over x, y and yaw.
-      cell_m: the edge of a cell.
-      reach_m: the radius of the images.
-      max_shift_m: the largest shift along x and y.
+      products: Fourier transform (`rfft2`) of the correlation for each rotation of the query. The first is that of the
+        peak.
+      pose: x (right) and y (up) of the peak, in metres, and its yaw, in radians.
+      yaws: Rotations, in radians.
+      curvature: Negative Hessian of the correlation at the peak, over x, y and yaw.
+      cell_m: Edge of a cell, in metres.
+      reach_m: Radius of the images, in metres.
+      max_shift_m: Maximum shift along x and y, in metres.
     """
     steps = int(max_shift_m / RIDGE_STEP_M)
     along = np.arange(-steps, steps + 1, dtype=np.float32) * np.float32(RIDGE_STEP_M)
@@ -106,24 +105,24 @@ def ridge_covariance(
 
 
 def _weak_axis(curvature: Float[Array, "3 3"]) -> Float[Array, ""]:
-    """The angle of the direction in the plane along which the correlation changes least, the best yaw taken there."""
+    """Angle of the direction in the plane along which the correlation, at the best yaw, changes least."""
     planar = curvature[:2, :2] - jnp.outer(curvature[:2, 2], curvature[2, :2]) / jnp.maximum(curvature[2, 2], 1e-4)
     return jnp.arctan2(2 * planar[0, 1], planar[0, 0] - planar[1, 1]) / 2 + np.float32(np.pi / 2)
 
 
 def _heights(product: Complex[Array, "s f"], points: Float[Array, "k 2"], cell_m: float) -> Float[Array, " k"]:
-    """The low frequencies of a correlation at any points, up to a factor common to all."""
+    """Low frequencies of a correlation at given points, up to a common factor."""
     size = product.shape[0]
     band = int(RIDGE_BAND * size)
     kept = jnp.concatenate([product[-band:, :band], product[:band, :band]])
     phases = points * np.float32(2 * np.pi / (cell_m * size))
     rows = jnp.exp(-1j * phases[:, 1:] * np.arange(-band, band, dtype=np.float32)[None])
     columns = jnp.exp(1j * phases[:, :1] * np.arange(band, dtype=np.float32)[None])
-    twice = np.where(np.arange(band) == 0, 1, 2).astype(np.float32)  # a real image's spectrum is half stored
+    twice = np.where(np.arange(band) == 0, 1, 2).astype(np.float32)  # half of a real image's spectrum is stored
     return ((rows @ kept) * columns).real @ twice
 
 
 def _shared_area(apart_m: Float[Array, "*b"], reach_m: float) -> Float[Array, "*b"]:
-    """The share of a circle of radius `reach_m` that lies in another circle at this distance."""
+    """Fraction of a circle of radius `reach_m` that overlaps with an equal circle at this distance."""
     ratio = jnp.minimum(apart_m / (2 * reach_m), 0.95)
     return (jnp.arccos(ratio) - ratio * jnp.sqrt(1 - ratio**2)) * np.float32(2 / np.pi)

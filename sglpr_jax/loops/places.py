@@ -1,4 +1,4 @@
-"""A map of places on disk, in which tomorrow's scan finds itself: an index, and an image and a pose for each place."""
+"""Maps of places for relocalisation: an index of descriptors, with an image and a pose for each place."""
 
 import dataclasses
 import itertools
@@ -32,34 +32,34 @@ from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
 
 ARRAYS = ("images", "world_from_place", "mountings")
-"""What a map's file holds beside the index."""
+"""Arrays of a map's file in addition to the index."""
 RIVALS = 10
-"""Number of other places that a query is compared with."""
+"""Maximum number of rivals of a query."""
 RIVAL_SPACING_M = 8.0
-"""Minimum distance between these, and from the match, in metres."""
+"""Minimum distance between rivals, and from rivals to the match, in metres."""
 Content = tuple[bytes | None, bytes]
-"""What tells a place from every other one: descriptor (None: not known yet) and pose."""
+"""Identity of a place: its descriptor (None if not known yet) and its pose, as bytes."""
 
 
 class Relocated(NamedTuple):
-    """Where a scan was taken, by one place of the map."""
+    """Pose of a scan, estimated from one place of the map."""
 
     place: str
-    """The id of the place."""
+    """Id of the place."""
     world_from_query: Float[np.ndarray, "4 4"]
-    """The pose of the scan's sensor (LiDAR frame, tilted as the sensor is) in the map's frame."""
+    """Pose of the scan's LiDAR (tilted if the sensor is) in the frame of the map, in metres."""
     loop: Loop
-    """The place is its match; its query is the number of places, that is, the next one."""
+    """Loop between scan and place. `match` is the row of the place, `query` is the number of places."""
 
     @property
     def probability(self) -> float:
-        """That the scan was taken there."""
+        """Probability that the scan shows the place."""
         return self.loop.probability
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PlaceMap:
-    """Places of one world frame, from one drive or several.
+    """Places in one world frame, from one or more drives.
 
     Example:
       places = PlaceMap.of(recording, params, poses)
@@ -69,11 +69,11 @@ class PlaceMap:
 
     index: Index
     images: UInt8[np.ndarray, "n h h"]
-    """The density images, 8 bits."""
+    """Density images, 8 bits."""
     world_from_place: Float[np.ndarray, "n 4 4"]
-    """Poses of the LiDAR."""
+    """Pose of the LiDAR at each place."""
     mountings: Float[np.ndarray, "n 4"]
-    """How the sensor was mounted: its height over the ground, metres, and the direction of up in its frame."""
+    """Mounting of the sensor: height above the ground, in metres, and the up direction in its frame."""
 
     def __len__(self) -> int:
         return len(self.index)
@@ -88,23 +88,37 @@ class PlaceMap:
         spacing_m: float = SPACING_M,
         on_progress: Callable[[int], None] = lambda done: None,
     ) -> "PlaceMap":
-        """The map of a recording whose poses (LiDAR frame, in the world) are known.
+        """Create the map of a recording with known poses.
 
-        Errors are those of `map_recording`, which can also leave out bad scans and go on after a kill.
+        `map_recording` does the same and can also skip unreadable scans and resume. Raises the errors of
+        `map_recording`.
+
+        Arguments:
+          recording: The scans.
+          params: Weights of the model that describes them.
+          poses: Pose of the LiDAR in the world at each scan.
+          spacing_m: Minimum distance of consecutive places, in metres.
+          on_progress: Called with the number of scans done.
         """
         return map_recording(recording, params, poses, spacing_m=spacing_m, on_progress=on_progress).places
 
     def mounting(self, row: int = -1) -> Mounting:
-        """How the sensor of a place was mounted; without `row` that of the place added last."""
+        """Mounting of the sensor at a place, by default the last one."""
         height, *up = self.mountings[row].tolist()
         return Mounting(height, tuple(up))
 
     def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
-        """The places of both, in one world frame; those of `other` that are here already are taken once.
+        """Merge two maps in one world frame. Places that are in both are stored once.
 
-        Where its ids are taken by other places, its recordings are called ~2, ~3 and so on. Of a map that is not whole
-        yet `drive` has the poses of all scans (`poses_by_id`): its places are called as they will be in the whole one.
-        Raises ValueError where other weights or images made them.
+        If ids of `other` are taken by other places, its recordings are renamed with the suffix ~2, ~3 and so on.
+
+        Arguments:
+          other: Map to add.
+          drive: Poses of all scans of the recording of `other` (`poses_by_id`). They are needed if `other` is not
+            complete, so that its places get the same ids as in the complete map.
+
+        Raises:
+          ValueError: If the maps were made with other weights or have images of another size.
         """
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
@@ -126,11 +140,21 @@ class PlaceMap:
         model: LoopModel | None = None,
         candidates: int = CANDIDATES,
     ) -> list[Relocated]:
-        """Where a scan or image may have been taken: the poses by its nearest places, the most probable first.
+        """Locate a scan or image in the map.
 
-        The record's mounting says how its sensor is mounted; `mounting()` is that of the map's, which points (n, 3) are
-        taken to have. None for a scan that shows next to nothing. Raises ValueError where other weights made the map
-        and for an array of another shape, TypeError for what is no record, no params and no array.
+        Arguments:
+          params: Weights that made the map.
+          record: A record, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that
+            of the last place (`mounting`). For another mounting pass a record.
+          model: Model of the probabilities, by default the one shipped for the weights.
+          candidates: Number of nearest places that the query is compared with.
+
+        Returns:
+          One pose for each of the nearest places, the most probable first. Empty if the scan is almost empty.
+
+        Raises:
+          ValueError: If other weights made the map, or if an array has another shape.
+          TypeError: If an argument is not parameters, a record or an array.
         """
         finder = CandidateFinder(params)
         record = given_record(record, mounting=self.mounting() if len(self) else None)
@@ -157,7 +181,7 @@ class PlaceMap:
         return sorted(_shared(pairs), key=lambda pair: -pair.probability)
 
     def save(self, path: Path | str) -> None:
-        """Write one file, whole or not at all: the index's, with images and poses beside its arrays."""
+        """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
         path = Path(path)
         content = self.index.to_bytes({name: getattr(self, name) for name in ARRAYS})
         with replacing(path) as temporary:
@@ -165,7 +189,7 @@ class PlaceMap:
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
-        """Read what `save` wrote. Errors are those of `Index.load`; ValueError for an index alone too."""
+        """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has only an index."""
         index, more = Index.load_with(path, weights_hash=weights_hash)
         left_out = [name for name in ARRAYS if name not in more]
         if left_out:
@@ -173,10 +197,10 @@ class PlaceMap:
         return cls(index, *(more[name] for name in ARRAYS))
 
     def _names_of(self, other: "PlaceMap", new: list[int], drive: Mapping[str, Float[np.ndarray, "4 4"]]) -> list[str]:
-        """The ids, `recording/scan`, of new places here, with a number after the recording where one is taken.
+        """Ids (`recording/scan`) of the new places, with a suffix after the recording if an id is taken.
 
-        What is new depends on how far a drive was mapped; so all of its scans are asked, and places of it that are here
-        already have their own ids.
+        The new places depend on how much of the drive is mapped. The suffix must not, so all scans of the drive are
+        checked.
         """
         names = [other.index.ids[row] for row in new]
         scans: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in drive.items()}
@@ -187,7 +211,7 @@ class PlaceMap:
         return [_marked(name, mark) for name in names]
 
     def _contents(self) -> Iterator[tuple[bytes, bytes]]:
-        """What tells each place from every other one."""
+        """Descriptor and pose of each place, as bytes."""
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
             yield descriptor.tobytes(), pose.tobytes()
 
@@ -199,7 +223,7 @@ class PlaceMap:
         distance: float,
         peak: Peak,
     ) -> tuple[float, float]:
-        """Distance and correlation of the match, compared with those of other places of the map (`loops.rivals`)."""
+        """`distance_share` and `rival_share` of a match, with other places of the map as rivals."""
         rows = self._rivals(descriptor, match)
         if peak.correlation < CandidateConfig().min_rival_correlation or not len(rows):
             return np.nan, np.nan
@@ -211,7 +235,7 @@ class PlaceMap:
         return distance_share(distance, apart, expected), rival_share(found, float(peak.correlation), expected)
 
     def _rivals(self, descriptor: Float[np.ndarray, " d"], match: int) -> Int[np.ndarray, " k"]:
-        """Places that look like a query, away from its match and from each other."""
+        """Places with the nearest descriptors, at least `RIVAL_SPACING_M` from the match and from each other."""
         places, chosen = self.world_from_place[:, :3, 3], [match]
         left = np.linalg.norm(self.index.descriptors - descriptor, axis=1)
         for _ in range(RIVALS):
@@ -223,7 +247,7 @@ class PlaceMap:
 
 
 def _shared(pairs: list[Relocated]) -> list[Relocated]:
-    """Answers that stand apart exclude each other: together they have a probability of at most 1."""
+    """Scale probabilities so that those of answers more than `NEGATIVE_M` apart add up to at most 1."""
     groups: list[list[Relocated]] = []
     for pair in sorted(pairs, key=lambda pair: -pair.probability):
         position = pair.world_from_query[:3, 3]
@@ -238,7 +262,7 @@ def _shared(pairs: list[Relocated]) -> list[Relocated]:
 
 
 def poses_by_id(recording: Recording, poses: Float[np.ndarray, "n 4 4"]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """The pose of each scan by the id that its place has, or would have."""
+    """Pose of each scan by the id of its place, whether or not the scan is in the map."""
     return dict(zip(_place_ids(recording), np.asarray(poses, np.float64), strict=True))
 
 
@@ -256,7 +280,7 @@ def _marked(name: str, mark: str) -> str:
 
 
 def _free_mark(taken: Mapping[str, Content], coming: Mapping[str, Content]) -> str:
-    """The first of "", ~2, ~3, ... with which none of the coming places has the id of another one."""
+    """First suffix of "", ~2, ~3, ... with which no coming place has the id of another place."""
 
     def is_taken(name: str, content: Content) -> bool:
         there = taken.get(name, content)
@@ -269,13 +293,13 @@ def _free_mark(taken: Mapping[str, Content], coming: Mapping[str, Content]) -> s
 
 
 class Mapped(NamedTuple):
-    """The map of a recording, and what was not put into it."""
+    """Map of a recording, with the scans that were skipped."""
 
     places: PlaceMap
     scans: int
-    """So many of the recording's scans were gone through: all, unless it was stopped."""
+    """Number of processed scans: all, unless the run was stopped."""
     skipped: tuple[str, ...]
-    """The ids of scans that could not be read."""
+    """Ids of scans that cannot be read."""
 
 
 def map_recording(
@@ -289,12 +313,25 @@ def map_recording(
     should_stop: Callable[[], bool] = lambda: False,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Mapped:
-    """Make the map of a recording whose poses (LiDAR frame, in the world) are known.
+    """Create the map of a recording with known poses.
 
-    A place's id is `RECORDING/SCAN`. Scans nearer than `spacing_m` to the last place are not read; those that show next
-    to nothing are left out. `on_bad_scan`, `kept_in`, `should_stop` and `on_progress` are as in `find_loops`. Raises
-    ValueError for poses of another length or shape, and for a recording without scans that show something; TypeError
-    for what is no recording, no params or no array.
+    The id of a place is `RECORDING/SCAN`. Scans that are almost empty are skipped.
+
+    Arguments:
+      recording: The scans.
+      params: Weights of the model that describes them.
+      poses: Pose of the LiDAR in the world at each scan.
+      spacing_m: Minimum distance of consecutive places, in metres. Scans nearer to the last place are not read.
+      on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped. Without it the error is
+        raised.
+      kept_in: Checkpoint directory. With the same recording, poses, weights and spacing, the run resumes from it. The
+        directory is not removed.
+      should_stop: If it returns True, the run ends and returns the map of the processed scans.
+      on_progress: Called with the number of processed scans.
+
+    Raises:
+      ValueError: If the poses have another length or shape, or if all scans are empty.
+      TypeError: If an argument is not a recording, parameters or an array.
     """
     check_is(recording, Recording, by="open_recording")
     poses = given_poses(poses, of="poses")
@@ -303,8 +340,8 @@ def map_recording(
     check_level(poses, recording.mounting, name=recording.name)
     finder = CandidateFinder(params)
     kept = None if kept_in is None else _recalled(Path(kept_in), finder, recording, poses, spacing_m, on_bad_scan)
-    looked_at: list[int] = []  # rows of the recording, whose frames the finder has
-    frames: list[int] = []  # of those, the places
+    looked_at: list[int] = []  # rows of the recording that are frames of the finder
+    frames: list[int] = []  # frames of the finder that are places
     rows: list[int] = []
     done = 0
     for i in range(len(recording)):
@@ -324,7 +361,9 @@ def map_recording(
     if kept is not None:
         kept.keep(finder, all=True)
     if not rows and done == len(recording):
-        raise ValueError(f"{recording.name}: expected scans that show something, found {len(recording)} empty ones")
+        raise ValueError(
+            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
+        )
     skipped = tuple(recording.ids[looked_at[row]] for row in finder.missing)
     return Mapped(_places(finder, recording, poses, frames, rows), done, skipped)
 
@@ -337,7 +376,7 @@ def _recalled(
     spacing_m: float,
     on_bad_scan: OnBadScan | None,
 ) -> Unfinished:
-    """The folder of what an earlier run has seen, which the finder has now."""
+    """Open a checkpoint directory and add its frames to the finder."""
     kept = Unfinished.opened(folder, settings(recording, finder, poses=poses, spacing_m=spacing_m))
 
     def add(seen: Seen | None, compared: Compared) -> None:
@@ -354,7 +393,7 @@ def _places(
     frames: list[int],
     rows: list[int],
 ) -> PlaceMap:
-    """The map of some `rows` of a recording, which are these `frames` of the finder."""
+    """Map of the `rows` of a recording, which are the `frames` of the finder."""
     index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
     names = _place_ids(recording)
     ids = [names[row] for row in rows]

@@ -1,4 +1,4 @@
-"""Poses in the plane of the ground, as rows of x, y (metres) and yaw (radians), and loops as such poses."""
+"""Poses and loops in the plane of the ground, as rows of x, y (metres) and yaw (radians)."""
 
 from collections.abc import Sequence
 
@@ -14,24 +14,24 @@ Planar = Float[np.ndarray, "... 3"]
 """Poses in the plane: x, y, yaw."""
 
 SEEN = np.array([0, 1, 5])
-"""Rows of x, y and yaw in a covariance of six degrees of freedom."""
+"""Rows of x, y and yaw in a covariance of 6 degrees of freedom."""
 
 
 def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
-    """Position and heading in the plane of the poses' own frame."""
+    """Project poses to the x-y plane of their own frame."""
     return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
 
 
 def planar_odometry(odometry: Float[np.ndarray, "n 4 4"], mounting: Mounting | None) -> Planar:
-    """Odometry of a LiDAR, tilted as its `mounting` says, in the plane of the ground."""
+    """Project the odometry of a LiDAR with this `mounting` to the plane of the ground."""
     return planar(upright_odometry(odometry, mounting))
 
 
 def planar_loops(loops: Sequence[Loop], mounting: Mounting | None) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
     """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries.
 
-    No direction has a standard deviation of more than `DEGENERATE_M`: a pose that may lie anywhere along a wall would
-    otherwise agree with every other pose along it.
+    Standard deviations are limited to `DEGENERATE_M` along every direction. Otherwise a pose that may lie anywhere
+    along a wall would agree with every other pose along the wall.
     """
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
     covariances = np.array([loop.covariance for loop in loops], np.float64).reshape(-1, 6, 6)
@@ -40,13 +40,13 @@ def planar_loops(loops: Sequence[Loop], mounting: Mounting | None) -> tuple[Plan
 
 
 def _bounded(covariances: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """The same with all variances, in metres and radians squared, bounded."""
+    """Covariances with eigenvalues of at most `DEGENERATE_M` squared."""
     variances, axes = np.linalg.eigh(covariances)
     return (axes * np.minimum(variances, DEGENERATE_M**2)[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
 def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Queries and matches."""
+    """Frames of the queries and of the matches."""
     return np.array([loop.query for loop in loops], np.int64), np.array([loop.match for loop in loops], np.int64)
 
 
@@ -71,5 +71,5 @@ def relative(a: Planar, b: Planar) -> Planar:
 
 
 def wrapped(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """The angle from -pi to pi."""
+    """Wrap angles to the range from -pi to pi."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,9 +1,9 @@
-"""The pose between two images by exhaustive search: all rotations and shifts, on merged cells.
+"""Exhaustive search of the pose between two images: all rotations and shifts, on merged cells.
 
-The square root of the query's image is rotated, band-passed and correlated with that of the match. The band is a blur
-less a wider blur: it keeps what is as wide as a wall, a pole or a trunk, without which one street looks like any other.
-The correlation is needed at small shifts alone, so the inverse Fourier transform is a product with small matrices,
-which is faster than a whole one.
+The square root of the query's image is rotated, band-passed and correlated with the square root of the match's image.
+The band-pass is the difference of a narrow and a wide blur. It keeps structures as wide as a wall, a pole or a trunk;
+without it one street looks like any other. The correlation is needed at small shifts only, so the inverse Fourier
+transform is a product with small matrices, which is faster than a full transform.
 """
 
 import dataclasses
@@ -23,23 +23,23 @@ from sglpr_jax.data.density_grid import RESOLUTION_M
 
 @dataclasses.dataclass(frozen=True)
 class VerificationConfig:
-    """How two images are compared."""
+    """Settings of the comparison of two images."""
 
     resolution_m: float = RESOLUTION_M
     """Edge of an image's cell, in metres."""
     reach_m: float = 25.0
-    """Cells farther from the sensor are ignored, so that an image does not change with rotation, in metres."""
+    """Radius of the compared cells around the sensor, in metres. A circle has the same content at every rotation."""
     max_shift_m: float = 12.0
     """Maximum distance between two scans of one place along x and along y, in metres."""
     turns: int = 72
     """Number of rotations over the whole circle."""
     coarse: int = 2
-    """Cells per side that the exhaustive search merges into one."""
+    """Number of cells per side that the exhaustive search merges into one."""
     blur_m: float = 0.4
     wide_blur_m: float = 1.0
-    """Standard deviations of the two blurs, in metres; the wider one is subtracted."""
+    """Standard deviations of the two blurs, in metres. The wider blur is subtracted."""
     refine_deg: float = 3.0
-    """Range of the refinement to both sides, in degrees, in 8 steps."""
+    """Range of the refinement to each side, in degrees, in 4 steps."""
     second_m: float = 3.0
     second_deg: float = 15.0
     """Minimum distance of the second peak from the best one, in metres or in degrees."""
@@ -47,7 +47,7 @@ class VerificationConfig:
     """Maximum distance at which a peak of the same rotation belongs to the ridge of the best one, in metres."""
     prior_m: float = 2.0
     prior_deg: float = 10.0
-    """Maximum distance of a pose from the expected one, where there is one."""
+    """Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
 
 
 DEFAULT = VerificationConfig()
@@ -65,19 +65,19 @@ class Peak(NamedTuple):
     yaw: Float[AnyArray, "*b"]
     """Rotation of the query, in radians, counter-clockwise, from 0 to 2 pi."""
     correlation: Float[AnyArray, "*b"]
-    """1 for equal images, about 0 for unrelated ones."""
+    """Correlation at the pose: 1 for equal images, about 0 for unrelated ones."""
     second: Float[AnyArray, "*b"]
     """Highest correlation at any other pose (`second_m`, `second_deg`)."""
     ridge: Float[AnyArray, "*b"]
-    """Highest correlation at `second_m` to `ridge_m` from the best pose, at about its rotation: high where the
-    surroundings do not tell how far the sensor moved, as between walls."""
+    """Highest correlation at `second_m` to `ridge_m` from the best pose, at about the same rotation. It is high if the
+    surroundings do not show how far the sensor moved, as between walls."""
 
     def one(self, k: int) -> "Peak":
-        """The k-th of several."""
+        """The k-th peak."""
         return Peak(*(values[k] for values in self))
 
     def some(self, rows: slice | np.ndarray) -> "Peak":
-        """Some of several."""
+        """A selection of the peaks."""
         return Peak(*(values[rows] for values in self))
 
 
@@ -95,17 +95,17 @@ def search(
     """Return the best pose of a query in the frame of each of k matches.
 
     Arguments:
-      query: A square image of counts in the orientation of eq. 1, with an even number of cells per side.
+      query: Square image of counts in the orientation of eq. 1, with an even number of cells per side.
       matches: Images of the same size.
-      priors: Expected x, y (metres) and yaw (radians) of the query for each match, near which the pose is searched; a
-        row of NaN has none.
-      config: The search range.
+      priors: Expected x, y (metres) and yaw (radians) of the query for each match. The pose is searched near it. A row
+        of NaN means no expected pose.
+      config: Settings of the comparison.
 
     Returns:
       Peaks with a leading axis of k.
 
     Raises:
-      ValueError: if the images are not square or have an odd number of cells.
+      ValueError: If the images are not square or have an odd number of cells.
     """
     return search_spectra(query_spectra(query, config=config), matches, priors, config=config)
 
@@ -114,7 +114,7 @@ def search(
 def query_spectra(
     query: Num[Array | np.ndarray, "h w"], *, config: VerificationConfig = DEFAULT
 ) -> Complex[Array, "s t f"]:
-    """Return the spectra of all rotations of a query, for `search_spectra`. Errors are those of `search`."""
+    """Return the spectra of all rotations of a query, for `search_spectra`. Raises the errors of `search`."""
     angles = np.arange(config.turns, dtype=np.float32) * np.float32(2 * np.pi / config.turns)
     rotated = rotations(merged(prepared(query, config), config.coarse), jnp.asarray(angles))
     return jnp.moveaxis(spectrum(rotated, config.resolution_m * config.coarse, config), 1, 0)
@@ -128,7 +128,7 @@ def search_spectra(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Peak:
-    """`search` for a query whose `query_spectra` are known."""
+    """Like `search`, with the `query_spectra` of a query."""
     cell_m = config.resolution_m * config.coarse
     halves = _halves(spectra)
 
@@ -142,7 +142,7 @@ def search_spectra(
 
 
 def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAULT) -> Num[AnyArray, "m m"]:
-    """The middle of an image that is compared; m is a multiple of two merged cells. Errors are those of `search`."""
+    """Central part of an image that is compared. m is a multiple of two merged cells. Raises the errors of `search`."""
     if image.shape[0] != image.shape[1] or image.shape[0] % 2:
         raise ValueError(f"expected a square image of an even number of cells, found {image.shape}")
     size = min(2 * cells(config.reach_m, config.resolution_m), image.shape[0])
@@ -151,7 +151,7 @@ def within_reach(image: Num[AnyArray, "h w"], config: VerificationConfig = DEFAU
 
 
 def prepared(image: Num[Array | np.ndarray, "h w"], config: VerificationConfig) -> Float[Array, "m m"]:
-    """The square root of the counts within reach, zero around them."""
+    """Square root of the counts within reach. Other cells are zero."""
     middle = within_reach(image, config)
     size = middle.shape[0]
     axis = (np.arange(size) - (size - 1) / 2) * config.resolution_m
@@ -166,29 +166,29 @@ def occupied(image: Num[np.ndarray, "h w"], config: VerificationConfig = DEFAULT
 
 @functools.cache
 def _within(shape: tuple[int, int], radius: float) -> Bool[np.ndarray, "h w"]:
-    """Which cells lie within a radius (cells) of the middle."""
+    """Whether each cell lies within a radius (in cells) of the centre."""
     down, right = (np.arange(n) - (n - 1) / 2 for n in shape)
     return np.hypot(down[:, None], right[None]) < radius
 
 
 def cells(metres: float, cell_m: float) -> int:
-    """Number of cells that cover a length."""
+    """Number of cells that cover a length, both in metres."""
     return int(np.ceil(metres / cell_m))
 
 
 def merged(image: Float[Array, "m m"], side: int) -> Float[Array, "k k"]:
-    """Means over squares of cells."""
+    """Average pooling over squares of `side` cells."""
     size = image.shape[0] // side
     return image.reshape(size, side, size, side).mean((1, 3))
 
 
 def rotations(image: Float[Array, "m m"], angles: Float[Array, " t"]) -> Float[Array, "t m m"]:
-    """The image rotated by each angle."""
+    """Rotate an image by each angle, in radians."""
     return rotate_image(jnp.broadcast_to(image, (len(angles), *image.shape)), angles)
 
 
 def spectrum(images: Float[Array, "t m m"], cell_m: float, config: VerificationConfig) -> Complex[Array, "t s f"]:
-    """Band-passed Fourier transforms, of unit power, so large that no shift up to the greatest one wraps around."""
+    """Band-passed Fourier transforms of unit power, padded so that no shift up to `max_shift_m` wraps around."""
     size = fast_size(images.shape[-1] + cells(config.max_shift_m, cell_m))
     along, across = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]
     frequency = 2 * (np.pi / cell_m) ** 2 * (along**2 + across**2)
@@ -199,18 +199,18 @@ def spectrum(images: Float[Array, "t m m"], cell_m: float, config: VerificationC
 
 
 def fast_size(least: int) -> int:
-    """A size, no smaller, whose Fourier transforms are fast."""
-    size: Any = next_fast_len(least, real=True)  # whose types say None
+    """Smallest size of at least `least` whose Fourier transform is fast."""
+    size: Any = next_fast_len(least, real=True)  # typed as None
     return int(size)
 
 
 def twice(size: int) -> Float32[np.ndarray, "1 f"]:
-    """How often each column of a real image's half spectrum occurs in the whole one."""
+    """Number of times that each column of the half spectrum of a real image occurs in the full spectrum."""
     return np.where(np.isin(np.arange(size // 2 + 1), (0, size / 2)), 1, 2).astype(np.float32)[None]
 
 
 class _Halves(NamedTuple):
-    """Real and imaginary parts of spectra, by rows: those of frequencies 0 to s/2, and those of -1, -2 and so on."""
+    """Real and imaginary parts of spectra: rows of frequencies 0 to s/2, and rows of frequencies -1, -2 and so on."""
 
     low: tuple[Float[Array, "h t f"], Float[Array, "h t f"]]
     high: tuple[Float[Array, "g t f"], Float[Array, "g t f"]]
@@ -227,8 +227,8 @@ def _correlations(
 ) -> Float[Array, "d t r"]:
     """Correlation of the match with every rotated query at every shift: rows down, rotations, columns to the right.
 
-    The transform of even and odd parts, for shifts from zero on, takes a quarter of the multiplications of the whole
-    one: the cosine of an opposite shift is the same, and the sine changes its sign.
+    Even and odd parts are transformed separately, for shifts of zero and more. At the opposite shift the cosine is the
+    same and the sine changes its sign. This takes a quarter of the multiplications of the full transform.
     """
     size, (_, turns, width) = len(match), queries.low[0].shape
     waves = map(jnp.asarray, _waves_to(cells(config.max_shift_m, cell_m), size))
@@ -250,23 +250,23 @@ def _products(
     match: tuple[Float[Array, "h 1 f"], Float[Array, "h 1 f"]],
     queries: tuple[Float[Array, "h t f"], Float[Array, "h t f"]],
 ) -> tuple[Float[Array, "h t f"], Float[Array, "h t f"]]:
-    """Real and imaginary part of a match's spectrum times those of the queries, conjugate."""
+    """Real and imaginary parts of a match's spectrum times the complex conjugates of the queries' spectra."""
     (a, b), (c, d) = match, queries
     return a * c + b * d, b * c - a * d
 
 
 def _both_ways(even: Float[Array, "a b"], odd: Float[Array, "a b"], *, axis: int) -> Float[Array, "*c"]:
-    """Values at shifts from the most negative to the greatest: even - odd from zero on, and even + odd before it."""
+    """Values at all shifts in ascending order: even + odd at negative shifts, even - odd at the others."""
     before = jnp.flip(jax.lax.slice_in_dim(even + odd, 1, None, axis=axis), axis)
     return jnp.concatenate([before, even - odd], axis)
 
 
 @functools.cache
 def _waves_to(reach: int, size: int) -> tuple[Float32[np.ndarray, "_ _"], ...]:
-    """Cosines and sines: of shifts from 0 to reach by frequencies down, and of frequencies by shifts to the right.
+    """Cosines and sines: shifts from 0 to reach by frequencies down, and frequencies by shifts to the right.
 
-    The latter are scaled so that an inverse transform of a half spectrum comes out. The sines down leave out
-    frequencies that are their own opposites.
+    The second pair is scaled for the inverse transform of a half spectrum. The sines down omit the frequencies that are
+    their own opposites.
     """
     shifts, rows, columns = np.arange(reach + 1), np.arange(size // 2 + 1), np.arange(size // 2 + 1)
     down, right = (2 * np.pi / size * np.outer(*pair) for pair in ((shifts, rows), (columns, shifts)))
@@ -278,10 +278,10 @@ def _waves_to(reach: int, size: int) -> tuple[Float32[np.ndarray, "_ _"], ...]:
 
 def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], cell_m: float, config: VerificationConfig) -> Peak:
     reach, step = cells(config.max_shift_m, cell_m), np.float32(2 * np.pi / config.turns)
-    x, y, yaw = prior  # of which NaN leaves everything
+    x, y, yaw = prior  # NaN allows all poses
     expected = reach - y / cell_m, yaw / step, reach + x / cell_m
     near_prior = _near(found.shape, expected, config.prior_m / cell_m, config.prior_deg)
-    highest = found.max(0)  # the slow axis, along which a maximum is fast
+    highest = found.max(0)  # a maximum along the slowest axis is fast
     allowed = jnp.where(jnp.isnan(x), highest, jnp.where(near_prior, found, -1.0).max(0))
     turn, right = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
     column = found[:, turn, right]
@@ -300,7 +300,7 @@ def _others(
     cell_m: float,
     config: VerificationConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The highest correlation away from a peak, and that on its ridge; `highest` is that of all shifts down."""
+    """Highest correlation away from a peak, and on its ridge. `highest` is the maximum over all shifts down."""
     down, turn, right = at
     most_turns = int(config.second_deg * config.turns / 360 + 1e-6)
     turns = jnp.mod(turn + np.arange(-most_turns, most_turns + 1), config.turns)
@@ -316,7 +316,7 @@ def _others(
 
 
 def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
-    """Where the peak lies between the cells along each axis: that of the parabola through three values."""
+    """Offset of the peak from its cell along each axis, from a parabola through three values."""
     offsets = []
     for axis, at in enumerate(peak):
         size = found.shape[axis]
@@ -336,7 +336,7 @@ def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> 
 def _near(
     shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""] | int], most_cells: float, most_deg: float
 ) -> Bool[Array, "d t r"]:
-    """Which poses are near one."""
+    """Whether each pose is near a given pose."""
     down, turn, right = (jnp.abs(jnp.arange(n) - at) for n, at in zip(shape, pose, strict=True))
     turn = jnp.mod(turn, shape[1])
     turn = jnp.minimum(turn, shape[1] - turn) * (360 / shape[1]) <= most_deg

@@ -1,8 +1,7 @@
-"""How probable it is that two scans show one place: a monotone additive model of retrieval, comparison and repetition.
+"""Probability that two scans show one place: a monotone additive model of retrieval, comparison and repetition.
 
-The log odds are a sum of one piecewise linear function a number of `Evidence`. Each can only fall where the evidence
-weakens, and each is bounded: descriptors and images that agree perfectly say "this much and no more", so that they
-cannot outweigh other places that agree as well.
+The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. The functions are monotone and
+bounded. Therefore a perfect fit of descriptors and images cannot outweigh other places that fit as well.
 """
 
 import dataclasses
@@ -17,7 +16,8 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 DEFAULTS = Path(__file__).with_name("probability.json")
-"""Models fitted in the simulator, by the hash of the weights; "" is for all others. See docs/decisions/loops.md."""
+"""File of models fitted in the simulator, by the hash of the weights. "" is the model for all other weights. See
+docs/decisions/loops.md."""
 KNOTS: Mapping[str, tuple[float, ...]] = {
     "distance": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
     "distance_share": (0.3, 0.5, 0.7, 0.9, 1.1),
@@ -26,49 +26,49 @@ KNOTS: Mapping[str, tuple[float, ...]] = {
     "rival": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "cells": (100.0, 200.0, 400.0, 800.0, 1200.0, 1600.0),
 }
-"""Where the functions may bend. Outside they are constant."""
+"""Knots of the piecewise linear functions. Outside the knots they are constant."""
 RISING = ("correlation", "cells")
-"""Numbers that speak for a loop where they are large; the others speak against it."""
+"""Fields whose functions rise. The other functions fall."""
 RIDGE = 0.02
-"""Weight of the squared differences of the functions' values in the fit: keeps them finite, and smooth."""
+"""Weight of the penalty on squared steps between knots. It keeps the functions finite and smooth."""
 
 
 class Evidence(NamedTuple):
-    """What speaks for pairs of scans, a number for each pair."""
+    """Evidence for pairs of scans, one number of each kind for each pair."""
 
     distance: Float[np.ndarray, "*n"]
-    """Distance of the descriptors."""
+    """Distance between the descriptors."""
     distance_share: Float[np.ndarray, "*n"]
-    """The same as a share of the distance to the nearest rival's (`loops.rivals`); NaN if there are no rivals."""
+    """Descriptor distance divided by the distance to the nearest rival (`loops.rivals`). NaN without rivals."""
     correlation: Float[np.ndarray, "*n"]
     """Correlation of the images."""
     second: Float[np.ndarray, "*n"]
-    """Second peak of the correlation, as a share of the best."""
+    """Second-peak ratio of the correlation."""
     rival: Float[np.ndarray, "*n"]
-    """Correlation with the best rival, as a share of the match's; NaN if there are no rivals."""
+    """Correlation with the best rival, divided by the correlation with the match. NaN without rivals."""
     cells: Float[np.ndarray, "*n"]
-    """Number of occupied cells of the emptier image: a few walls look like others more easily than a whole street."""
+    """Number of occupied cells of the image that has fewer. Images of few walls fit many places."""
 
     @classmethod
     def of(
         cls, distance: float, distance_share: float, correlation: Any, second: Any, rival: float, cells: float
     ) -> "Evidence":
-        """Evidence of one pair."""
+        """Create the evidence of one pair."""
         values = (distance, distance_share, correlation, second, rival, cells)
         return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
     def stack(cls, pairs: Sequence["Evidence"]) -> "Evidence":
-        """Of several pairs, in order."""
+        """Stack the evidence of several pairs, in order."""
         return cls(*np.array(pairs, np.float64).reshape(len(pairs), len(cls._fields)).T)
 
 
 ALL = Evidence._fields
 OF_IMAGES = ("correlation", "second", "rival", "cells")
-"""The numbers that mean the same whatever weights made the descriptors."""
+"""Fields that do not depend on the weights of the descriptors."""
 
 OF_REPETITION = ("distance_share", "second", "rival")
-"""The numbers that say whether other poses and places fit as well."""
+"""Fields that compare the match with other poses and places."""
 
 
 class Curve(NamedTuple):
@@ -78,47 +78,47 @@ class Curve(NamedTuple):
     values: tuple[float, ...]
 
     def __call__(self, numbers: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """The values at some numbers; a missing one (NaN) counts as the worst."""
+        """Evaluate the function. NaN gets the lowest value."""
         return np.where(np.isnan(numbers), min(self.values), np.interp(numbers, self.knots, self.values))
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopModel:
-    """Probability = 1 / (1 + exp(-(bias + sum of curves)))."""
+    """Model of the probability of loops: 1 / (1 + exp(-(bias + sum of curves)))."""
 
     curves: Mapping[str, Curve]
-    """By the name of a field of `Evidence`. Fields without a curve do not count."""
+    """Curves by the field of `Evidence`. Fields without a curve are not used."""
     bias: float
     made_with: str
-    """The pairs that it was fitted to."""
+    """Description of the pairs that the model was fitted to."""
 
     def probability(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """The probability of each pair that it is a loop."""
+        """Probability that each pair is a loop."""
         return np.asarray(1 / (1 + np.exp(-np.clip(self.log_odds(evidence), -50, 50))))
 
     def log_odds(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """The logarithm of probability / (1 - probability)."""
+        """Log odds of each pair: the logarithm of probability / (1 - probability)."""
         return np.asarray(self.bias + sum(self.contributions(evidence).values()))
 
     def contributions(self, evidence: Evidence) -> dict[str, Float[np.ndarray, "*n"]]:
-        """What each number adds to the log odds."""
+        """Term of each field in the log odds."""
         values = evidence._asdict()
         return {name: curve(np.asarray(values[name], np.float64)) for name, curve in self.curves.items()}
 
     def but_for_repetition(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """The log odds if nothing else fitted as well as the match does."""
+        """Log odds if no other pose and place fitted as well as the match."""
         parts = self.contributions(evidence)
         best = {name: max(self.curves[name].values) for name in OF_REPETITION if name in parts}
         return np.asarray(self.bias + sum((parts | best).values()))
 
     def to_json(self) -> dict[str, Any]:
-        """The value that `from_json` reads."""
+        """Convert to a JSON value for `from_json`."""
         curves = {name: curve._asdict() for name, curve in self.curves.items()}
         return {"curves": curves, "bias": self.bias, "made_with": self.made_with}
 
     @classmethod
     def from_json(cls, value: Any, *, source: str) -> "LoopModel":
-        """Raises ValueError, naming the `source`, for anything but the values of `to_json`."""
+        """Read a value of `to_json`. Raises ValueError, naming the `source`, if the value is invalid."""
         try:
             curves = {name: Curve(**{k: tuple(v) for k, v in one.items()}) for name, one in value["curves"].items()}
             model = cls(curves, value["bias"], value["made_with"])
@@ -128,7 +128,7 @@ class LoopModel:
         except (TypeError, KeyError, AttributeError, OverflowError):
             fits = False
         if not fits:
-            raise ValueError(f"{source}: expected a model of loops ({', '.join(ALL)}), found another value")
+            raise ValueError(f"{source}: expected a loop model ({', '.join(ALL)}), found another value")
         return model
 
 
@@ -144,20 +144,20 @@ def fit(
     weights: Float[np.ndarray, " n"] | None = None,
     made_with: str = "",
 ) -> LoopModel:
-    """Fit the likeliest monotone model to pairs that are known to be loops or not.
+    """Fit a monotone model to labelled pairs by maximum likelihood.
 
     Arguments:
-      evidence: One number of each kind a pair.
-      is_loop: Which pairs are loops.
-      names: The kinds that count.
-      weights: Of the pairs; without them all count alike.
-      made_with: What the pairs are, for people.
+      evidence: Evidence of the pairs.
+      is_loop: Whether each pair is a loop.
+      names: Fields of the evidence that the model uses.
+      weights: Weights of the pairs, by default all equal.
+      made_with: Description of the pairs.
 
     Raises:
-      ValueError: If there are no loops, or nothing else.
+      ValueError: If all pairs are loops or no pair is.
     """
     if is_loop.all() or not is_loop.any():
-        raise ValueError(f"expected loops and others to fit to, found {is_loop.sum()} loops of {len(is_loop)} pairs")
+        raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     weights = np.ones(len(is_loop)) if weights is None else weights
     columns = np.concatenate([_rises(name, getattr(evidence, name)) for name in names], axis=1)
     columns = np.column_stack([columns, np.ones(len(is_loop))])
@@ -182,19 +182,19 @@ def fit(
 
 
 def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """How much of each step between two knots a number has made, from 0 to 1, from its worst value on."""
+    """Progress of each number between each two knots, from 0 at its worst end to 1."""
     knots = np.array(KNOTS[name])
     made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
     return np.nan_to_num(made if name in RISING else 1 - made, nan=0.0)
 
 
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
-    """`model` for another sensor: its log odds scaled and shifted so that they are the likeliest there.
+    """Calibrate a model for another sensor: scale and shift its log odds by maximum likelihood.
 
-    These are two numbers, so that some hundred pairs are enough. Raises ValueError as `fit` does.
+    These are only two numbers, so a few hundred pairs are enough. Raises the errors of `fit`.
     """
     if is_loop.all() or not is_loop.any():
-        raise ValueError(f"expected loops and others to fit to, found {is_loop.sum()} loops of {len(is_loop)} pairs")
+        raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     log_odds, sign = model.log_odds(evidence), np.where(is_loop, 1.0, -1.0)
 
     def cost(line: Float[np.ndarray, " 2"]) -> float:
@@ -208,12 +208,17 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
 
 
 def default_model(weights_hash: str, *, path: Path = DEFAULTS) -> LoopModel:
-    """The model that ships for these weights; one of the images alone for weights that none was fitted for."""
+    """Return the model shipped for these weights. For other weights it is a model that uses only the images."""
     return models(path).get(weights_hash) or models(path)[""]
 
 
 def models(path: Path) -> dict[str, LoopModel]:
-    """Models by the hash of their weights, from a JSON file. Raises FileNotFoundError, and ValueError for others."""
+    """Read models by the hash of their weights from a JSON file.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is invalid.
+    """
     try:
         found = json.loads(path.read_text())
     except ValueError as error:

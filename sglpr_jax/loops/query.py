@@ -1,4 +1,4 @@
-"""A scan or ready-made image from a file, to be found in a map."""
+"""Query scans and images from files, for relocalisation in a map."""
 
 import dataclasses
 from pathlib import Path
@@ -15,12 +15,20 @@ from sglpr_jax.loops.places import PlaceMap
 def read_query(
     path: Path, places: PlaceMap, *, format: ScanFormat = "auto", sensor_height: SensorHeight = "auto"
 ) -> Record:
-    """Read what `places.relocate` looks for: a scan of this format, or an image (.png).
+    """Read a query for `PlaceMap.relocate`.
 
-    "auto" looks into a .bin whose name says nothing, as opening a folder of such does.
-    `sensor_height` is metres above the ground, "estimate" finds it and the tilt from the scan, "auto" takes the
-    mounting of the map's last place. Raises what `scan_record` and `read_image` do, IsADirectoryError for a folder, and
-    ValueError where there is no ground to estimate from.
+    Arguments:
+      path: File of a scan, or of an image (.png).
+      places: Map in which the query will be located.
+      format: Format of the scan. "auto" uses the file name. For a .bin whose name does not state the format, it uses
+        the content, as for a folder of scans.
+      sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates height and tilt from the
+        scan. "auto" uses the mounting of the last place of the map.
+
+    Raises:
+      IsADirectoryError: If `path` is a folder.
+      ValueError: If height and tilt cannot be estimated, because the scan shows no ground. Errors of `scan_record` and
+        `read_image` are raised, too.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected one scan or image, found a folder; name a file in it")
@@ -34,11 +42,11 @@ def read_query(
     assert record.points is not None
     found = estimate_mounting(record.points)
     if found is None:
-        raise ValueError(f"{path}: expected ground that tells the sensor's height, found none: say how high")
+        raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")
     return dataclasses.replace(record, mounting=found)
 
 
 def _found(path: Path) -> ScanFormat:
-    """What a .bin holds whose name says nothing, where it is not what "auto" takes it for."""
+    """Format of a .bin whose name does not state it, if its content differs from what "auto" assumes."""
     unsaid = path.is_file() and not says_its_format(path)
     return (unusual_record([path]) if unsaid else None) or "auto"

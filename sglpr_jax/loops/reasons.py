@@ -1,4 +1,4 @@
-"""The reasons why pairs were rejected: what each means, and how often it occurred."""
+"""Reasons for the rejection of pairs: meanings and counts."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ MEANING: dict[Reason, str] = {
     "little overlap": "The two scans, registered in 6 degrees of freedom, overlap too little.",
     "degenerate": f"The position is uncertain by more than {DEGENERATE_M:g} m along one direction, as between walls.",
 }
-"""One sentence for each reason."""
+"""Meaning of each reason, one sentence each."""
 
 
 def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
@@ -24,10 +24,10 @@ def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
 
 
 def listed(counts: dict[Reason, int]) -> str:
-    """The counts in one line: "repeats: 10, little overlap: 2"."""
+    """Format counts in one line: "repeats: 10, little overlap: 2"."""
     return ", ".join(f"{reason}: {count}" for reason, count in counts.items())
 
 
 def why_rejected(rejected: Sequence[Rejected]) -> list[str]:
-    """One line for each reason, with its count and meaning."""
+    """Lines for the user: one for each reason, with its count and meaning."""
     return [f"rejected, {reason} ({count}): {MEANING[reason]}" for reason, count in counted(rejected).items()]

@@ -1,7 +1,7 @@
-"""The pose between two scans in 6 degrees of freedom: KISS-Matcher finds it, GICP refines it (extra `slam`).
+"""Registration of two scans in 6 degrees of freedom: KISS-Matcher and then GICP (extra `slam`).
 
-Neither knows whether the scans show one place: started 3 m off along a road, GICP converges 3 m off. What tells is
-the share of the space of one scan that the other one fills too, the overlap.
+Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, it converges 3 m off. The
+overlap shows it: the share of the space of one scan that the other scan fills, too.
 """
 
 import importlib
@@ -18,31 +18,35 @@ from sglpr_jax.loops.transforms import transformed
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """How two scans are laid over each other."""
+    """Settings of the registration of two scans."""
 
     voxel_m: float = 1.0
-    """The edge of KISS-Matcher's voxels."""
+    """Edge of KISS-Matcher's voxels, in metres."""
     fine_voxel_m: float = 0.25
-    """The edge of GICP's."""
+    """Edge of GICP's voxels, in metres."""
     max_apart_m: float = 1.0
-    """Points of GICP farther from each other do not correspond."""
+    """Maximum distance of corresponding points in GICP, in metres."""
     iterations: int = 40
+    """Maximum number of GICP iterations."""
     overlap_voxel_m: float = 1.0
+    """Edge of the voxels of the overlap, in metres."""
     overlap_reach_m: float = 40.0
-    """Points farther from both sensors do not count in the overlap."""
+    """Maximum distance from both sensors of points that count in the overlap, in metres."""
     min_position_m: float = 0.002
     min_rotation_deg: float = 0.005
     """Standard deviations added to every covariance, in metres and degrees."""
 
 
 class Registration(NamedTuple):
-    """How a query lies in the frame of a match."""
+    """Pose of a query in the frame of a match, with covariance and overlap."""
 
     match_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres."""
     covariance: Float[np.ndarray, "6 6"]
-    """Of a small motion of the query in its own frame: x, y, z in metres, then about x, y, z in radians."""
+    """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
+    radians."""
     overlap: float
-    """The share of the space near both sensors that both scans fill, from 0 to 1."""
+    """Share of the space near both sensors that both scans fill, from 0 to 1."""
 
 
 def register(
@@ -53,17 +57,20 @@ def register(
     initial_covariance: Float[np.ndarray, "6 6"] | None = None,
     config: RegistrationConfig = RegistrationConfig(),
 ) -> Registration:
-    """Register the scan of a query to that of a match, both in metres in the LiDAR frame.
+    """Register the scan of a query to the scan of a match.
 
     Arguments:
-      initial: a first guess of `match_from_query`, within a metre and some degrees. Without it KISS-Matcher finds one,
-        which takes half a second.
-      initial_covariance: covariance of the first guess, of a small motion of the query in its own frame. The result
-        keeps it along a direction in which the scans slide on each other, as in a tunnel.
+      query: Points of the query in the LiDAR frame, in metres.
+      match: Points of the match in the LiDAR frame, in metres.
+      initial: First guess of `match_from_query`, within a metre and a few degrees. Without it KISS-Matcher computes
+        one, which takes half a second.
+      initial_covariance: Covariance of the first guess, of a small motion of the query in its own frame. The result
+        keeps it along directions in which the scans can slide on each other, as in a tunnel.
+      config: Settings of the registration.
 
     Raises:
-      ImportError: the extra `slam` is not installed.
-      ValueError: a scan has fewer than 100 finite points.
+      ImportError: If the extra `slam` is not installed.
+      ValueError: If a scan has fewer than 100 finite points.
 
     Example:
       found = register(recording.points(52), recording.points(4501))
@@ -84,7 +91,7 @@ def register(
         max_iterations=config.iterations,
     )
     pose = np.asarray(found.T_target_source)
-    order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp has the rotation first
+    order = np.array([3, 4, 5, 0, 1, 2])  # small_gicp puts rotation first
     information = np.asarray(found.H)[order][:, order]
     matched = matched_points(target, tree, source, pose, max_apart_m=config.max_apart_m)
     covariance = registration_covariance(information, matched, pose, initial_covariance)
@@ -95,7 +102,7 @@ def register(
 def coarse_pose(
     query: Float32[np.ndarray, "n 3"], match: Float32[np.ndarray, "m 3"], *, voxel_m: float = 1.0
 ) -> Float[np.ndarray, "4 4"]:
-    """`match_from_query` by KISS-Matcher, without a first guess. Raises ImportError without the extra `slam`."""
+    """Estimate `match_from_query` with KISS-Matcher, without a first guess. Raises ImportError without extra `slam`."""
     matcher = _library("kiss_matcher")
     found = matcher.KISSMatcher(matcher.KISSMatcherConfig(voxel_m)).estimate(query, match)
     pose = np.eye(4)
@@ -110,7 +117,7 @@ def overlap(
     *,
     config: RegistrationConfig = RegistrationConfig(),
 ) -> float:
-    """The number of voxels that both scans fill over that of the scan that fills fewer, near both sensors."""
+    """Number of voxels that both scans fill, divided by the number that the smaller scan fills, near both sensors."""
     moved = transformed(match_from_query, query)
     sensors = np.stack([np.zeros(3), match_from_query[:3, 3]])
     ours, theirs = (_voxels(cloud[_near(cloud, sensors, config)], config) for cloud in (moved, match))
@@ -125,14 +132,14 @@ def _near(
 
 
 def _voxels(cloud: Float[np.ndarray, "n 3"], config: RegistrationConfig) -> Int[np.ndarray, " v"]:
-    """The voxels that hold points, a number each."""
+    """Occupied voxels, one number each."""
     side = 2 * int(config.overlap_reach_m / config.overlap_voxel_m) + 4
     x, y, z = np.floor(cloud / config.overlap_voxel_m).astype(np.int64).T + side // 2
     return np.unique((z * side + y) * side + x)
 
 
 def _preprocessed(cloud: Float32[np.ndarray, "n 3"], config: RegistrationConfig) -> tuple[Any, Any]:
-    """The thinned cloud with the covariances of its surface, and its tree."""
+    """Downsampled cloud with the covariances of its surface, and its search tree."""
     points, size = cloud.astype(np.float64), config.fine_voxel_m
     return _library("small_gicp").preprocess_points(points, downsampling_resolution=size, num_neighbors=NEIGHBOURS)
 
@@ -145,7 +152,7 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
 
 
 def check_installed() -> None:
-    """Raise ImportError where the extra `slam` is not installed, before hours of work that end in a registration."""
+    """Raises ImportError if the extra `slam` is not installed, before any long work starts."""
     _library("small_gicp")
 
 

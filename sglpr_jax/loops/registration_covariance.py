@@ -1,8 +1,8 @@
-"""The covariance of a registration of two scans: what the points at hand say, not what as many independent ones would.
+"""Covariance of the registration of two scans, for points with correlated errors.
 
-Neighbouring points err together: they lie on one surface, one ring of the sensor, one vehicle that has moved. Their
-contributions are added up in blocks of space, and the scatter of the blocks gives the noise (a sandwich estimator). The
-constants were fitted on simulated drives with 64, 32 and 16 beams (`benchmarks/covariance.py`).
+Errors of neighbouring points are correlated: the points lie on one surface, one ring of the sensor or one vehicle that
+has moved. Their contributions are summed in blocks of space, and the scatter of the blocks gives the noise (a sandwich
+estimator). The constants were fitted on simulated drives with 64, 32 and 16 beams (`benchmarks/covariance.py`).
 """
 
 from typing import Any, NamedTuple
@@ -11,43 +11,42 @@ import numpy as np
 from jaxtyping import Float, Int
 
 NEIGHBOURS = 20
-"""Neighbours of a point from which its normal is estimated. With 10, normals on the rings of 16 beams are arbitrary,
-and GICP holds the rings of one scan on those of the other: roll and pitch were .3 degrees off."""
+"""Number of neighbours from which the normal of a point is estimated. With 10, normals on the rings of 16 beams are
+arbitrary, and GICP aligns the rings of the two scans. Roll and pitch were .3 degrees off."""
 POINTS = 4000
-"""Maximum number of points of the query that the covariance is computed from."""
+"""Target number of points of the query for the covariance. Clouds with fewer points are not thinned."""
 BLOCK_M = 8.0
-"""Edge of the blocks of space whose errors are taken as independent."""
+"""Edge of the blocks of space with independent errors, in metres."""
 SCALE, HEIGHT_SCALE = 1.15, 0.8
-"""Factor of all standard deviations, and of that of the height besides."""
+"""Factor of all standard deviations, and additional factor of the height."""
 SPARSE, SPARSE_TILT = 3.2, 9.0
-"""The standard deviations grow by these factors times the share of the ground where the neighbours of a point lie on
-one line, because a normal is a guess there: position and yaw by the first, roll and pitch by the second."""
+"""Growth of standard deviations with the share of sparse ground: of x, y and yaw, and of roll and pitch. Ground is
+sparse where the neighbours of a point lie on one line, so that its normal is arbitrary."""
 FLAT_COSINE = 0.9
-"""A surface is ground if its normal is closer to the z axis than this cosine."""
+"""Minimum cosine between the z axis and the normal of a surface that is ground."""
 LINE = 0.05
-"""Neighbours lie on a line if the second of their variances is less than this fraction of the first."""
+"""Maximum ratio of the second to the first variance of neighbours that lie on a line."""
 SLIDING = 0.04
-"""Normals point along every direction; one along which their squared components make up less than this share is
-degenerate, and the scans slide along it."""
+"""Share of the squared components of all normals below which a direction is degenerate: scans can slide along it."""
 UNKNOWN_M = 3.0
-"""Standard deviation along a degenerate direction, where the first guess has no covariance."""
+"""Standard deviation along a degenerate direction if the first guess has no covariance, in metres."""
 
 
 class Matched(NamedTuple):
     """Points of a query, each with its nearest neighbour in the match."""
 
     points: Float[np.ndarray, "k 3"]
-    """In the query's frame."""
+    """Points in the query's frame, in metres."""
     residuals: Float[np.ndarray, "k 3"]
-    """From each point, moved, to its neighbour, in the match's frame."""
+    """Vector from each transformed point to its neighbour, in the match's frame."""
     weights: Float[np.ndarray, "k 3 3"]
-    """Inverse covariances of the residuals, as GICP has them."""
+    """Inverse covariances of the residuals, as in GICP."""
     normals: Float[np.ndarray, "k 3"]
-    """Of the neighbours' surfaces, in the query's frame."""
+    """Normals of the neighbours' surfaces, in the query's frame."""
     each: int
-    """How many points of the query each of these stands for."""
+    """Number of points of the query that each of these represents."""
     sparse: float
-    """The share of the ground where points have neighbours along one line only."""
+    """Share of the ground where the neighbours of a point lie on one line."""
 
 
 def registration_covariance(
@@ -59,10 +58,10 @@ def registration_covariance(
     """Return the covariance of a small motion of the query in its own frame: metres, then radians.
 
     Arguments:
-      information: GICP's matrix, of the same motion.
-      matched: the points that correspond.
-      match_from_query: the pose that was found.
-      initial_covariance: that of the first guess, which is kept along degenerate directions.
+      information: GICP's information matrix of the same motion.
+      matched: Corresponding points.
+      match_from_query: Estimated pose.
+      initial_covariance: Covariance of the first guess, which is kept along degenerate directions.
     """
     inverse = np.linalg.pinv(information, hermitian=True)
     grow = np.repeat(SCALE * (1 + np.array([SPARSE, SPARSE_TILT]) * matched.sparse), 3)
@@ -75,12 +74,14 @@ def registration_covariance(
 def matched_points(
     match: Any, tree: Any, query: Any, match_from_query: Float[np.ndarray, "4 4"], *, max_apart_m: float
 ) -> Matched:
-    """Look up the nearest neighbours of some of the query's points.
+    """Find the nearest neighbours of a subset of the query's points.
 
     Arguments:
-      match, tree, query: what small_gicp's `preprocess_points` returns for both scans.
-      match_from_query: the pose that was found.
-      max_apart_m: points farther apart do not correspond.
+      match: Cloud of the match, from small_gicp's `preprocess_points`.
+      tree: Search tree of the match, from the same function.
+      query: Cloud of the query, from the same function.
+      match_from_query: Estimated pose.
+      max_apart_m: Maximum distance of corresponding points, in metres.
     """
     turn = match_from_query[:3, :3]
     points, theirs = (np.asarray(cloud.points())[:, :3] for cloud in (query, match))
@@ -102,7 +103,7 @@ def matched_points(
 
 
 def _noise(matched: Matched, match_from_query: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    """The scatter of the gradient of GICP's error, in blocks of space."""
+    """Scatter of the gradient of GICP's error over blocks of space."""
     pull = np.einsum("kij,kj->ki", matched.weights, matched.residuals) @ match_from_query[:3, :3]
     gradient = np.concatenate([pull, np.cross(matched.points, pull)], axis=1)
     _, block = np.unique(np.floor(matched.points / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)
@@ -114,7 +115,7 @@ def _noise(matched: Matched, match_from_query: Float[np.ndarray, "4 4"]) -> Floa
 def _sliding(
     normals: Float[np.ndarray, "k 3"], initial_covariance: Float[np.ndarray, "6 6"] | None
 ) -> Float[np.ndarray, "3 3"]:
-    """The first guess's covariance of the position, along the directions in which no surface holds the scans."""
+    """Position covariance of the first guess along degenerate directions."""
     strengths, directions = np.linalg.eigh(normals.T @ normals)
     shares = strengths / max(strengths.sum(), 1e-9)
     guess = np.eye(3) * UNKNOWN_M**2 if initial_covariance is None else initial_covariance[:3, :3]
@@ -123,7 +124,7 @@ def _sliding(
 
 
 def _sparse_ground(cloud: Float[np.ndarray, "n 3"], tree: Any, rows: Int[np.ndarray, " k"]) -> float:
-    """The share of the points of flat ground whose neighbours lie on one line."""
+    """Share of the points of flat ground whose neighbours lie on one line."""
     if not len(rows):
         return 1.0
     neighbours = cloud[np.asarray(tree.batch_knn_search(cloud[rows], NEIGHBOURS)[0]).astype(np.int64)]

@@ -1,4 +1,4 @@
-"""Do the probabilities of loops mean what they say? Pairs in bins of probability, and how many of each are loops."""
+"""Reliability of loop probabilities: pairs in bins of probability, and the share of loops in each bin."""
 
 import itertools
 from collections.abc import Sequence
@@ -12,36 +12,37 @@ from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.same_place import NEGATIVE_M
 
 EDGES = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0)
-"""Narrow where loops are accepted and refused."""
+"""Edges of the bins. They are narrow where loops are accepted and rejected."""
 
 
 class Bin(NamedTuple):
-    """Pairs of nearly equal probability."""
+    """Pairs with similar probability."""
 
     low: float
     high: float
-    """Of the probabilities; the last bin has 1, too."""
+    """Range of the probabilities. The last bin includes 1."""
     pairs: int
+    """Number of pairs."""
     loops: int
-    """So many of the pairs are loops."""
+    """Number of pairs that are loops."""
     said: float
-    """The mean of their probabilities."""
+    """Mean probability of the pairs."""
 
     @property
     def share(self) -> float:
-        """Of loops among the pairs."""
+        """Share of loops among the pairs."""
         return self.loops / self.pairs
 
 
 def reliability(
     probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"], *, edges: Sequence[float] = EDGES
 ) -> tuple[Bin, ...]:
-    """The bins that hold pairs, in order of probability."""
+    """Sort pairs into bins. Returns the bins with pairs, in order of probability."""
     found = []
     for low, high in itertools.pairwise(edges):
         chosen = (probability >= low) & ((probability < high) | (high == edges[-1]))
         if chosen.any():
-            said = float(probability[chosen].mean().clip(low, high))  # the mean of equal numbers may be rounded out
+            said = float(probability[chosen].mean().clip(low, high))  # rounding may move the mean of equal numbers out
             found.append(Bin(low, high, int(chosen.sum()), int(is_loop[chosen].sum()), said))
     return tuple(found)
 
@@ -49,7 +50,7 @@ def reliability(
 def reliability_of(
     candidates: Sequence[Candidate], model: LoopModel, positions: Float[np.ndarray, "n 3"]
 ) -> tuple[Bin, ...]:
-    """The bins of candidates whose true positions are known: loops are up to 10 m apart, others more than 20 m."""
+    """Reliability of candidates with known positions: loops are up to 10 m apart, others more than 20 m."""
     if not candidates:
         return ()
     evidence, is_loop = labelled(candidates, positions)
@@ -59,9 +60,9 @@ def reliability_of(
 def labelled(
     candidates: Sequence[Candidate], positions: Float[np.ndarray, "n 3"], *, loop_m: float = 10.0
 ) -> tuple[Evidence, Bool[np.ndarray, " m"]]:
-    """The evidence of candidates whose true positions are known, and whether each is a loop: up to `loop_m` apart.
+    """Evidence of candidates with known positions, and whether each is a loop (at most `loop_m` apart).
 
-    Candidates between that and 20 m are left out.
+    Candidates that are more than `loop_m` and at most 20 m apart are omitted.
     """
     apart = np.array([np.linalg.norm(positions[one.query] - positions[one.match]) for one in candidates])
     clear = (apart <= loop_m) | (apart > NEGATIVE_M)

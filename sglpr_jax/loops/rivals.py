@@ -1,9 +1,9 @@
-"""Does the query fit other places as well as its match? Scans of its surroundings that certainly show other places.
+"""Rivals of a match: scans of the same surroundings that certainly show other places.
 
-Frames of the last half minute are never matches, and they come from the same surroundings as the query. So do the
-frames around the match. If the query fits one of these rivals about as well as the match, the place repeats, and the
-fit proves nothing. A rival that overlaps the query or the match fits it rightly, at the pose by which the sensor moved:
-there only its second-best pose counts.
+Frames of the last half minute are never matches, and they show the surroundings of the query. The frames around the
+match do so, too. If the query fits one of these rivals about as well as the match, the place repeats, and the fit
+proves nothing. A rival that overlaps the query or the match fits it correctly at the pose given by the motion. At that
+pose, only the second-best fit counts.
 """
 
 import dataclasses
@@ -20,21 +20,22 @@ from sglpr_jax.loops.transforms import yaw_of
 
 @dataclasses.dataclass(frozen=True)
 class RivalConfig:
-    """Which frames are rivals of a match."""
+    """Selection of the rivals of a match."""
 
     of_query: int = 6
-    """Maximum number from before the query."""
+    """Maximum number of rivals before the query."""
     of_match: int = 4
-    """Maximum number from around the match, half before and half after it."""
+    """Maximum number of rivals around the match, half before and half after it."""
     age: tuple[float, float] = (0.27, 0.97)
-    """Time between a rival and the query or the match while the sensor moved, as shares of the excluded time: 8 to
-    29 s of 30."""
+    """Minimum and maximum time between a rival and the query or the match, without standing time, as fractions of the
+    excluded time. The defaults are 8 and 29 s of 30 s."""
     agree_m: float = 3.0
     agree_share: float = 0.05
-    """A fit agrees with the motion up to this distance, in metres, plus this share of the travelled distance."""
+    """Maximum deviation of a fit that agrees with the motion, in metres and as a fraction of the travelled distance."""
     agree_deg: float = 20.0
+    """Maximum angle of a fit that agrees with the motion, in degrees."""
     overlap_m: float = 15.0
-    """Scans nearer than this see much of the same, in metres."""
+    """Distance below which two scans overlap, in metres."""
 
 
 def rivals(
@@ -47,14 +48,14 @@ def rivals(
     exclude_s: float,
     config: RivalConfig = RivalConfig(),
 ) -> Int[np.ndarray, " k"]:
-    """Choose the rivals of a match: of each stretch of time the frame whose descriptor is nearest to the query's.
+    """Choose the rivals of a match: from each time interval, the frame whose descriptor is nearest to the query's.
 
     Arguments:
       descriptor: Descriptor of the query.
       descriptors: Descriptors of all earlier frames.
       match: Frame of the match.
       motion: Motion of all earlier frames and the query.
-      usable: Earlier frames that show something.
+      usable: Whether each earlier frame is not empty.
       exclude_s: Minimum age of a match, in seconds.
       config: Number and age of the rivals.
 
@@ -81,14 +82,14 @@ def rival_share(
     *,
     config: RivalConfig = RivalConfig(),
 ) -> float:
-    """Return the best correlation of a query with a rival, as a share of that with its match; NaN without rivals.
+    """Best correlation of a query with a rival, divided by its correlation with the match. NaN without rivals.
 
     Arguments:
-      peaks: Poses of the query over k rivals.
+      peaks: Peaks of the query over k rivals.
       match_correlation: Correlation of the query with its match.
-      expected: Poses of the query in the frames of the rivals, by what is known of the motion, and how far from them
-        a peak may be, in metres; NaN if the pose is not known. A peak there is no evidence of repetition, and the
-        second one counts in its place.
+      expected: Poses of the query in the frames of the rivals according to the motion, with tolerances in metres (NaN
+        if the pose is unknown). A peak at an expected pose does not show repetition. The second peak counts instead.
+      config: Angle within which a peak agrees with the expected pose.
     """
     if not len(peaks.correlation):
         return np.nan
@@ -109,10 +110,9 @@ def distance_share(
     *,
     config: RivalConfig = RivalConfig(),
 ) -> float:
-    """Return the descriptor distance of a query to its match, as a share of that to the nearest rival.
+    """Descriptor distance of a query to its match, divided by its distance to the nearest rival. NaN without rivals.
 
-    Rivals that are known to see much of what the query sees do not count; NaN without others. For `expected` see
-    `rival_share`.
+    Rivals that overlap the query according to the `expected` poses (see `rival_share`) do not count.
     """
     overlaps = np.zeros(len(rival_distances), bool)
     for poses, tolerance_m in expected:
@@ -129,7 +129,7 @@ def expected_poses(
     *,
     config: RivalConfig = RivalConfig(),
 ) -> tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]:
-    """The poses of a query at a known pose in a `frame`, in the frames of its rivals, as `rival_share` takes them."""
+    """Expected poses and tolerances for `rival_share`, for a query with a known pose in the frame of `frame`."""
     poses, known = motion.from_frame(frame, rows)
     travelled = np.abs(np.array([motion.travelled[row] for row in rows]) - motion.travelled[frame])
     tolerance = np.where(known, config.agree_m + config.agree_share * travelled, np.nan)

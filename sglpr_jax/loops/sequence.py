@@ -1,8 +1,8 @@
-"""The sequential test: the loops of neighbouring frames add up, or speak against each other.
+"""Sequential test: the log odds of neighbouring frames are added or subtracted.
 
-The log odds of a loop are its own, plus those of the frames about it whose matches move as their queries do, less those
-of frames that match elsewhere. Neighbours that see the same walls are not independent: a frame counts as much as the
-sensor moved since the one before.
+The log odds of neighbouring frames are added if their matches move as their queries do, and subtracted if they match
+elsewhere. Neighbours that see the same walls are not independent, so the weight of a frame depends on the distance
+travelled since the previous one.
 """
 
 import dataclasses
@@ -20,34 +20,35 @@ from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar,
 
 @dataclasses.dataclass(frozen=True)
 class SequenceConfig:
-    """Which frames count, and how much."""
+    """Selection and weights of neighbouring frames."""
 
     frames: int = 30
-    """Number of frames before and after a loop that count."""
+    """Number of frames before and after a loop that are considered."""
     support: int = 2
     """Minimum number of loops that show the same place, including the loop itself."""
     independent_m: float = 15.0
-    """Travelled distance at which two frames are about independent, in metres."""
+    """Travelled distance after which two frames are nearly independent, in metres."""
     least_probability: float = 0.2
-    """A neighbour counts by how much its log odds exceed those of this probability."""
+    """Minimum probability of a neighbour. It counts with the excess of its log odds over those of this probability."""
     unknown_m: float = 1.0
-    """Distance from one frame to the next if the motion is not known, in metres."""
+    """Assumed distance between consecutive frames if the motion is unknown, in metres."""
     max_log_odds: float = 4.0
-    """A neighbour counts at most this much."""
+    """Maximum log odds that a neighbour adds or subtracts."""
     frames_a_frame: float = 3.0
-    """If the motion is not known, matches of queries k frames apart are at most this factor times k + 1 apart."""
+    """If the motion is unknown, the matches of two queries k frames apart are at most this factor times k + 1 frames
+    apart."""
     agree_m: float = 2.0
     agree_share: float = 0.1
     agree_deg: float = 10.0
-    """Two loops agree if their circle closes within this distance, plus this share of the travelled distance, and
-    within this angle."""
+    """Maximum closure error of the cycle of two loops that agree: distance in metres, additional fraction of the
+    travelled distance, and angle in degrees."""
     guess_share: float = 0.075
     guess_deg_per_m: float = 0.2
-    """What is added to both for each metre of `Motion.guessed_m`, in metres and degrees."""
+    """Additional tolerance for each metre of `Motion.guessed_m`, in metres and degrees."""
 
 
 def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceConfig()) -> Bool[np.ndarray, "n n"]:
-    """Which pairs of loops agree by their frames alone: the match moves as the query does, in either direction."""
+    """Whether each pair of loops agrees by frame numbers: the match moves as the query does, in either direction."""
     query, match = frames_of(loops)
     on = np.abs(query[:, None] - query[None])
     return np.abs(match[:, None] - match[None]) <= config.frames_a_frame * (on + 1)
@@ -56,7 +57,7 @@ def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceCo
 def agree_in_motion(
     loops: Sequence[Loop], motion: Motion, mounting: Mounting | None, *, config: SequenceConfig = SequenceConfig()
 ) -> Bool[np.ndarray, "n n"]:
-    """Which pairs of loops agree by the motion of the sensor; where that is a guess, by their frames, too."""
+    """Whether each pair of loops agrees with the motion of the sensor and, if it is a guess, in frame numbers."""
     query, match = frames_of(loops)
     segment = np.array(motion.segments)
     known = segment[query][:, None] == segment[query][None]
@@ -77,7 +78,7 @@ def agree_in_motion(
 
 
 def _moved(fitted: Planar, query: Planar, match: Planar) -> Planar:
-    """Where the motion puts each loop j, given loop i: (i, j) is match_j_from_query_j by way of loop i."""
+    """Pose of each loop j predicted from loop i and the motion: (i, j) is match_j_from_query_j via loop i."""
     query_from_query = compose(inverted(query)[:, None], query[None])
     match_from_match = compose(inverted(match)[None], match[:, None])
     return compose(match_from_match, compose(fitted[:, None], query_from_query))
@@ -91,26 +92,27 @@ def added_log_odds(
     *,
     config: SequenceConfig = SequenceConfig(),
 ) -> Float[np.ndarray, " n"]:
-    """The log odds of each loop, given those of the others.
+    """Log odds of each loop, given its neighbours.
 
     Arguments:
-      loops: In the order of their queries.
-      log_odds: Of each loop alone.
-      agreeing: Which pairs show the same place.
-      motion: Of all frames.
+      loops: Loops in the order of their queries.
+      log_odds: Log odds of each loop alone.
+      agreeing: Whether each pair of loops agrees.
+      motion: Motion of all frames.
+      config: Selection and weights of neighbours.
     """
     query, _ = frames_of(loops)
     gaps = _gaps(query, motion, config)
     counted = np.clip(log_odds - logit(config.least_probability), 0, config.max_log_odds)
     fresh = 1 - np.exp(-gaps / config.independent_m)
-    towards = np.sign(np.arange(len(loops))[:, None] - np.arange(len(loops))[None])  # of i, seen from j
+    towards = np.sign(np.arange(len(loops))[:, None] - np.arange(len(loops))[None])  # direction from j to i
     weight = np.where(towards > 0, fresh[None, 1:], np.where(towards < 0, fresh[None, :-1], 0.0))
     weight = weight * (np.abs(query[:, None] - query[None]) <= config.frames)
     return log_odds + (np.where(agreeing, 1.0, -1.0) * weight) @ counted
 
 
 def _gaps(query: np.ndarray, motion: Motion, config: SequenceConfig) -> Float[np.ndarray, " m"]:
-    """How far the sensor moved before each query, and after the last: one more than there are queries."""
+    """Distance travelled before each query, and after the last one. There is one more than queries."""
     between = [
         abs(motion.travelled[b] - motion.travelled[a])
         if motion.segments[a] == motion.segments[b]

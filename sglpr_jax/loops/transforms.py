@@ -1,4 +1,4 @@
-"""Rigid transforms as 4 x 4 matrices, `a_from_b @ b_from_c == a_from_c`, and what they are in the plane."""
+"""Rigid transforms as 4 x 4 matrices, `a_from_b @ b_from_c == a_from_c`."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 
 def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
-    """A motion in the plane: metres, and radians counter-clockwise."""
+    """Transform in the plane, from x and y in metres and yaw in radians counter-clockwise."""
     found = np.eye(4)
     found[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     found[:2, 3] = x, y
@@ -14,7 +14,7 @@ def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
 
 
 def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
-    """b_from_a."""
+    """Inverse transform, b_from_a."""
     turned = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
     found = np.zeros_like(a_from_b)
     found[..., :3, :3] = turned
@@ -24,17 +24,17 @@ def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"
 
 
 def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
-    """Where b's x axis points in a's plane, radians."""
+    """Yaw of the x axis of frame b in frame a, in radians."""
     return np.asarray(np.arctan2(a_from_b[..., 1, 0], a_from_b[..., 0, 0]))
 
 
 def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Points of frame b in frame a."""
+    """Transform points from frame b to frame a."""
     return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "4 4"]) -> np.ndarray:
-    """The covariance of a small motion of a body (metres, then radians) in its frame a, from that in its frame b."""
+    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
     x, y, z = a_from_b[:3, 3]
     turned = a_from_b[:3, :3]
     adjoint = np.zeros((6, 6))
@@ -44,14 +44,14 @@ def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np
 
 
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
-    """The rotations as x, y, z, w, with w not negative."""
+    """Rotations as quaternions x, y, z, w with non-negative w."""
     return Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
 
 
 def from_quaternions(
     translations: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Poses of translations and quaternions (x, y, z, w)."""
+    """Poses from translations and quaternions (x, y, z, w)."""
     poses = np.tile(np.eye(4), (len(translations), 1, 1))
     poses[:, :3, 3] = translations
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
@@ -59,6 +59,6 @@ def from_quaternions(
 
 
 def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
-    """How far the sensor had come at every pose, metres."""
+    """Travelled distance at each pose, in metres."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,8 +1,8 @@
-"""What was seen of a recording's scans so far, in a folder: a run that was killed goes on there and ends as if not.
+"""Checkpoint directory of a search or a map. A run that was killed resumes from it and ends with the same result.
 
-All that takes time is kept: descriptors, images, and how those of the candidates lie to each other. A file holds some
-frames, is called by the first of them, and is written whole or not at all; the frames after the last file are looked at
-again. What was seen with other settings is thrown away; a folder that is somebody else's is refused.
+Everything that takes time is stored: descriptors, images and the comparisons of candidates. A file holds up to `FRAMES`
+frames, is named after the first one and is written atomically. Frames after the last file are processed again. A
+checkpoint with other settings is deleted. A folder with other files is rejected.
 """
 
 import contextlib
@@ -32,15 +32,15 @@ FORMAT = f"{KIND} 3"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
 OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
-"""The names of files of frames, and of what `files.replacing` leaves half-written."""
+"""Names of files of frames, and of temporary files of `files.replacing`."""
 ALIGNMENT_NUMBERS = 14
-"""x, y, yaw, nine of the covariance, correlation, second."""
+"""Numbers of an alignment: x, y, yaw, 9 of the covariance, correlation and second-peak ratio."""
 FRAMES = 50
-"""In a file."""
+"""Number of frames in a file."""
 
 
 def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray | float | None) -> dict[str, Any]:
-    """All that decides what is seen of a recording's scans, as JSON has it: `given` is what the user said of them."""
+    """Settings that determine the content of a checkpoint, as JSON values. `given` are further arguments of the run."""
     found = {
         "format": FORMAT,
         "recording": fingerprint(recording),
@@ -61,21 +61,24 @@ def _digest(values: np.ndarray | None) -> str | None:
 
 @dataclasses.dataclass
 class Unfinished:
-    """The folder of a search, or of a map in the making, that goes on."""
+    """Checkpoint directory of a search or a map."""
 
     folder: Path
     kept: int = 0
-    """So many frames are in it."""
+    """Number of stored frames that have been read or written."""
 
     @classmethod
     def opened(cls, folder: Path, wanted: dict[str, Any]) -> "Unfinished":
-        """The folder, emptied where other settings filled it, which is told.
+        """Open a folder as checkpoint directory. If it has other settings, warn and delete its checkpoint.
 
-        Raises FileExistsError where no such run has filled it and anything else is in it, WriteError where it cannot be
-        written.
+        Raises:
+          FileExistsError: If the folder has files that do not belong to a checkpoint.
+          WriteError: If the folder cannot be written.
         """
         if other := _other_settings(folder, wanted):
-            warn(f"{folder}: expected what a run with the same settings has kept, found another {', '.join(other)}")
+            warn(
+                f"{folder}: expected a checkpoint with the same settings, found another {', '.join(other)}; restarting"
+            )
             _empty(folder)
         write_json(folder / SETTINGS, wanted)
         return cls(folder)
@@ -88,10 +91,16 @@ class Unfinished:
         *,
         missing: bool,
     ) -> None:
-        """Call `add`, which adds to the `finder`, an empty one, with what is kept of each frame and its candidates.
+        """Call `add` with each stored frame and its comparisons.
 
-        Ends at the first file that is not there or damaged and, unless scans may be `missing`, at the first frame whose
+        Stops at the first file that is missing or damaged. With `missing=False`, it also stops at the first frame whose
         scan could not be read.
+
+        Arguments:
+          finder: Empty finder, to which `add` adds the frames.
+          mounting: Mounting of the sensor.
+          add: Function that adds a frame.
+          missing: Whether scans may be unreadable.
         """
         while self._path.is_file():
             try:
@@ -108,7 +117,7 @@ class Unfinished:
             self.kept = len(finder.index)
 
     def keep(self, finder: CandidateFinder, candidates: Sequence[Candidate] = (), *, all: bool = False) -> None:
-        """Write the frames that are not kept, as soon as they fill a file, or `all` of them. Raises WriteError."""
+        """Write the new frames if they fill a file; with `all`, write them in any case. Raises WriteError."""
         first, end = self.kept, len(finder.index)
         if end - first < (1 if all else FRAMES):
             return
@@ -125,15 +134,17 @@ class Unfinished:
 
     @property
     def _path(self) -> Path:
-        """The file of the frames that come next."""
+        """File of the next frames."""
         return self.folder / f"{self.kept:06d}{ENDING}"
 
 
 @contextlib.contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Make the folder, keep other processes out of it, and remove in the end what was made where nothing is in it.
+    """Create and lock a folder. At the end, remove the folder and its new parents if they are empty.
 
-    Raises BlockingIOError where another process has it, NotADirectoryError where a file lies in the way.
+    Raises:
+      BlockingIOError: If another process has locked the folder.
+      NotADirectoryError: If the path leads through a file.
     """
     there = next(one for one in (folder, *folder.parents) if one.exists())
     if not there.is_dir():
@@ -151,14 +162,14 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 def remove(folder: Path) -> None:
-    """Remove what is kept in a folder, and the folder where nothing else is in it."""
+    """Delete the checkpoint in a folder, and the folder if it is then empty."""
     _empty(folder)
     with contextlib.suppress(OSError):
         folder.rmdir()
 
 
 def _other_settings(folder: Path, wanted: dict[str, Any]) -> list[str]:
-    """Those that a folder was not filled with; "format" where it says none. Errors are those of `opened`."""
+    """Names of settings that differ from those of a checkpoint, or "format" if it has none. Errors as in `opened`."""
     if not folder.is_dir() or not any(folder.iterdir()):
         return []
     try:
@@ -173,17 +184,17 @@ def _other_settings(folder: Path, wanted: dict[str, Any]) -> list[str]:
 
 
 def _check_own(folder: Path) -> None:
-    """Raise FileExistsError where a folder holds anything but what a kill leaves there before the settings."""
+    """Raises FileExistsError if a folder holds anything but files of frames and temporary files."""
     others = sorted(path.name for path in folder.iterdir() if not _is_own(path))
     if others:
         raise FileExistsError(
-            f"{folder}: expected a new folder, an empty one or that of an unfinished run, found {others[0]}"
+            f"{folder}: expected a new folder, an empty one or a checkpoint directory, found {others[0]}"
             f"{' and more' if len(others) > 1 else ''}"
         )
 
 
 def _empty(folder: Path) -> None:
-    (folder / SETTINGS).unlink(missing_ok=True)  # first, so that what a kill here leaves is of no settings
+    (folder / SETTINGS).unlink(missing_ok=True)  # first, so that a killed run leaves no settings
     for path in folder.glob("*"):
         if _is_own(path):
             path.unlink()
@@ -194,7 +205,7 @@ def _is_own(path: Path) -> bool:
 
 
 def columns(candidates: Sequence[Candidate], links: Sequence[Peak | None]) -> dict[str, np.ndarray]:
-    """The comparisons of some frames as arrays: their candidates, in order, and the link of each frame."""
+    """Convert the comparisons of some frames to arrays: their candidates, in order, and the link of each frame."""
     alignments = [np.concatenate([np.reshape(value, -1) for value in one.alignment]) for one in candidates]
     missing = [np.nan] * len(Peak._fields)
     return {
@@ -206,7 +217,7 @@ def columns(candidates: Sequence[Candidate], links: Sequence[Peak | None]) -> di
 
 
 def compared_of(columns: dict[str, np.ndarray], rows: Sequence[int]) -> list[Compared]:
-    """The comparisons of frames `rows` from their arrays."""
+    """Convert arrays of `columns` to the comparisons of the frames `rows`."""
     found: dict[int, list[Candidate]] = {row: [] for row in rows}
     for (query, match), values, evidence in zip(
         columns["pairs"].tolist(), columns["alignments"], columns["evidence"], strict=True

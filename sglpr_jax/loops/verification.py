@@ -1,7 +1,7 @@
-"""How the images of two scans lie to each other: the pose of `pose_search`, refined, with covariance and correlation.
+"""Alignment of two images: the pose of `pose_search`, refined, with covariance and correlation.
 
-About the best peak of the exhaustive search, the correlation is taken on whole cells. A Fourier series gives its values
-between cells, and a parabola those between rotations.
+Around the best peak of the exhaustive search, the correlation is computed on cells that are not merged. A Fourier
+series interpolates between cells, and a parabola between rotations.
 """
 
 import functools
@@ -17,35 +17,35 @@ from sglpr_jax.loops.pose_search import DEFAULT, Peak, VerificationConfig, prepa
 
 
 class Alignment(NamedTuple):
-    """How a query lies in the frame of a match: the pose `match_from_query` in the plane, and how sure it is."""
+    """Pose of a query in the frame of a match, in the plane, with covariance and correlation."""
 
     x: Float[Array, "*b"]
     y: Float[Array, "*b"]
-    """Where the query's sensor is in the match's frame, metres."""
+    """Position of the query's sensor in the match's frame, in metres."""
     yaw: Float[Array, "*b"]
-    """How it is turned there, radians, counter-clockwise, from -pi to pi."""
+    """Rotation of the query in the match's frame, in radians, counter-clockwise, from -pi to pi."""
     covariance: Float[Array, "*b 3 3"]
     """Covariance of x, y (metres) and yaw (radians), in the match's frame.
 
-    It follows the shape of the peak: metres along a plain wall, centimetres across. It does not include the chance that
-    another peak is the right one; see `second`.
+    It follows the shape of the peak: metres along a plain wall, centimetres across. It does not include the possibility
+    that another peak is the correct one; see `second`.
     """
     correlation: Float[Array, "*b"]
-    """At the peak: 1 for equal images, about 0 for images that have nothing to do with each other."""
+    """Correlation at the peak: 1 for equal images, about 0 for unrelated ones."""
     second: Float[Array, "*b"]
-    """The height of the second peak as a share of the first: near 1 where another pose fits as well."""
+    """Second-peak ratio: height of the second peak divided by the first. It is near 1 if another pose fits as well."""
 
     def one(self, k: int) -> "Alignment":
-        """The k-th of several."""
+        """The k-th alignment."""
         return Alignment(*(value[k] for value in self))
 
 
 TURN_STEPS = 4
-"""Steps of the second search to each side in angle."""
+"""Number of rotation steps of the refinement to each side."""
 RIDGE_TURNS = (0, 2, 6, 8)
-"""Those of these angles at which a ridge that bends is looked for."""
+"""Indices of these rotations at which a bent ridge is searched."""
 SHIFT_STEPS = 5
-"""Steps of half a cell of the second search to each side in x and y."""
+"""Number of steps of half a cell of the refinement to each side, in x and y."""
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -55,10 +55,18 @@ def align(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
-    """Lay the image of a query over that of a match, both (n, n) counts in the orientation of eq. 1, n even.
+    """Estimate the pose of a query in the frame of a match from their images.
 
-    Works under jit and vmap; of one query with several matches (`align_all`) the query is turned once. Raises
-    ValueError for images that are not square or have an odd number of cells.
+    The function works under `jit` and `vmap`. For one query and several matches use `align_all`, which rotates the
+    query only once.
+
+    Arguments:
+      query: Square image of counts in the orientation of eq. 1, with an even number of cells per side.
+      match: Image of the same size.
+      config: Settings of the comparison.
+
+    Raises:
+      ValueError: If the images are not square or have an odd number of cells.
     """
     peak = jax.tree.map(lambda values: values[0], search(query, jnp.asarray(match)[None], config=config))
     return refined(query, match, peak, config=config)
@@ -72,7 +80,7 @@ def refined(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
-    """The alignment at the peak that `search` has found, on whole cells. Errors are those of `search`."""
+    """Refine a peak of `search` on cells that are not merged. Raises the errors of `search`."""
     second = jnp.where(peak.correlation > 1e-3, peak.second / jnp.maximum(peak.correlation, 1e-6), 1.0)
     query, match = prepared(query, config), prepared(match, config)
     pose, correlation, covariance = _refined(query, match, jnp.stack([peak.x, peak.y, peak.yaw]), config)
@@ -87,7 +95,7 @@ def align_all(
     *,
     config: VerificationConfig = DEFAULT,
 ) -> Alignment:
-    """`align` one query with each of several matches; every field has a leading axis of k."""
+    """Align one query with each of k matches. Every field of the result has a leading axis of k."""
     matches = jnp.asarray(matches)
     peaks = search(query, matches, config=config)
     return jax.lax.map(lambda one: refined(query, *one, config=config), (matches, peaks))
@@ -96,7 +104,7 @@ def align_all(
 def _refined(
     query: Float[Array, "m m"], match: Float[Array, "m m"], start: Float[Array, " 3"], config: VerificationConfig
 ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, "3 3"]]:
-    """The peak near the pose `start`: (x, y, yaw), the correlation there, and the covariance of the pose."""
+    """Peak near the pose `start`: (x, y, yaw), its correlation, and the covariance of the pose."""
     cell_m, step_rad = config.resolution_m, np.float32(np.radians(config.refine_deg) / TURN_STEPS)
     yaws = start[2] + jnp.arange(-TURN_STEPS, TURN_STEPS + 1) * step_rad
     product = spectrum(match[None], cell_m, config) * jnp.conj(spectrum(rotations(query, yaws), cell_m, config))
@@ -135,12 +143,12 @@ def _refined(
 
 
 def _waves(shifts: Float[Array, " k"], frequencies: Float[np.ndarray, " f"]) -> Complex[Array, "k f"]:
-    """The factors that a Fourier series takes at shifts between the cells."""
+    """Factors of a Fourier series at shifts between cells."""
     return jnp.exp(2j * np.pi * shifts[:, None] * jnp.asarray(frequencies, jnp.float32)[None])
 
 
 def _parabola(block: Float[Array, "3 3 3"]) -> tuple[Float[Array, ""], Float[Array, " 3"], Float[Array, "3 3"]]:
-    """Value, gradient and Hessian, at the middle one, of the least-squares parabola through 27 values."""
+    """Value, gradient and Hessian at the centre of the least-squares parabola through 27 values."""
     offsets = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), -1).reshape(27, 3)
     pairs = [(i, j) for i in range(3) for j in range(i, 3)]
     columns = [np.ones(27), *offsets.T, *(offsets[:, i] * offsets[:, j] for i, j in pairs)]

@@ -1,1 +1,1 @@
-"""What a descriptor can come from: the network, and methods without training."""
+"""Methods that compute descriptors: the network, and methods without training."""

@@ -1,4 +1,4 @@
-"""What a method is made of: how it describes scans or images, what it needs for that, how its descriptors compare."""
+"""Interface of a method: how it describes scans or images, its inputs, and how its descriptors are compared."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,64 +10,66 @@ from jaxtyping import Bool, Float, Float32, Int32
 from sglpr_jax.grid import Grid, ImageKind
 
 DescribeFn = Callable[..., Float[Any, "b d"]]
-"""Images of point counts (b, h, w) and, where asked for, maps of classes (b, h, w) in; one descriptor each out."""
+"""Maps images of point counts (b, h, w), and maps of classes (b, h, w) if requested, to one descriptor each."""
 DescribeScanFn = Callable[[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None], Float32[np.ndarray, " d"]]
-"""The points of one scan and, where asked for, their classes in; its descriptor out."""
+"""Maps the points of one scan, and their classes if requested, to its descriptor."""
 DistanceFn = Callable[[Float32[np.ndarray, "q d"], Float32[np.ndarray, "n d"]], Float32[np.ndarray, "q n"]]
-"""The descriptors of queries and of a database in; their distances out, smaller for places more alike."""
+"""Maps the descriptors of queries and of a database to distances. Smaller distances mean more similar places."""
 
 
 @dataclass(frozen=True)
 class HandcraftedMethod:
-    """A method that needs no training, as its file in `handcrafted/` declares it."""
+    """A method without training, as declared by its file in `handcrafted/`."""
 
     name: str
-    """As a command line takes it."""
+    """Name on the command line."""
     source: str
-    """The publication."""
+    """Publication of the method."""
     takes: Literal["images", "points", "labelled points"]
-    """Images (n, h, w) -> (n, d); the points of one scan (n, 3) -> (d,); or points and classes (n,) -> (d,)."""
+    """Input: images (n, h, w), described as (n, d), or the points (n, 3) of one scan, described as (d,). Labelled
+    points have classes (n,)."""
     describe: Callable[..., Float32[np.ndarray, "..."]]
     distance: DistanceFn | None = None
-    """How its descriptors are compared; None: by L2."""
+    """Distance between descriptors. None: L2."""
     describe_ready_made: Callable[..., Float32[np.ndarray, "n d"]] | None = None
-    """What describes ready-made images where it is not `describe`: they may be empty near their borders."""
+    """Replaces `describe` for ready-made images, which may be empty near their borders."""
 
     @property
     def distance_name(self) -> str:
-        """What a descriptor file calls the distance: L2, or by the method's own name."""
+        """Name of the distance in a descriptor file: "l2", or the name of the method."""
         return "l2" if self.distance is None else self.name
 
 
 @dataclass(frozen=True)
 class ImageMethod:
-    """A way to describe images: the function, the window it wants (None: images whole), and what to write about it."""
+    """A method that describes images: the function, its window (None: whole images), and a description of the
+    method."""
 
     describe: DescribeFn
     grid: Grid | None
     about: dict[str, Any]
-    """The method and its configuration, as JSON can hold them."""
+    """Name of the method and its configuration, as JSON values."""
     weights_hash: str = ""
     categories: int = 0
-    """The function wants maps of so many classes too; 0: of none."""
+    """Number of categories of the class maps that the function also needs. 0: no class maps."""
     image: ImageKind = "points"
-    """What raw scans are made into."""
+    """Kind of image that is made of raw scans."""
     field: Bool[np.ndarray, "h w"] | None = None
-    """In which cells the function looks; None: in all."""
+    """Cells that the function uses. None: all cells."""
 
 
 @dataclass(frozen=True)
 class ScanMethod:
-    """A way to describe the points of a scan: the function, whether it wants labels, and how to compare the results."""
+    """A method that describes the points of a scan: the function, whether it needs labels, and its distance."""
 
     describe: DescribeScanFn
     labels: bool
     distance: str
-    """The name of one in `retrieval.distances`."""
+    """Name of a distance in `retrieval.distances`."""
     about: dict[str, Any]
-    """The method, as JSON can hold it."""
+    """Description of the method, as JSON values."""
     weights_hash: str = ""
 
 
 Method = ImageMethod | ScanMethod
-"""Anything that `retrieval.embed` describes a recording by."""
+"""A method that `retrieval.embed` accepts."""

@@ -1,4 +1,4 @@
-"""The names of all methods, for whoever must know them before the methods themselves are imported."""
+"""Names of all methods, for modules that need them before they import the methods."""
 
 from typing import TYPE_CHECKING, Literal
 
@@ -15,15 +15,16 @@ HANDCRAFTED_NAMES = (
     "random",
 )
 METHODS = (NETWORK, *HANDCRAFTED_NAMES)
-"""The names of all methods."""
+"""Names of all methods."""
 UNTRAINED, SHIPPED = "untrained", "shipped"
-"""Beside a network just trained: the same with fresh weights, and the weights that describe where none are named."""
+"""Methods for comparison with a newly trained network: the same network with random weights, and the default
+weights."""
 BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
-"""The methods that stand beside a network just trained, where none are named."""
+"""Default methods for comparison with a newly trained network."""
 
 if TYPE_CHECKING:
     MethodName = BesideName = str
 else:
     MethodName = Literal[METHODS]
     BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED_NAMES)]
-"""One of these names: a command line lists them in its help and refuses others."""
+"""One of these names. Command lines list them in the help and reject others."""

@@ -1,4 +1,4 @@
-"""How SSC lays one scan onto another: a turn and a move of the outlines of their landmarks, in the plane."""
+"""Alignment of two scans in SSC: rotation and translation of their landmark outlines in the plane."""
 
 import jax
 import jax.numpy as jnp
@@ -7,22 +7,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 SECTORS = 360
 WINDOW = np.arange(-10, 10)
-"""Sectors in which a landmark's partner is sought, counted from its own."""
+"""Sectors in which the partner of a landmark is searched, relative to its own sector."""
 GATE_M = 3.0
-"""Partners that are farther apart in x or in y do not count."""
+"""Maximum distance of partners along x and along y, in metres."""
 STEPS = 100
-"""Of the iterative closest point method, at most."""
+"""Maximum number of iterations of the iterative closest point method."""
 STANDSTILL_M = 1e-5
-"""It ends when a step is shorter in x and in y."""
+"""The iteration stops when a step is shorter than this along x and along y, in metres."""
 FARTHEST_MOVE_M = 5.0
-"""A move that is longer in x or in y is taken for a failure."""
+"""Maximum translation along x and along y, in metres. Larger translations count as failures."""
 
 
 def align(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> tuple[Int[Array, ""], Float[Array, "2"]]:
-    """Return by how many degrees to turn the scan `other` clockwise, and then how far to move it (x, y in metres).
+    """Return the clockwise rotation of the scan `other`, in degrees, and then its translation (x, y), in metres.
 
-    Outlines are x and y of the landmark of each sector, in metres; both are 0 where there is none. A move of more than
-    5 m in x or in y is given up: it becomes 0.
+    Outlines are x and y of the landmark in each sector, in metres. Both are 0 in sectors without a landmark. A
+    translation of more than 5 m along x or y is replaced by 0.
     """
     shift = best_shift(jnp.hypot(*query), jnp.hypot(*other))
     turned = turn(jnp.roll(other, -shift, axis=1), shift)
@@ -31,7 +31,8 @@ def align(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> tuple[I
 
 
 def best_shift(query: Float[Array, "360"], other: Float[Array, "360"]) -> Int[Array, ""]:
-    """Return the s of least sum over j of |query[j] - other[j + s]|, distances in metres: of equal ones the first."""
+    """Return the s that minimises the sum over j of |query[j] - other[j + s]|, distances in metres; the first of equal
+    ones."""
     doubled = jnp.concatenate([other, other])
     costs = jax.lax.map(
         lambda s: jnp.abs(query - jax.lax.dynamic_slice(doubled, (s,), (SECTORS,))).sum(), jnp.arange(SECTORS)
@@ -40,18 +41,18 @@ def best_shift(query: Float[Array, "360"], other: Float[Array, "360"]) -> Int[Ar
 
 
 def turn(points: Float[Array, "2 n"], degrees: Int[Array, ""]) -> Float[Array, "2 n"]:
-    """Return x and y after a clockwise turn."""
+    """Return x and y after a clockwise rotation."""
     cos, sin = jnp.cos(jnp.radians(degrees)), jnp.sin(jnp.radians(degrees))
     x, y = points
     return jnp.stack([x * cos + y * sin, y * cos - x * sin])
 
 
 def best_move(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> Float[Array, "2"]:
-    """Return the move of `other` onto `query`, by the iterative closest point method in 2-D.
+    """Return the translation of `other` onto `query`, by the iterative closest point method in 2-D.
 
-    Each landmark of the query is paired with the nearest in the 20 sectors about its own, of any class. The differences
-    of the n pairs within 3 m in x and in y are added up, divided by n + 1, and added to the move, until that is less
-    than 10 um or 100 times.
+    Each landmark of the query is paired with the nearest landmark of any class in the 20 sectors around its own. The
+    step is the sum of the differences of the n pairs within 3 m along x and y, divided by n + 1. Steps are added until
+    one is shorter than 10 um, at most 100 times.
     """
     partners = (np.arange(SECTORS) + WINDOW[:, None]) % SECTORS
     candidates = jnp.moveaxis(other[:, partners], 1, 0)
@@ -74,7 +75,7 @@ def best_move(query: Float[Array, "2 360"], other: Float[Array, "2 360"]) -> Flo
 def _to_nearest(
     points: Float[Array, "2 360"], candidates: Float[Array, "20 2 360"], may_pair: Bool[Array, "20 360"]
 ) -> Float[Array, "2 360"]:
-    """Return how far each point's nearest candidate is behind it in x and y; infinity where it has none."""
+    """Return the offset in x and y from each point's nearest candidate to the point; infinity without a candidate."""
 
     def nearer(best, candidate):
         squared, apart = best
@@ -83,7 +84,7 @@ def _to_nearest(
         return (jnp.minimum(found, squared), jnp.where(found < squared, to_candidate, apart)), None
 
     start = jnp.full(SECTORS, jnp.inf), jnp.full((2, SECTORS), jnp.inf)
-    # One candidate for all sectors at a time: the arrays stay small and the loop is plain arithmetic.
+    # One candidate for all sectors at a time keeps the arrays small and the loop simple.
     return jax.lax.scan(nearer, start, (candidates, may_pair))[0][1]
 
 

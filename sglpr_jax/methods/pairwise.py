@@ -1,4 +1,4 @@
-"""For distances between all pairs of two sets of descriptors: blocks that bound the memory, and all shifts at once."""
+"""Distances between all pairs of two sets of descriptors, in blocks that bound the memory, and for all shifts."""
 
 import os
 from collections.abc import Callable
@@ -23,8 +23,15 @@ def in_blocks(
 ) -> Float32[np.ndarray, "q n"]:
     """Return `compare(prepare(queries), prepare(database))`, computed for at most `block` x `block` pairs at a time.
 
-    The database is prepared by `prepare_database` where that is another function. So many blocks at once as there are
-    `threads` (None: one for each core), where what compares keeps only one busy.
+    Arguments:
+      compare: Returns the distances between prepared queries and prepared rows of the database.
+      queries: Descriptors of the queries.
+      database: Descriptors of the database.
+      block: Maximum number of rows on each side of a block.
+      prepare: Prepares rows for `compare`.
+      prepare_database: Replaces `prepare` for the database.
+      threads: Number of blocks that are computed at the same time. None: the number of cores. More than one helps if
+        `compare` uses only one core.
     """
     out = np.empty((len(queries), len(database)), np.float32)
 
@@ -35,7 +42,7 @@ def in_blocks(
             out[row : row + block, column : column + block] = found
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        list(pool.map(fill, range(0, len(database), block)))  # raises what a block has raised
+        list(pool.map(fill, range(0, len(database), block)))  # raises the errors of the blocks
     return out
 
 

@@ -1,4 +1,4 @@
-"""How LiDAR Iris lays one image onto another: by turn and scale, then by translation (Reddy and Chatterji, 1996)."""
+"""Alignment of two images in LiDAR Iris: first rotation and scale, then translation (Reddy and Chatterji, 1996)."""
 
 import functools
 from typing import NamedTuple
@@ -10,15 +10,15 @@ from jax.scipy.ndimage import map_coordinates
 from jaxtyping import Array, Complex, Float, Float32, Int
 
 LARGEST_SCALE = 1.8
-"""A greater one is taken for the inverse of the right one."""
+"""Maximum scale. A larger one is considered the inverse of the true scale."""
 NEAR = 2
-"""Cells about the peak whose centre of mass is the peak's place."""
+"""Distance from the peak, in cells, within which its centre of mass is computed."""
 SMALL = float(np.finfo(np.float32).eps)
-"""Added to the square of an amplitude before dividing by it: faint frequencies count for less."""
+"""Added to squared amplitudes before division, so that faint frequencies have less weight."""
 
 
 class Spectra(NamedTuple):
-    """What is compared of an image: itself, its spectrum, and that of its log-polar spectrum."""
+    """An image, its spectrum, and the spectrum of its log-polar amplitudes."""
 
     image: Float[Array, "*n rows columns"]
     spectrum: Complex[Array, "*n rows frequencies"]
@@ -27,7 +27,7 @@ class Spectra(NamedTuple):
 
 @jax.jit
 def spectra(images: Float[Array, "n rows columns"]) -> Spectra:
-    """Return the spectra of images; rows and columns are even."""
+    """Return the spectra of images with an even number of rows and columns."""
     filtered = _high_pass(*images.shape[1:])
     places = list(_log_polar_places(*images.shape[1:]))
 
@@ -40,11 +40,13 @@ def spectra(images: Float[Array, "n rows columns"]) -> Spectra:
 
 @jax.jit
 def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
-    """Return by how many columns to roll each query to the right so that it lies on each image of the database.
+    """Return two estimates of the shift to the right, in columns, that aligns each query with each image of the
+    database.
 
-    The query is first turned and scaled as the log-polar spectra say. The first is the peak's place, rounded towards 0.
-    The second is the same for the image of the database rolled by half its columns, and back: the peak is the same, but
-    it is rounded from the other side, and may be cut by the border.
+    The query is first rotated and scaled according to the log-polar spectra. The first estimate is the position of the
+    correlation peak, rounded towards 0. For the second, the database image is rolled by half its columns, and the
+    result is corrected for the roll. The peak is the same, but it is rounded in the opposite direction and may be cut
+    by the border.
     """
 
     def shifts(query, other):
@@ -59,7 +61,7 @@ def column_shifts(queries: Spectra, database: Spectra) -> Int[Array, "q n 2"]:
 
 
 def turn_and_scale(query: Spectra, other: Spectra) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return by how many radians to turn the query, and by how much it is larger than the other."""
+    """Return the rotation that aligns the query, in radians, and the size of the query relative to the other image."""
     rows, columns = query.image.shape
     correlation = _correlation(query.log_polar, other.log_polar, (rows, columns))
     down, right = _peak(correlation, (rows // 2, columns // 2))
@@ -71,16 +73,16 @@ def turn_and_scale(query: Spectra, other: Spectra) -> tuple[Float[Array, ""], Fl
 def _correlation(
     a: Complex[Array, "rows frequencies"], b: Complex[Array, "rows frequencies"], shape: tuple[int, int]
 ) -> Float[Array, "rows columns"]:
-    """Return the phase correlation, whose peak lies as far from the corner as b has to move onto a."""
+    """Return the phase correlation. The offset of its peak from the corner is the shift that moves b onto a."""
     cross = a * jnp.conj(b)
     size = jnp.abs(cross)
     return jnp.fft.irfft2(cross * size / (size**2 + SMALL), shape)
 
 
 def _peak(surface: Float[Array, "rows columns"], rolled: tuple[int, int]) -> Float[Array, "2"]:
-    """Return how far down and right of the middle the peak's centre of mass lies, with the opposite sign.
+    """Return the offset of the middle, down and right, from the centre of mass of the peak.
 
-    That is in the surface `rolled` by so many rows and columns, at whose borders the peak is cut.
+    The offset is measured in the surface rolled by `rolled` rows and columns. Borders of this surface cut the peak.
     """
     shape = np.array(surface.shape)
     peak = jnp.stack(jnp.divmod(_argmax(surface), surface.shape[1]))
@@ -95,14 +97,14 @@ def _peak(surface: Float[Array, "rows columns"], rolled: tuple[int, int]) -> Flo
 
 
 def _argmax(values: Float[Array, "rows columns"]) -> Int[Array, ""]:
-    """Return what `jnp.argmax` does, in an eighth of its time on a CPU."""
+    """Return the same as `jnp.argmax`, in an eighth of its time on a CPU."""
     return jnp.where(values.ravel() == values.max(), jnp.arange(values.size), values.size).min()
 
 
 def _turned_and_scaled(
     image: Float[Array, "rows columns"], angle: Float[Array, ""], scale: Float[Array, ""]
 ) -> Float[Array, "rows columns"]:
-    """Return the image, turned about its middle and made smaller; 0 where it was not."""
+    """Return the image, rotated about its middle and shrunk by `scale`, with zeros outside."""
     rows, columns = image.shape
     down, right = jnp.meshgrid(jnp.arange(rows) - rows // 2, jnp.arange(columns) - columns // 2, indexing="ij")
     cos, sin = scale * jnp.cos(angle), scale * jnp.sin(angle)
@@ -111,13 +113,15 @@ def _turned_and_scaled(
 
 
 def _log_base(rows: int, columns: int) -> float:
-    """Return the growth of the radius from column to column of a log-polar picture: the last but one is the corner."""
+    """Return the ratio of the radii of neighbouring columns of a log-polar image. The corner follows the last
+    column."""
     return float(np.hypot(rows // 2, columns // 2) ** (1 / columns))
 
 
 @functools.cache
 def _log_polar_places(rows: int, columns: int) -> Float32[np.ndarray, "2 rows columns"]:
-    """Return row and column of each cell of a log-polar picture: its rows are half a turn, its columns radii."""
+    """Return row and column of each cell of a log-polar image. Its rows are angles over half a revolution, its columns
+    radii."""
     angle = np.pi / 2 + np.pi * np.arange(rows)[:, None] / rows
     radius = _log_base(rows, columns) ** np.arange(columns)[None, :]
     return np.stack([rows // 2 + radius * np.cos(angle), columns // 2 + radius * np.sin(angle)]).astype(np.float32)
@@ -125,7 +129,8 @@ def _log_polar_places(rows: int, columns: int) -> Float32[np.ndarray, "2 rows co
 
 @functools.cache
 def _high_pass(rows: int, columns: int) -> Float32[np.ndarray, "rows columns"]:
-    """Return the gain (1 - c) (2 - c) of each frequency, c being the product of two half cosines: 0 in the middle."""
+    """Return the gain (1 - c) (2 - c) of each frequency, where c is the product of two half cosines. It is 0 in the
+    middle."""
     down, right = (np.cos(np.pi * (np.arange(size) / size - 0.5)) for size in (rows, columns))
     product = np.outer(down, right)
     return ((1 - product) * (2 - product)).astype(np.float32)

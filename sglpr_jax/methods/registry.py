@@ -1,4 +1,4 @@
-"""Every method that a descriptor can come from: the network, and the handcrafted methods."""
+"""All methods: the network and the handcrafted methods."""
 
 import dataclasses
 import functools
@@ -29,15 +29,20 @@ def method_named(name: str, weights: str | None, recording: Recording) -> Method
 
 
 def methods_named(names: Sequence[str], weights: str | None, recording: Recording) -> dict[str, Method]:
-    """Return these methods by name; before them the network, where weights or nothing at all are named."""
+    """Return the methods with these names. The network comes first if weights are given, or if nothing is given."""
     described_first = [NETWORK] if weights is not None or not names else []
     return {name: method_named(name, weights, recording) for name in dict.fromkeys([*described_first, *names])}
 
 
 def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:
-    """Return a method to stand beside a network just trained, of `BesideName`: on images it has the same window.
+    """Return a method for comparison with a newly trained network. On images it has the same window.
 
-    `untrained` is the same network with fresh weights made from `seed`, `shipped` the `DEFAULT_WEIGHTS`.
+    Arguments:
+      trained: Weights of the trained network.
+      name: One of `BesideName`. `untrained` is the same network with random weights from `seed`, `shipped` has the
+        `DEFAULT_WEIGHTS`.
+      recording: Recording to describe.
+      seed: Seed of the random weights.
     """
     if name == UNTRAINED:
         return network(init(jax.random.key(seed + 1), config=trained.config))
@@ -47,7 +52,7 @@ def method_beside(trained: Params, name: str, recording: Recording, *, seed: int
 
 
 def network(params: Params) -> ImageMethod:
-    """Return the method that describes by `params`."""
+    """Return the method that describes images with `params`."""
     config = params.config
     about = {"method": NETWORK, "model": dataclasses.asdict(config)}
     describe_views = functools.partial(describe, params)
@@ -63,9 +68,9 @@ def network(params: Params) -> ImageMethod:
 
 
 def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
-    """Return a handcrafted method for the scans of `recording`: on points, on whole images, or on images of `grid`.
+    """Return a handcrafted method for the scans of `recording`. It takes points, whole images, or images of `grid`.
 
-    Raises ValueError for a name that is not in `HANDCRAFTED`.
+    Raises ValueError if the name is not in `HANDCRAFTED`.
     """
     if name not in HANDCRAFTED:
         raise ValueError(f"no handcrafted method {name!r}; there are {', '.join(HANDCRAFTED)}")

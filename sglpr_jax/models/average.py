@@ -1,4 +1,4 @@
-"""The average of the weights of several trainings, one begun with another's: often better than each of them."""
+"""Average of the weights of related trainings, which is often better than each of them."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,11 +13,18 @@ from sglpr_jax.models.whitening import unwhitened
 
 
 def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) -> Params:
-    """Every parameter as the mean of what it is in `models`, which count in proportion to `shares`, or alike.
+    """Average the weights of models with equal configurations.
 
-    Only good for trainings of which one began with another's weights: in others the same channel means other things.
-    Whitening layers are left out, for each was fitted to descriptors that are no more; fit one anew. Raises ValueError
-    for models that differ in more than that, or shares that are not one of 0 or more for each, one of them above 0.
+    The average is useful only if one training started from the weights of another. In independent trainings the same
+    channel has different meanings. Whitening layers are removed, because each was fitted to the descriptors of its own
+    model; fit a new one.
+
+    Arguments:
+      models: Models whose configurations are equal except for the whitening layer.
+      shares: Contribution of each model, 0 or more and at least one above 0. By default all models contribute equally.
+
+    Raises:
+      ValueError: If the configurations differ, or if the shares are invalid.
 
     Example:
       average([load("runs/before"), load("runs/after")], shares=[0.3, 0.7])
@@ -42,4 +49,4 @@ def _require_same_model(one: Params, other: Params) -> None:
     if different:
         name = different[0]
         found = f"{name.replace('/', '.')} {a.get(name)} and {b.get(name)}"
-        raise ValueError(f"expected weights of one model to average, found two, with {found}")
+        raise ValueError(f"expected models with equal configurations, found {found}")

@@ -1,4 +1,4 @@
-"""A model's configuration from the plain values of a JSON file, every one of which must fit its field."""
+"""Conversion of the plain values of a JSON file to a model configuration, with a check of every field."""
 
 import types
 import typing
@@ -9,13 +9,17 @@ from sglpr_jax.fields import check_value, field_types, is_config, require
 from sglpr_jax.models.config import ModelConfig
 
 ADDED_LATER = {"head.means": (), "head.whiten": False, "backbone.fine": (), "backbone.stem.fine": ()}
-"""Fields that files handed out before do not have, and what such files mean."""
+"""Values of fields that are missing in files of earlier versions."""
 
 
 def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
-    """What `dataclasses.asdict` was made of; every field must be there.
+    """Rebuild a configuration from the output of `dataclasses.asdict`.
 
-    Raises ValueError naming `source`, the field, what was expected and what was found.
+    Every field is required, except the fields in `ADDED_LATER`.
+
+    Raises:
+      ValueError: If a field is missing, unknown or invalid. The message names `source`, the field, and the expected and
+        the found value.
     """
     try:
         return _read(ModelConfig, values, field="")
@@ -24,7 +28,7 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 
 
 def _read(annotation: Any, value: Any, field: str) -> Any:
-    """The value of a field: dictionaries become dataclasses, lists tuples and whole numbers floats where one is due."""
+    """Converts a value to a field's type: dictionaries to dataclasses, lists to tuples, whole numbers to floats."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if is_config(annotation):
         return _read_dataclass(annotation, value, field)
@@ -54,7 +58,7 @@ def _read_dataclass(expected: Any, value: Any, field: str) -> Any:
     read = {name: _read(annotations[name], one, prefix + name) for name, one in value.items()}
     try:
         return expected(**read)
-    except ValueError as error:  # the fields do not go together
+    except ValueError as error:  # the fields are inconsistent
         raise ValueError(f"{prefix.removesuffix('.')}{': ' if prefix else ''}{error}") from error
 
 
@@ -63,7 +67,7 @@ def _differing(value: dict[str, Any], annotations: dict[str, Any]) -> tuple[set[
 
 
 def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:
-    """The member of a union that a value belongs to; of several configurations the one of its `kind`."""
+    """The member of a union that fits a value. Several configurations are distinguished by their `kind`."""
     configs: dict[str, Any] = {member.kind: member for member in members if is_config(member)}
     if not configs:
         return next(member for member in members if member is not types.NoneType)

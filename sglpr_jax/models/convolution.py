@@ -1,10 +1,10 @@
-"""The convolution of the backbones and heads: XLA's going forward, products going backward.
+"""Convolution of the backbones and heads: XLA's in the forward pass, matrix products in the backward pass.
 
-Of few channels it is a product going forward too, and of many, on a CPU, Winograd's, of a quarter of the
-multiplications.
+Two cases use products in the forward pass, too. Convolutions with few input channels use one matrix product. On a CPU,
+convolutions with many channels use Winograd's method, which needs a quarter of the multiplications.
 
-On a CPU XLA computes the gradient of a kernel by a slow general loop where the step runs in chunks (27 to 70 times the
-time of the products), and elsewhere it takes up to 1.8 times as long as they do.
+On a CPU, XLA computes the gradient of a kernel by a slow general loop if the step runs in chunks. The loop takes 27 to
+70 times as long as the products. Otherwise XLA takes up to 1.8 times as long as the products.
 """
 
 import functools
@@ -20,32 +20,33 @@ from sglpr_jax.models.winograd import AT_ONCE as COLUMNS_AT_ONCE
 from sglpr_jax.models.winograd import winograd
 
 FEW_INPUTS = 16
-"""Numbers of a column of pixels under the kernel up to which a product takes half the time of XLA's convolution."""
+"""Maximum kernel height times channels for which a matrix product takes half the time of XLA's convolution."""
 AT_ONCE = 4
-"""Columns of the result that one row of such a product gives."""
+"""Number of output columns in one row of the matrix product for few channels."""
 MANY_CHANNELS = 32
-"""Of the image and of the result: from here on sums of pixels cost less than the multiplications that they spare."""
+"""Minimum number of input and of output channels for which sums of pixels cost less than the multiplications they
+save."""
 MANY_PIXELS = 1536
-"""Of all images together: below it sums of the kernel cost as much."""
+"""Minimum number of pixels of all images together. Below it, the sums of the kernel cost as much as they save."""
 
 
 class Convolution(nn.Module):
-    """A square convolution, He-initialised; the columns of a `circular` image go around.
+    """Square convolution with He initialisation. With `circular=True` the columns wrap around.
 
-    Patches side by side (kernel = stride) need no border, others PyTorch's of kernel // 2.
+    The border is kernel // 2 pixels wide, as in PyTorch. If the stride equals the kernel size, there is no border.
     """
 
     features: int
     size: int = 3
-    """Edge of the kernel."""
+    """Edge of the kernel, in pixels."""
     strides: tuple[int, int] = (1, 1)
-    """Along rows and columns."""
+    """Strides along rows and columns."""
     circular: bool = False
     kernel_init: Callable = nn.initializers.he_normal()
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.features}"]:
-        """The last row or column counts as a whole stride where the stride does not divide them."""
+        """Convolves images. With a border, an odd kernel gives ceil(size / stride) rows and columns."""
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = jnp.asarray(weight(self, "kernel", self.kernel_init, shape), x.dtype)
         bias = weight(self, "bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)
@@ -57,9 +58,9 @@ class Convolution(nn.Module):
 def convolve(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
 ) -> Float[Array, "b _ _ f"]:
-    """XLA's convolution of the image with its border, or a product or more (`_as_products`) for few channels and many.
+    """Convolve images that are extended by a border, with the derivative of matrix products.
 
-    Its derivative is that of the products.
+    Few input channels and many channels are computed by `_as_products`, all others by XLA's convolution.
     """
     if _few_inputs(kernel) or _saves_multiplications(x, kernel, strides):
         return _as_products(x, kernel, strides, circular)
@@ -87,9 +88,10 @@ def _as_products(
 def _saves_multiplications(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int]
 ) -> bool:
-    """On a GPU cuDNN chooses for itself, and bfloat16 has no digits to spare for sums of pixels.
+    """Whether Winograd's method saves time at sufficient precision.
 
-    An exported program, for any number of images and any machine, leaves it to XLA.
+    On a GPU, cuDNN chooses its own method. The precision of bfloat16 is too low for sums of pixels. An exported program
+    accepts any number of images on any machine, so the choice is left to XLA.
     """
     images, height, width, _ = x.shape
     suits = len(kernel) == 3 and strides[1] == 1 and width % COLUMNS_AT_ONCE == 0
@@ -102,12 +104,12 @@ def _saves_multiplications(
 def as_product(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
 ) -> Float[Array, "b _ _ f"]:
-    """The same convolution as one matrix product.
+    """Compute the same convolution as one matrix product.
 
-    Where the stride leaves no column out, the product gives what each column adds to itself and to its neighbours, of
-    the k pixels above each other; else it is of whole patches, k times the copies. Of few channels it is of patches
-    wide enough for some results side by side, by a kernel that is mostly zeros: a product of so little is bound by
-    what it reads and writes.
+    With column stride 1 and an odd kernel, the product gives the contributions of each column, of k pixels above each
+    other, to itself and to its neighbours. Otherwise it multiplies whole patches, which copies k times the data.
+    For few channels, the patches are wide enough for several results side by side, and the kernel is mostly zeros. The
+    time of this small product is limited by memory access.
     """
     size, border, f = len(kernel), _border(kernel, strides), kernel.shape[-1]
     x = jnp.pad(x, ((0, 0), (border, border), (0, 0), (0, 0)))
@@ -130,32 +132,32 @@ def _few_inputs(kernel: Float[Array, "k k c f"]) -> bool:
 
 
 def _side_by_side_kernels(kernel: Float[Array, "k k c f"], n: int, stride: int) -> Float[Array, "k _ c _"]:
-    """One kernel that gives the results of n columns, each of which sees its own part of a wider patch."""
+    """Kernel for the results of n columns. Each result uses its own part of a wider patch."""
     beyond = (n - 1) * stride
     parts = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, stride)]
     return jnp.concatenate(parts, axis=-1)
 
 
 def _border(kernel: Float[Array, "k k c f"], strides: tuple[int, int]) -> int:
-    """Patches side by side need none."""
+    """Width of the border. Adjacent patches without overlap have no border."""
     size = len(kernel)
     return 0 if strides == (size, size) else size // 2
 
 
 def _columns_around(x: Float[Array, "b h w c"], border: int, circular: bool) -> Float[Array, "b h _ c"]:
-    """Columns more at the left and the right: those of the other side, or zeros."""
+    """Adds columns on the left and on the right: those of the opposite side, or zeros."""
     sides = ((0, 0), (0, 0), (border, border), (0, 0))
     return jnp.pad(x, sides, mode="wrap") if circular else jnp.pad(x, sides)
 
 
 def _side_by_side(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
-    """The pixels along the axis that the kernel meets at each place, as channels."""
+    """Stacks the pixels along the axis that the kernel covers at each position, as channels."""
     met = (x.shape[axis] - size) // stride * stride + 1
     return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + met, stride, axis) for i in range(size)], axis=-1)
 
 
 def _moved(x: Float[Array, "b h w c"], by: int, circular: bool) -> Float[Array, "b h w c"]:
-    """Columns moved to the right; those that leave come in again, or zeros do."""
+    """Shifts the columns to the right. Columns that leave the image enter on the other side, or zeros enter."""
     if circular:
         return jnp.roll(x, by, axis=2)
     as_it_is = (0, 0, 0)

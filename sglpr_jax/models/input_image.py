@@ -1,4 +1,4 @@
-"""From an image of counts to what the network sees: rescaled, blank beyond the field of view, polar if asked for."""
+"""Conversion of an image of counts to network input: scaling, field of view and, if configured, polar resampling."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +11,14 @@ from sglpr_jax.models.polar import to_polar
 
 CLIP_COUNT = 10.0
 FEWEST_CELLS = 2
-"""An image shows a place from so many cells with points on. All empty images have one descriptor."""
+"""Minimum number of cells with points in an image that shows a place. All empty images have the same descriptor."""
 
 
 def prepare(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w {config.channels}"]:
-    """Point counts as network input: rescaled as `config.counts` says, blank where it does not see."""
+    """Convert point counts to network input.
+
+    Counts are scaled as in `config.counts`, and cells outside the field of view are blank.
+    """
     image = _counts(bev, config)
     if config.counts == "log1p":
         image = jnp.log1p(image)
@@ -29,7 +32,7 @@ def prepare(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h 
 
 
 def _counts(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h w"]:
-    """The counts of an image. Those of a density image are fractions: bytes are its grey values, integers no image."""
+    """Counts of an image as float32. A density image has floats or uint8 grey values; other integers are invalid."""
     if config.image == "density" and not jnp.issubdtype(bev.dtype, jnp.floating):
         if bev.dtype != jnp.uint8:
             raise ValueError(
@@ -41,20 +44,20 @@ def _counts(bev: Num[Array, "b h w"], config: ModelConfig) -> Float[Array, "b h 
 
 
 def backbone_view(image: Float[Array, "b h w c"], config: ModelConfig) -> Float[Array, "b p q c"]:
-    """An image as the backbone sees it: polar where the configuration says so, of the type that it computes in."""
+    """Convert an image to the input of the backbone: polar if configured, and in the data type of the computation."""
     seen = to_polar(image, config.grid, *config.polar) if config.polar else image
     return seen.astype(config.compute)
 
 
 def field_of_view(config: ModelConfig) -> Bool[np.ndarray, "1 h w"]:
-    """Which cells the network sees: all, or those inside the largest circle, but not those of the vehicle itself."""
+    """Return the mask of cells that the network sees: within the field and at least `blind_m` from the sensor."""
     grid, distance = config.grid, cell_distance(config.grid)
     seen = (distance < grid.resolution_m * min(grid.height, grid.width) / 2) | (config.field == "square")
     return (seen & (distance >= config.blind_m))[None]
 
 
 def cell_distance(grid: Grid) -> Float[np.ndarray, "h w"]:
-    """How far the middle of each cell lies from the sensor, metres."""
+    """Return the distance of each cell's centre from the sensor, in metres."""
     down, right = np.mgrid[: grid.height, : grid.width]
     cells = np.hypot(down - (grid.height - 1) / 2, right - (grid.width - 1) / 2)
     return (grid.resolution_m * cells).astype(np.float32)

@@ -1,7 +1,7 @@
-"""The linear layer, layer norm and initial values that all modules share, set as the PyTorch reference has them.
+"""Linear layer, layer norm and initial values of all modules, configured as in the PyTorch reference.
 
-Weights are float32. Layers multiply in the type of their input, so that a network computes in the type of its image
-(`ModelConfig.compute`) but where a module asks for float32.
+Weights are float32. Layers multiply in the data type of their input. A network therefore computes in the type of its
+image (`ModelConfig.compute`), except where a module requests float32.
 """
 
 import functools
@@ -16,9 +16,12 @@ from jaxtyping import Array, Float
 
 
 def weight(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> Any:
-    """A weight of the module that calls it. ValueError for one of another shape.
+    """Return a weight of the calling module, and create it at initialisation.
 
-    Flax's `param` traces `init` in every call to know the shape: half of the time that tracing a network takes.
+    Flax's `param` traces `init` in every call to find the shape. This takes half of the time of tracing a network.
+
+    Raises:
+      ValueError: If the weight has another shape.
     """
     if not module.has_variable("params", name):
         return module.param(name, init, shape)
@@ -29,9 +32,9 @@ def weight(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...])
 
 
 class Linear(nn.Module):
-    """A dense layer with weights N(0, 0.02) and bias 0, computed as one product of two matrices.
+    """Dense layer with weights N(0, 0.02) and bias 0, computed as one product of two matrices.
 
-    XLA's CPU backend is three times slower at the same product with the leading axes left apart.
+    XLA's CPU backend is three times slower if the leading axes are kept separate.
     """
 
     features: int
@@ -40,7 +43,7 @@ class Linear(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
-        """The same linear map of every vector of `c` channels."""
+        """Applies the same linear map to every vector of `c` channels."""
         c = x.shape[-1]
         kernel = weight(self, "kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
         y = product(x.reshape(-1, c), jnp.asarray(kernel))
@@ -51,11 +54,11 @@ class Linear(nn.Module):
 
 @jax.custom_jvp
 def product(x: Float[Array, "n c"], matrix: Float[Array, "c f"]) -> Float[Array, "n f"]:
-    """The product of many rows and a matrix.
+    """Multiply many rows by a matrix.
 
-    The gradient of the matrix sums over the rows, and XLA's CPU backend rearranges whichever factor comes first before
-    it does: up to half of the time where that is the wider one, which it would be for a matrix of more rows than
-    columns. The barrier keeps XLA from exchanging them again.
+    The gradient of the matrix is a sum over the rows. XLA's CPU backend rearranges the first factor of this sum, which
+    takes up to half of the time if the first factor is the wider one. For a matrix with more rows than columns, the
+    derivative therefore exchanges the factors. The barrier keeps XLA from exchanging them again.
     """
     return x @ matrix
 
@@ -72,21 +75,21 @@ def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]):
 
 
 def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
-    """The exact GELU, x times the normal distribution function, by erf: `jax.nn.gelu` takes the costlier erfc."""
+    """Exact GELU: x times the normal distribution function. It uses erf; `jax.nn.gelu` uses the slower erfc."""
     return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
 
 
 class LayerNorm(nn.Module):
-    """Layer norm over channels with PyTorch's epsilon; within it everything is float32.
+    """Layer norm over channels with PyTorch's epsilon, computed in float32.
 
-    The arithmetic of Flax's, whose initial values would be traced in every call (see `weight`).
+    The arithmetic is that of Flax, whose layer would trace the initial values in every call (see `weight`).
     """
 
     epsilon: float = 1e-5
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
-        """Keeps the type of its input."""
+        """The output has the data type of the input."""
         scale = jnp.asarray(weight(self, "scale", nn.initializers.ones, x.shape[-1:]))
         bias = jnp.asarray(weight(self, "bias", nn.initializers.zeros, x.shape[-1:]))
         rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
@@ -97,7 +100,7 @@ class LayerNorm(nn.Module):
 def layer_norm(
     x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"], epsilon: float
 ) -> Float[Array, "n c"]:
-    """Layer norm of every row. Its derivative is written out: XLA makes more passes over the rows for JAX's."""
+    """Normalise every row. The derivative is explicit, because XLA passes over the rows more often for JAX's."""
     mean, per_deviation = _statistics(x, epsilon)
     return (x - mean) * (per_deviation * scale[None]) + bias[None]
 
@@ -113,7 +116,7 @@ def _(epsilon: float, primals: tuple[Array, Array, Array], tangents: tuple[Array
 
 
 def _statistics(x: Float[Array, "n c"], epsilon: float) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
-    """The mean of each row, and 1 / its standard deviation."""
+    """Mean and reciprocal standard deviation of each row."""
     mean = _mean(x)
     variance = jnp.maximum(_mean(x * x) - mean * mean, 0.0)
     return mean, jax.lax.rsqrt(variance + epsilon)
@@ -124,15 +127,15 @@ def _mean(x: Float[Array, "n c"]) -> Float[Array, "n 1"]:
 
 
 torch_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
-"""PyTorch's default for convolutions, U(-1/sqrt(fan_in), 1/sqrt(fan_in))."""
+"""PyTorch's default initialisation of convolutions, U(-1/sqrt(fan_in), 1/sqrt(fan_in))."""
 
 NORM_FLOOR = 1e-12
 
 
 def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:
-    """Scales vectors along `axis` to length 1.
+    """Scale vectors along `axis` to length 1.
 
-    A vector shorter than 1e-12 has no direction: it becomes 0, with gradient 0 (the plain quotient's is NaN at 0).
+    A vector shorter than 1e-12 becomes 0 with gradient 0. The gradient of the plain quotient is NaN at 0.
     """
     square = jnp.sum(x * x, axis=axis, keepdims=True)
     has_direction = square > NORM_FLOOR**2

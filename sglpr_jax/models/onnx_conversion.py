@@ -1,4 +1,4 @@
-"""Convert weights to an ONNX model: `python -m sglpr_jax.models.onnx_conversion WEIGHTS FILE`. See `program.onnx`."""
+"""Converts weights to an ONNX model: `python -m sglpr_jax.models.onnx_conversion WEIGHTS FILE`. See `program.onnx`."""
 
 import sys
 from pathlib import Path
@@ -13,7 +13,7 @@ OPSET = 21
 
 
 def convert(weights: Path, file: Path) -> None:
-    """Write the ONNX model of `describe`, with the description of its input among its metadata."""
+    """Write `describe` as an ONNX model, with the description of its input in the metadata."""
     params = load(weights)
     grid = params.config.grid
     model = to_onnx(

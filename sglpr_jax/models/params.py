@@ -1,4 +1,4 @@
-"""Weights together with the model they belong to."""
+"""Weights together with the configuration of their model."""
 
 from typing import Any
 
@@ -9,8 +9,8 @@ from sglpr_jax.models.config import ModelConfig
 
 @flax.struct.dataclass
 class Params:
-    """What every call takes: a pytree of weights whose static part is `config`."""
+    """Parameters of a model: a pytree of weights whose static part is `config`."""
 
     weights: Any
-    """Arrays in nested dictionaries; a layer's name in the model leads to its weights."""
+    """Nested dictionaries of arrays, with the names of the model's layers as keys."""
     config: ModelConfig = flax.struct.field(pytree_node=False)

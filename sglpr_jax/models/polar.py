@@ -1,7 +1,8 @@
-"""Resampling between the Cartesian image and a polar one, in which a rotation about the sensor is a shift.
+"""Resampling between Cartesian and polar images. In a polar image, a rotation about the sensor is a shift.
 
-The polar image has `radii` rows, the innermost first, and `sectors` columns, counter-clockwise from x. It covers the
-largest circle in the grid. Both directions are bilinear with fixed weights: a value is a weighted sum of four others.
+The polar image has `radii` rows, the innermost first, and `sectors` columns, counter-clockwise from the x axis. It
+covers the largest circle in the grid. Both directions are bilinear with fixed weights: each value is a weighted sum of
+four others.
 """
 
 import functools
@@ -16,7 +17,7 @@ from sglpr_jax.grid import Grid
 
 
 class Taps(NamedTuple):
-    """What a resampling reads: for each of n values, k pixels of the flat image and their weights."""
+    """Source pixels of a resampling: k pixels of the flat image and their weights for each of n values."""
 
     pixel: np.ndarray  # (k, n) int32
     weight: np.ndarray  # (k, n) float32
@@ -25,7 +26,7 @@ class Taps(NamedTuple):
 def to_polar(
     image: Float[Array, "b h w c"], grid: Grid, radii: int, sectors: int
 ) -> Float[Array, "b {radii} {sectors} c"]:
-    """The image read along radii and sectors."""
+    """Sample the image along radii and sectors."""
     radius_cells = min(grid.height, grid.width) / 2
     radius = (np.arange(radii) + 0.5) * (radius_cells / radii)
     angle = (np.arange(sectors) + 0.5) * (2 * np.pi / sectors)
@@ -36,10 +37,10 @@ def to_polar(
 
 
 def from_polar(polar: Float[Array, "b r s c"], grid: Grid) -> Float[Array, "b {grid.height} {grid.width} c"]:
-    """The polar image read at every cell of the grid; zero beyond the circle.
+    """Sample the polar image at every cell of the grid. Cells outside the circle are zero.
 
-    Differentiable in reverse mode only: its gradient is written as a reading too, because with the scatter that JAX
-    makes of a gather's gradient, forward and backward took six times as long on a CPU.
+    The function is differentiable in reverse mode only. Its gradient is written as a gather, too. With the scatter of
+    JAX's own gradient, the forward and backward passes took six times as long on a CPU.
     """
     radii, sectors = polar.shape[1:3]
     down, right = np.mgrid[: grid.height, : grid.width]
@@ -65,7 +66,7 @@ def _flat(image: Float[Array, "b h w c"]) -> Float[Array, "b h*w c"]:
 
 
 def _bilinear(row: np.ndarray, column: np.ndarray, height: int, width: int) -> Taps:
-    """The four pixels around each place. Rows must lie within the image; columns go around."""
+    """The four pixels around each position. Rows must lie within the image; columns wrap around."""
     top, left = np.minimum(np.floor(row), height - 2).astype(np.int32), np.floor(column).astype(np.int32)
     down, right = row - top, column - left
     corners = [(dy, dx) for dy in (0, 1) for dx in (0, 1)]
@@ -75,7 +76,7 @@ def _bilinear(row: np.ndarray, column: np.ndarray, height: int, width: int) -> T
 
 
 def _transposed(taps: Taps, pixels: int) -> Taps:
-    """Who reads each pixel: the taps with which the gradient reads back; as many as the most-read pixel has readers."""
+    """Taps of the gradient: the readers of each pixel, padded to the largest number of readers."""
     used = taps.weight > 0
     reader = np.broadcast_to(np.arange(taps.pixel.shape[1]), taps.pixel.shape)[used]
     pixel, weight = taps.pixel[used], taps.weight[used]
@@ -89,6 +90,6 @@ def _transposed(taps: Taps, pixels: int) -> Taps:
 
 
 def _read(flat: Float[Array, "b p c"], taps: Taps) -> Float[Array, "b n c"]:
-    """The weighted sums that the taps describe."""
+    """Weighted sums of the pixels in `taps`."""
     read = (flat[:, pixel] * weight[None, :, None] for pixel, weight in zip(*taps, strict=True))
     return functools.reduce(jnp.add, read)

@@ -1,4 +1,4 @@
-"""Named model sizes, so that `init(key, preset="small")` works wherever the package is installed."""
+"""Named model configurations, so that `init(key, preset="small")` works wherever the package is installed."""
 
 import dataclasses
 
@@ -22,35 +22,35 @@ _SMALL = ModelConfig(
 )
 
 MODELS: dict[str, ModelConfig] = {
-    # The paper's model, its head read literally: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
+    # The paper's model with a literal head: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
     "paper": _PAPER,
-    # A third of that head's cost: the first convolution undoes the x4 expansion in one step.
+    # A head of a third of the cost: its first convolution reverses the x4 expansion in one step.
     "paper-head-b": dataclasses.replace(_PAPER, head=HeadConfig(kernels=(4, 3, 3), strides=(4, 2, 2))),
-    # The paper says "projection radius 11.2 m", which its own eq. 1 gives only with cells of 0.1 m.
+    # The paper says "projection radius 11.2 m". Its equation 1 gives this radius only with cells of 0.1 m.
     "paper-11m": dataclasses.replace(_PAPER, grid=Grid(resolution_m=0.1)),
-    # Every stage of the paper's Swin-Unet and its window, from cells of 0.4 m: it reads the ready-made KITTI images.
+    # All stages of the paper's Swin-Unet and its window, with cells of 0.4 m as in the ready-made KITTI images.
     "paper-112": dataclasses.replace(
         _PAPER, grid=Grid(resolution_m=0.4, height=112, width=112), image="density", backbone=SwinConfig(patch=2)
     ),
-    # Trains on two CPU cores within the hour; its window is that of the ready-made KITTI images (+-25.6 m).
+    # Trains in less than an hour on two CPU cores. Its window is that of the ready-made KITTI images (+-25.6 m).
     "small": _SMALL,
-    # With convolutions in front, which learn the semantic map better (docs/results.md); a step takes longer.
+    # Has convolutions in front, which improve the semantic map (docs/results.md). A step takes longer.
     "small-stem": dataclasses.replace(_SMALL, backbone=dataclasses.replace(_SMALL_SWIN, stem=(16, 32, 64))),
-    # A convolutional backbone that a rotation of the scan only shifts.
+    # Convolutional backbone whose features shift when the scan is rotated.
     "rings": dataclasses.replace(
         _SMALL,
         image="density",
         backbone=RingConfig(),
         head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
     ),
-    # The paper's parts in a form that follows a rotation: circular convolutions, then windows, CBAM, NetVLAD.
+    # The paper's parts in a form that follows rotations: circular convolutions, then windows, CBAM and NetVLAD.
     "sglpr": dataclasses.replace(
         _SMALL,
         image="density",
         backbone=SglprConfig(),
         head=HeadConfig(tap="tokens", channels=(96, 128, 160), strides=(2, 1, 1), means=(1, 2, 1)),
     ),
-    # For tests: every part of the model, next to no arithmetic.
+    # For tests: every part of the model, with little computation.
     "tiny": ModelConfig(
         grid=Grid(resolution_m=1.6, height=32, width=32),
         backbone=SwinConfig(embed_dim=8, depths=(1, 1), heads=(1, 2), window=4, drop_path=0.1),
@@ -60,7 +60,11 @@ MODELS: dict[str, ModelConfig] = {
 
 
 def model_preset(name: str) -> ModelConfig:
-    """The model of that name. Raises ValueError with the names there are."""
+    """Return the model configuration with this name.
+
+    Raises:
+      ValueError: If there is no preset with this name. The message lists all names.
+    """
     if name not in MODELS:
-        raise ValueError(f"no model preset {name!r}; there are {', '.join(MODELS)}")
+        raise ValueError(f"expected a model preset ({', '.join(MODELS)}), found {name!r}")
     return MODELS[name]

@@ -1,4 +1,4 @@
-"""`describe` with its weights inside, as a program for runtimes that do not know this package: StableHLO and ONNX."""
+"""Export of `describe` with its weights as a program for runtimes without this package: StableHLO and ONNX."""
 
 import contextlib
 import dataclasses
@@ -39,24 +39,33 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
 NEEDS = "pip install 'sglpr-jax[export]'"
 NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
-"""Without its own requirements: they ask for an older Orbax than this package's, and the conversion uses none."""
+"""jax2onnx is installed without its requirements. They include an Orbax that is older than this package's and that the
+conversion does not use."""
 
 
 def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:
-    """Write `describe` as a program into `folder`, whole or not at all; one that is there is replaced.
+    """Export `describe` with its weights as a program.
 
-    The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`, which says how
-    a scan becomes the program's input, and the program's SHA-256. Both take any number of images (b, h, w) in float32
-    and return (b, d).
+    The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`. The latter
+    describes how a scan becomes the program's input, and holds the SHA-256 of the program. Both formats take any number
+    of images (b, h, w) in float32 and return descriptors (b, d).
 
-    `stablehlo` is what `jax.export.deserialize` reads, for CPU, CUDA and TPU; it needs the package flatbuffers. `onnx`
-    needs jax2onnx. Raises ImportError, with the command that installs it, where one is missing; FileExistsError where
-    the folder holds other files; ValueError for another format and for a model that reads labels too.
+    Arguments:
+      params: Model that reads images only.
+      folder: New folder, or one with an earlier program, which is replaced. It is written completely or not at all.
+      format: `stablehlo` for `jax.export.deserialize` on CPU, CUDA and TPU (requires flatbuffers), or `onnx` (requires
+        jax2onnx).
+
+    Raises:
+      ImportError: If a required package is missing. The message has the command that installs it.
+      FileExistsError: If the folder holds other files.
+      ValueError: If the format is unknown, or if the model reads labels.
+      RuntimeError: If the conversion to ONNX fails.
     """
     check_value(format, ProgramFormat, "format")
     folder = Path(folder)
     if params.config.head.reads_labels:
-        raise ValueError(f"expected a model that reads images alone, found one that reads {params.config.head.input}")
+        raise ValueError(f"expected a model that reads images only, found one that reads {params.config.head.input}")
     check_holds_only(folder, (*(f"describe.{one}" for one in get_args(ProgramFormat)), CONFIG_FILE, INPUT_FILE))
     params = for_places(params)
     program = stablehlo(params) if format == "stablehlo" else onnx(params)
@@ -64,17 +73,17 @@ def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -
         new.mkdir()
         (new / f"describe.{format}").write_bytes(program)
         write_json(new / CONFIG_FILE, dataclasses.asdict(params.config))
-        checksum = {"sha256": hashlib.sha256(program).hexdigest()}  # for whoever runs it: runtimes look at nothing
+        checksum = {"sha256": hashlib.sha256(program).hexdigest()}  # for users: runtimes do not check it
         write_json(new / INPUT_FILE, input_description(params.config) | checksum)
     return folder
 
 
 def stablehlo(params: Params) -> bytes:
-    """`describe` of these weights as `jax.export` serialises it, with a symbolic number of images."""
+    """Return `describe` with these weights as serialised by `jax.export`, for any number of images."""
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"StableHLO needs the package flatbuffers: {NEEDS}") from error
+        raise ImportError(f"StableHLO requires the package flatbuffers: {NEEDS}") from error
     grid = params.config.grid
     shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
     program = jax.jit(lambda bev: describe(params, bev))
@@ -85,7 +94,7 @@ def stablehlo(params: Params) -> bytes:
 
 @contextlib.contextmanager
 def _no_source_locations() -> Iterator[None]:
-    """Leave out of programs where the files of their author lie: the same weights give the same bytes anywhere."""
+    """Omits source file locations from programs, so that the same weights give the same bytes on every machine."""
     limit = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, limit)
     jax.config.update(limit, 0)
@@ -96,9 +105,9 @@ def _no_source_locations() -> Iterator[None]:
 
 
 def onnx(params: Params) -> bytes:
-    """`describe` of these weights as an ONNX model, converted in a process of its own.
+    """Return `describe` with these weights as an ONNX model.
 
-    The conversion leaves JAX in a state in which the model cannot be called any more.
+    The conversion runs in a separate process, because the model cannot be called any more after it.
     """
     with tempfile.TemporaryDirectory() as temporary:
         weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
@@ -109,12 +118,12 @@ def onnx(params: Params) -> bytes:
         if ended.returncode:
             last = (ended.stderr.strip().splitlines() or ["no message"])[-1]
             error = ImportError if "ModuleNotFoundError" in last else RuntimeError
-            raise error(f"the conversion to ONNX failed ({last}); it needs: {NEEDS_ONNX}")
+            raise error(f"the conversion to ONNX failed ({last}); it requires: {NEEDS_ONNX}")
         return program.read_bytes()
 
 
 def input_description(config: ModelConfig) -> dict[str, str]:
-    """How a scan becomes the program's input, in words and formulas, for whoever writes that in another language."""
+    """Describe in words and formulas how a scan becomes the program's input, for users of other languages."""
     grid = config.grid
     return {
         "input": f"bev: float32 [b, {grid.height}, {grid.width}]",
@@ -135,7 +144,7 @@ def _counts_of_points(grid: Grid) -> dict[str, str]:
 
 
 def _counts_of_voxels(grid: Grid) -> dict[str, str]:
-    """What `density_bev`, `even_cells` and `centre_crop` do."""
+    """Steps of `density_bev`, `even_cells` and `centre_crop`."""
     u, v = grid.width // 2, grid.height // 2
     return {
         "voxels": f"points with |x| < {REACH_M}, |y| < {REACH_M}, {FLOOR_M} < z < {CEILING_M} are sorted into voxels, "

@@ -1,4 +1,4 @@
-"""SG-LPR whole (figure 2): a shared backbone, the place head, and the segmentation head of training time."""
+"""The whole SG-LPR network (figure 2): a shared backbone, the place head, and the segmentation head for training."""
 
 from typing import Any, NamedTuple
 
@@ -20,18 +20,18 @@ from sglpr_jax.models.presets import model_preset
 
 
 class Outputs(NamedTuple):
-    """What one pass gives: descriptors, logits where asked for, and every map on the way."""
+    """Outputs of one forward pass."""
 
     descriptor: Float[Array, "b d"]
-    """Of length 1; 256 numbers in the paper."""
+    """Descriptors of length 1, with 256 numbers in the paper."""
     logits: Any
-    """(b, h, w, classes), or None where they were not asked for or the model has no segmentation head."""
+    """(b, h, w, classes), or None if no logits were requested or the model has no segmentation head."""
     intermediates: dict[str, Array]
-    """Every map by name."""
+    """Every intermediate map by name."""
 
 
 class SGLPR(nn.Module):
-    """The network on prepared images. A pure function of (weights, image): no part of it sees the rest of the batch."""
+    """Network on prepared images: a pure function of weights and image, independent of the rest of the batch."""
 
     config: ModelConfig
 
@@ -44,9 +44,10 @@ class SGLPR(nn.Module):
         segment: int = 1,
         train: bool = False,
     ) -> Outputs:
-        """`segment` n: semantic logits of every n-th image, where there is such a head; 0: of none.
+        """Computes descriptors and semantic logits.
 
-        `labels` are for a place head that reads them, which stands alone: it has no backbone (table 6).
+        Logits are computed for every `segment`-th image, or for no image if it is 0 or if there is no segmentation
+        head. `labels` are for a place head that reads labels. This head has no backbone (table 6).
         """
         config = self.config
         place_head = PlaceHead(config.head, circular=config.polar is not None, name="place_head")
@@ -67,7 +68,7 @@ class SGLPR(nn.Module):
 
 
 def _decode_every(n: int, backbone: Backbone, seen: Seen) -> Float[Array, "b p q c"]:
-    """The pixels of every n-th image."""
+    """Pixels of every n-th image."""
     finer = [one[::n] for one in seen.finer]
     return backbone.decode(Seen(seen.features[::n], finer, named={}))
 
@@ -78,15 +79,24 @@ def describe(
     bev: Num[Array, "*b h w"],
     labels: Int[Array, "... h w"] | None = None,
 ) -> Float[Array, "*b d"]:
-    """The descriptor of each bird's-eye-view image, as `scan_image` makes it: 256 numbers of unit length.
+    """Compute the descriptor of each bird's-eye-view image.
 
-    The weights that ship want density images (`params.config.image`); `rasterize` makes images for models that want
-    counts of points. Any leading axes; works under jit, vmap and grad; computes nothing of the segmentation head. The
-    distance between two descriptors is the dissimilarity of their places (equation 2). A head that reads labels
-    (`head.input`) needs the maps of classes too. A density image is float counts 0 to 10, or the uint8 grey values 0 to
-    255 of its file. Raises ValueError for images of another size than `params.config.grid`, for density images of other
-    integers, and for labels that are missing or that nothing reads. An empty image has a descriptor too: see
+    The distance between two descriptors is the dissimilarity of their places (equation 2). The function works under
+    jit, vmap and grad. It does not compute the segmentation head. An empty image has a descriptor, too: see
     `is_describable`.
+
+    Arguments:
+      params: Model. The shipped weights require density images (`params.config.image`).
+      bev: Images with any leading axes, from `scan_image`. For models of point counts, `rasterize` also computes them.
+        A density image has float counts from 0 to 10, or the uint8 grey values from 0 to 255 of its file.
+      labels: Class maps, if the head reads labels (`head.input`).
+
+    Returns:
+      Descriptors of length 1. The shipped weights give 256 numbers.
+
+    Raises:
+      ValueError: If the images have another size than `params.config.grid`, if a density image has another integer
+        type, if labels are missing, or if the head does not read labels.
     """
     if 0 in bev.shape[:-2]:
         return jnp.zeros((*bev.shape[:-2], params.config.head.descriptor_size))
@@ -95,9 +105,9 @@ def describe(
 
 @jax.jit
 def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b"]:
-    """Whether each image shows something where the model looks: finite counts, and at least 2 cells that hold points.
+    """Whether each image shows a place: all counts are finite, and at least 2 cells in the field of view hold points.
 
-    The flag beside `describe`, which gives every empty image the same descriptor. Works under jit and vmap.
+    `describe` gives every empty image the same descriptor. The function works under jit and vmap.
     """
     seen = jnp.where(field_of_view(params.config)[0], bev > 0, False)
     enough = seen.sum((-2, -1), dtype=jnp.int32) >= FEWEST_CELLS
@@ -105,9 +115,13 @@ def is_describable(params: Params, bev: Num[Array, "*b h w"]) -> Bool[Array, "*b
 
 
 def segment(params: Params, bev: Num[Array, "*b h w"]) -> Float[Array, "*b h w k"]:
-    """The semantic logits of each image, from the head that training uses. Raises ValueError where there is none."""
+    """Compute the semantic logits of each image with the segmentation head of the training.
+
+    Raises:
+      ValueError: If the model has no segmentation head.
+    """
     if not params.config.segments:
-        raise ValueError("expected a model with a segmentation head, found one without: it was made for places alone")
+        raise ValueError("expected a model with a segmentation head, found one without (for place recognition only)")
     return forward(params, bev).logits.reshape(*bev.shape, -1)
 
 
@@ -119,11 +133,20 @@ def forward(
     key: Array | None = None,
     segment: int = 1,
 ) -> Outputs:
-    """Everything at once, for training and pictures: descriptors, logits and named maps, leading axes made one.
+    """Compute descriptors, logits and named maps in one pass, for training and pictures.
 
-    With a `key` it is the training pass, in which stochastic depth drops residual branches. `segment` n gives the
-    logits of every n-th image; with 0 the segmentation head does not exist, and a model without one gives none. Raises
-    ValueError as `describe` does.
+    The leading axes of the images are merged into one.
+
+    Arguments:
+      params: Model.
+      bev: Images, as in `describe`.
+      labels: Class maps, as in `describe`.
+      key: Random key. With a key this is the training pass, in which stochastic depth drops residual branches.
+      segment: Interval between images with logits: n for every n-th image, 0 for no logits. A model without a
+        segmentation head gives no logits.
+
+    Raises:
+      ValueError: In the same cases as `describe`, or if there are no images.
     """
     config = params.config
     grid = config.grid
@@ -147,19 +170,22 @@ def forward(
 
 
 def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:
-    """Labels must be there exactly where the head reads them."""
+    """Raises ValueError if the head reads labels and they are missing, or if it reads no labels and they are given."""
     found = "none" if labels is None else f"shape {labels.shape}"
     if config.head.reads_labels and (labels is None or labels.shape != shape):
         raise ValueError(
-            f"this model describes a place from {config.head.input}: expected maps of classes of shape {shape}, "
+            f"the place head of this model reads {config.head.input}: expected class maps of shape {shape}, "
             f"one for each image, found {found}"
         )
     if labels is not None and not config.head.reads_labels:
-        raise ValueError(f"this model describes a place from {config.head.input}: expected no labels, found {found}")
+        raise ValueError(f"the place head of this model reads {config.head.input}: expected no labels, found {found}")
 
 
 def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None) -> Params:
-    """Fresh weights for a named preset, or for a `config` of your own; only those that it needs."""
+    """Initialise the weights of a named preset, or of `config` if it is given.
+
+    Only the weights that the configuration needs are created.
+    """
     config = model_preset(preset) if config is None else config
     image = jnp.zeros((1, config.grid.height, config.grid.width, config.channels))
     labels = jnp.zeros(image.shape[:-1], jnp.int32) if config.head.reads_labels else None

@@ -1,22 +1,24 @@
-"""Weights that ship inside the package: a folder for each in sglpr_jax/weights, found by its name."""
+"""Weights that ship inside the package. Each has a folder in sglpr_jax/weights and is found by its name."""
 
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1] / "weights"
 DEFAULT_WEIGHTS = "sglpr"
-"""What describes where no weights are named."""
+"""Name of the default weights."""
 
 
 def shipped_weights() -> tuple[str, ...]:
-    """The names of the weights that came with the package; each folder has a model card, README.md."""
+    """Return the names of the weights that ship with the package. Each folder has a model card, README.md."""
     return tuple(sorted(path.name for path in FOLDER.glob("[!._]*") if path.is_dir()))
 
 
 def weights_folder(weights: Path | str) -> Path:
-    """The folder that is meant: the name of shipped weights is theirs, everything else a path.
+    """Return the folder of shipped weights, given their name, or of other weights, given their path.
 
-    A folder of one's own with such a name is `./NAME`, as a string. Raises FileNotFoundError, with the names there are,
-    where there is neither.
+    A name of shipped weights takes precedence. For your own folder with the same name, pass the string `./NAME`.
+
+    Raises:
+      FileNotFoundError: If neither exists. The message lists the names.
     """
     folder = FOLDER / weights if str(weights) in shipped_weights() else Path(weights)
     if not folder.is_dir():

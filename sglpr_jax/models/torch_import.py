@@ -1,4 +1,4 @@
-"""Weights of the published PyTorch Swin-Unet and Swin-T, by their names, from safetensors."""
+"""Import of the published PyTorch Swin-Unet and Swin-T from safetensors files, by the names of the weights."""
 
 import dataclasses
 import re
@@ -39,25 +39,26 @@ _RULES = (
     (r"/(kernel|scale)$", "/weight"),
     (r"/", "."),
 )
-"""Our names to PyTorch's, each rule applied in turn."""
+"""Replacements that convert the weight names of this project to PyTorch's, applied in order."""
 
 _BUFFERS = ("relative_position_index", "attn_mask")
-"""Tables that PyTorch stores with the weights; here they follow from the configuration."""
+"""Tables that PyTorch stores with the weights. Here they follow from the configuration."""
 
 _PREFIXES = ("module.", "swin_unet.")
-"""Of a data-parallel model, and of Swin-Unet's outer class."""
+"""Name prefixes of data-parallel models and of Swin-Unet's outer class."""
 
 PICKLES = (".pth", ".pt", ".bin", ".ckpt")
-"""Endings of PyTorch's own checkpoints."""
+"""File name extensions of PyTorch's own checkpoints."""
 
 _SWIN_T_ONLY = re.compile(r"head\.(weight|bias)|layers\.\d+\.(blocks\.\d+|downsample)\..+")
-"""What ImageNet's Swin-T has and a Swin-Unet may lack: the classifier, and a deeper third stage."""
+"""Weights of ImageNet's Swin-T that a Swin-Unet may lack: the classifier, and a deeper third stage."""
 
 
 class SwinTImport(NamedTuple):
-    """Parameters after an import of Swin-T, and what became of every weight.
+    """Parameters after an import of Swin-T, and a list of what happened to every weight.
 
-    `copied` and `kept` are our names: taken from the checkpoint, and left as they were. `unused` are the checkpoint's.
+    `copied` and `kept` are names of this project: weights from the checkpoint, and unchanged weights. `unused` are
+    names of the checkpoint.
     """
 
     params: Params
@@ -67,9 +68,11 @@ class SwinTImport(NamedTuple):
 
 
 def import_swin_unet(params: Params, path: Path | str) -> Params:
-    """`params` with backbone, expansion and segmentation head from a Swin-Unet checkpoint; the place head stays.
+    """Load the backbone, the expansion and the segmentation head from a Swin-Unet checkpoint; the place head is kept.
 
-    Raises FileNotFoundError, or ValueError where the file is no safetensors, or names or shapes are not the model's.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a safetensors file, or if names or shapes differ from the model.
     """
     try:
         weights = from_torch_names(read_checkpoint(path), params.config)
@@ -79,10 +82,13 @@ def import_swin_unet(params: Params, path: Path | str) -> Params:
 
 
 def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
-    """`params` with the encoder from an ImageNet Swin-T, its blocks copied to the mirrored decoder stages as well.
+    """Load the encoder from an ImageNet Swin-T, and copy its blocks to the mirrored decoder stages.
 
-    So Swin-Unet's own code does it. Weights of another shape, and those Swin-T has no counterpart of, stay as they
-    were. Raises FileNotFoundError, or ValueError where the file is no safetensors, or nothing fits.
+    Swin-Unet's own code does the same. Weights of another shape, and weights without a counterpart in Swin-T, are kept.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a safetensors file, or if no weight fits.
     """
     try:
         return from_swin_t(read_checkpoint(path), params)
@@ -91,19 +97,25 @@ def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
-    """The weights of a .safetensors file by name, float32, without buffers and prefixes.
+    """Read the weights of a .safetensors file by name, as float32, without buffers and prefixes.
 
-    A .pth is a pickle, which is a program: none is opened. Raises FileNotFoundError, or ValueError for other files.
+    A .pth file is a pickle, which can run code, so it is not opened.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If it is another kind of file.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
+        raise FileNotFoundError(f"{path}: expected a checkpoint, found no file")
     try:
         content = safetensors.numpy.load_file(path)
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
         pickled = path.suffix in PICKLES or zipfile.is_zipfile(path)
         found = "a pickle of PyTorch's, which this project does not open" if pickled else f"none ({in_short(error)})"
-        raise ValueError(f"expected a .safetensors file, found {found}; docs/guides/weights.md has the way") from error
+        raise ValueError(
+            f"expected a .safetensors file, found {found}; to convert it see docs/guides/weights.md"
+        ) from error
     named = {_without_prefixes(name): value for name, value in content.items() if not name.endswith(_BUFFERS)}
     return {name: value.astype(np.float32) for name, value in named.items()}
 
@@ -111,15 +123,17 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
 def from_torch_names(
     state: Mapping[str, np.ndarray], config: ModelConfig, *, input_channels: int = 1
 ) -> dict[str, Any]:
-    """A whole Swin-Unet by its PyTorch names, as the tree of weights without the place head.
+    """Convert a whole Swin-Unet with PyTorch's names to the tree of weights without the place head.
 
-    An embedding of 3 channels is summed into 1 where `input_channels` is 1: PyTorch repeats a grey image 3 times.
-    Raises ValueError naming the first weight that is missing, unknown or of the wrong shape.
+    With `input_channels=1`, an embedding of 3 channels is summed into 1, because PyTorch repeats a grey image 3 times.
+
+    Raises:
+      ValueError: If a weight is missing, unknown or of the wrong shape. The message names the first one.
     """
     expected = _expected_shapes(config, input_channels)
     unknown = set(state) - {torch_name(name) for name in expected}
     if unknown:
-        raise ValueError(f"not a weight of Swin-Unet: {min(unknown)} ({len(unknown)} such names)")
+        raise ValueError(f"not a weight of Swin-Unet: {min(unknown)} ({len(unknown)} unknown names)")
     weights = {}
     for name, shape in expected.items():
         source = torch_name(name)
@@ -127,12 +141,12 @@ def from_torch_names(
             raise ValueError(f"expected a weight {source}, found none")
         weights[name] = _flax_layout(name, state[source], input_channels)
         if weights[name].shape != shape:
-            raise ValueError(f"{source}: expected shape {shape} (in Flax's order), found {weights[name].shape}")
+            raise ValueError(f"{source}: expected shape {shape} (in Flax's axis order), found {weights[name].shape}")
     return as_tree(weights)
 
 
 def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
-    """A Swin-T by its PyTorch names into `params`; see `import_swin_t`."""
+    """Copy a Swin-T with PyTorch's names into `params`; see `import_swin_t`."""
     expected = _expected_shapes(params.config, 1)
     last = len(_swin(params.config).depths) - 1
     weights = by_name(params.weights)
@@ -155,14 +169,17 @@ def from_swin_t(state: Mapping[str, np.ndarray], params: Params) -> SwinTImport:
 
 
 def torch_name(name: str) -> str:
-    """PyTorch's name of a weight: `backbone/encoder_0/block_1/mlp_in/kernel` is `layers.0.blocks.1.mlp.fc1.weight`."""
+    """Return PyTorch's name of a weight.
+
+    For `backbone/encoder_0/block_1/mlp_in/kernel` it is `layers.0.blocks.1.mlp.fc1.weight`.
+    """
     for pattern, replacement in _RULES:
         name = re.sub(pattern, replacement, name)
     return name
 
 
 def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of all weights that a Swin-Unet shares with the model: all but the place head's."""
+    """Shapes of all weights that a Swin-Unet shares with the model: all except those of the place head."""
     _swin(config)
     image = jax.ShapeDtypeStruct((1, config.grid.height, config.grid.width, input_channels), np.float32)
     shapes = jax.eval_shape(SGLPR(config).init, jax.random.key(0), image)["params"]
@@ -170,16 +187,16 @@ def _expected_shapes(config: ModelConfig, input_channels: int) -> dict[str, tupl
 
 
 def _swin(config: ModelConfig) -> SwinConfig:
-    """The backbone, where it is a Swin-Unet; ValueError where it is another, or there is none."""
+    """The configuration of a Swin-Unet backbone. Raises ValueError if the model has another backbone or none."""
     if not config.head.reads_features:
-        raise ValueError(f"expected a model with a backbone, found one that describes a place from {config.head.input}")
+        raise ValueError(f"expected a model with a backbone, found a place head that reads {config.head.input}")
     if not isinstance(config.backbone, SwinConfig):
         raise ValueError(f"expected a model with the backbone 'swin', found {config.backbone.kind!r}")
     return config.backbone
 
 
 def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarray:
-    """PyTorch's (out, in, ...) as Flax's (..., in, out); the bias tables are (rows, heads) in both."""
+    """Converts PyTorch's (out, in, ...) to Flax's (..., in, out). The bias tables are (rows, heads) in both."""
     if name == "backbone/patch_embed/projection/kernel" and input_channels == 1:
         weight = weight.sum(1, keepdims=True)
     if name == "segmentation_head/kernel":
@@ -197,6 +214,6 @@ def _without_prefixes(name: str) -> str:
 
 def _check_swin_t(copied: list[str], unknown: list[str]) -> None:
     if unknown:
-        raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} such names)")
+        raise ValueError(f"not a weight of Swin-T: {unknown[0]} ({len(unknown)} unknown names)")
     if not copied:
-        raise ValueError("no weight has a counterpart of its shape; Swin-T fits 96 channels and window 7")
+        raise ValueError("expected weights that fit the model, found none; Swin-T fits 96 channels and window 7")

@@ -1,4 +1,4 @@
-"""Weights by name: which ones a model has, parts of them, and one number for all of them."""
+"""Weights by name: shapes and parts of a model's weights, partial restore, and checksums."""
 
 import dataclasses
 import functools
@@ -16,32 +16,35 @@ from sglpr_jax.models.sglpr import init
 
 SEGMENTATION_LAYERS = ("segmentation_head", "narrow", "detail")
 PIXEL_LAYERS = ("expand", "decoder")
-"""For the segmentation head, and for a place head that is told to look there (`head.tap`)."""
+"""Layers for the segmentation head, and for a place head with the tap `pixels` (`head.tap`)."""
 
 
 def by_name(weights: Any) -> dict[str, Any]:
-    """A flat dictionary of weights, named like `backbone/encoder_0/block_1/mlp_in/kernel`."""
+    """Flatten weights to a dictionary with names like `backbone/encoder_0/block_1/mlp_in/kernel`."""
     return flax.traverse_util.flatten_dict(weights, sep="/")
 
 
 def as_tree(named: dict[str, Any]) -> Any:
-    """The inverse of `by_name`."""
+    """Rebuild the nested dictionaries from the output of `by_name`."""
     return flax.traverse_util.unflatten_dict(named, sep="/")
 
 
 @functools.cache
 def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
-    """The shape of every weight that the configuration asks for; nothing is computed."""
+    """Return the shape of every weight of a configuration, without computing the weights."""
     fresh = jax.eval_shape(lambda: init(jax.random.key(0), config=config))
     return {name: leaf.shape for name, leaf in by_name(fresh.weights).items()}
 
 
 def graft(given: Params, fresh: Params) -> Params:
-    """`fresh` with the values of `given` wherever that has them: to train on from weights handed out.
+    """Replace the weights of `fresh` by those of `given` that exist (partial restore), to continue a training.
 
-    A kernel may see more channels in `fresh` than in `given`: it begins with 0 for those that come last. So a larger
-    network begins by computing what the smaller one does. A segmentation head is left out where `fresh` has none.
-    Raises ValueError where `given` has another weight that `fresh` has not, or one of another shape.
+    A kernel of `fresh` may have more input channels than that of `given`. The additional channels come last and start
+    at 0, so a larger network initially computes the same as the smaller one. The segmentation head of `given` is
+    dropped if `fresh` has none.
+
+    Raises:
+      ValueError: If `given` has another weight that `fresh` lacks, or one of another shape.
     """
     given = given if fresh.config.segments else for_places(given)
     all_of_them, values = by_name(fresh.weights), by_name(given.weights)
@@ -49,13 +52,13 @@ def graft(given: Params, fresh: Params) -> Params:
         wanted = all_of_them[name].shape if name in all_of_them else None
         if wanted is None or not _may_become(wanted, value.shape):
             expected = "no such weight" if wanted is None else wanted
-            raise ValueError(f"cannot begin with these weights: {name} has shape {value.shape}, expected {expected}")
+            raise ValueError(f"cannot start from these weights: {name} has shape {value.shape}, expected {expected}")
     values = {name: _with_zeros(value, all_of_them[name].shape) for name, value in values.items()}
     return dataclasses.replace(fresh, weights=as_tree(all_of_them | values))
 
 
 def _may_become(wanted: tuple[int, ...], found: tuple[int, ...]) -> bool:
-    """Whether the shapes are equal, or kernels' that differ in how many channels they see: the last axis but one."""
+    """Whether the shapes are equal, or of kernels where `wanted` has more input channels (last axis but one)."""
     if wanted == found:
         return True
     same = wanted[:-2] + wanted[-1:] == found[:-2] + found[-1:]
@@ -68,33 +71,34 @@ def _with_zeros(value: Any, shape: tuple[int, ...]) -> Any:
 
 
 def describing(params: Params) -> Any:
-    """The layers that `describe` computes with: no segmentation head and nothing that feeds it alone."""
+    """Return the layers that `describe` uses, without the segmentation head and layers that only serve it."""
     left_out = SEGMENTATION_LAYERS if params.config.head.tap == "pixels" else SEGMENTATION_LAYERS + PIXEL_LAYERS
     return {name: layer for name, layer in params.weights.items() if name not in left_out}
 
 
 def for_places(params: Params) -> Params:
-    """The part that `describe` computes with, to hand out."""
+    """Return the part of a model that `describe` uses, for publication."""
     if not params.config.segments:
         return params
     return Params(describing(params), dataclasses.replace(params.config, categories=0))
 
 
 def learning_segmentation_alone(params: Params) -> Params:
-    """The same model, of whose weights those alone have a gradient that `describe` does without."""
+    """Return the same model with gradients only for the weights that `describe` does not use."""
     return dataclasses.replace(params, weights=params.weights | jax.lax.stop_gradient(describing(params)))
 
 
 def weights_hash(params: Params) -> str:
-    """SHA-256 over names, shapes and values of what `describe` computes with: it says which weights made a descriptor.
+    """Return the SHA-256 of names, shapes, types and values of the weights that `describe` uses.
 
-    Weights that differ in the segmentation head alone, or have none, make the same descriptors and have the same hash.
+    It identifies the weights that made a descriptor. Models that differ only in the segmentation head make the same
+    descriptors and have the same hash.
     """
     return hash_of(by_name(describing(params)))
 
 
 def hash_of(named: Mapping[str, Any]) -> str:
-    """SHA-256 over names, shapes, types and values of arrays, in the order of their names."""
+    """Return the SHA-256 of names, shapes, types and values of arrays, in the order of their names."""
     digest = hashlib.sha256()
     for name, leaf in sorted(named.items()):
         digest.update(f"{name} {leaf.shape} {leaf.dtype}".encode())

@@ -1,4 +1,4 @@
-"""Weights on disk: a folder with config.json and model.safetensors, so that they never travel without their model."""
+"""Weights on disk: a folder with config.json and model.safetensors, so that weights and configuration stay together."""
 
 import dataclasses
 import hashlib
@@ -20,24 +20,33 @@ from sglpr_jax.models.weights import as_tree, by_name, hash_of, weight_shapes
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 CHECKSUM = "sha256"
-"""Under this name the header of the weights has the `hash_of` what is stored."""
+"""Key in the header of the weights file for the `hash_of` the stored values."""
 CHECKED_FOR = "config_sha256"
-"""Under this name it has the checksum of the configuration whose weights they are: to ask the model what it expects
-takes half a second, and need not be done each time."""
+"""Key in the header for the checksum of the configuration. If it matches, the expected shapes need not be computed,
+which saves half a second."""
 STORED = ("F32", "F16")
-"""The types that weights are stored in, as safetensors calls them."""
+"""Data types of stored weights, with their safetensors names."""
 
 
 def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
-    """Write weights and their configuration into `folder`, whole or not at all; those that are there are replaced.
+    """Write weights and their configuration to a folder.
 
-    With `half` as float16, in half the room. Raises OSError, naming `folder`, where they cannot be written or it holds
-    other files; ValueError, naming the weight, where one is not of its configuration's shape, no float32, not finite or
-    too large for float16.
+    Arguments:
+      params: Model.
+      folder: New folder, or one with earlier weights, which are replaced. It is written completely or not at all.
+      half: Store the weights as float16, in half the space.
+
+    Returns:
+      The folder.
+
+    Raises:
+      OSError: If the folder cannot be written or holds other files. The message names the folder.
+      ValueError: If a weight is not float32, is not finite, has another shape than the configuration requires, or is
+        too large for float16. The message names the weight.
     """
     folder = Path(folder)
     check_holds_only(folder, (CONFIG_FILE, WEIGHTS_FILE))
-    # safetensors writes an array's memory as it lies, so a transposed view would come back scrambled.
+    # safetensors writes memory in its physical order, so a transposed view would be read in the wrong order.
     values = {name: np.asarray(leaf, order="C") for name, leaf in by_name(params.weights).items()}
     _check_shapes({name: leaf.shape for name, leaf in values.items()}, params.config, source=folder)
     for name, leaf in values.items():
@@ -54,11 +63,17 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
 
 
 def load(weights: Path | str) -> Params:
-    """Weights that ship with the package, by name (`shipped_weights()`), or what `save` wrote, by folder; float32.
+    """Load weights that ship with the package, by name, or weights written by `save`, by folder.
 
-    A training run's directory works too: its `weights` folder is read. A name goes before a folder of the same name,
-    which is "./NAME". Raises FileNotFoundError when there is neither or a file is missing, ValueError when it is
-    damaged or the weights are not those of the configuration.
+    For the directory of a training run, its `weights` folder is read. The values are converted to float32.
+
+    Arguments:
+      weights: A name from `shipped_weights()`, or a folder. Names take precedence; a folder with the same name is
+        "./NAME".
+
+    Raises:
+      FileNotFoundError: If neither exists, or if a file is missing.
+      ValueError: If a file is damaged, or if the weights do not belong to the configuration.
     """
     folder = weights_folder(weights)
     if (folder / "weights").is_dir():
@@ -74,7 +89,7 @@ def load(weights: Path | str) -> Params:
 
 
 def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
-    """The weights as they are stored, once they are known to be those that the configuration asks for, and whole."""
+    """Reads the stored weights and checks their names, shapes, types, values and checksum."""
     try:
         with safetensors.safe_open(path, framework="np") as file:
             about = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
@@ -91,9 +106,9 @@ def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
         ) from error
     for name, leaf in values.items():
         _check_finite(name, leaf, source=path)
-    if metadata and metadata.get(CHECKSUM) != (found := hash_of(values)):  # files handed out before have no metadata
+    if metadata and metadata.get(CHECKSUM) != (found := hash_of(values)):  # files of earlier versions have none
         said = metadata.get(CHECKSUM, "none")
-        raise ValueError(f"{path}: expected weights of SHA-256 {said}, as its header says, found {found}")
+        raise ValueError(f"{path}: expected weights with the SHA-256 of the header, {said}, found {found}")
     return values
 
 
@@ -102,24 +117,24 @@ def _hash_of(config: ModelConfig) -> str:
 
 
 def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, source: Path) -> None:
-    """Raise ValueError, naming a weight that differs, unless they are all those that the configuration asks for."""
+    """Raises ValueError if names or shapes differ from the configuration. The message names one such weight."""
     expected = weight_shapes(config)
     if expected != found:
         name = min(set(expected.items()) ^ set(found.items()))[0]
         raise ValueError(
             f"{source}: expected the weights of its configuration, {name} of shape "
-            f"{expected.get(name, 'none (no such weight)')}, found {found.get(name, 'none (missing)')}"
+            f"{expected.get(name, 'none (unknown weight)')}, found {found.get(name, 'none (missing)')}"
         )
 
 
 def _check_finite(name: str, leaf: np.ndarray, *, source: Path) -> None:
     broken = leaf.size - int(np.isfinite(leaf).sum())
     if broken:
-        raise ValueError(f"{source}: expected finite weights, found {broken} of {leaf.size} others in {name}")
+        raise ValueError(f"{source}: expected finite weights, found {broken} of {leaf.size} not finite in {name}")
 
 
 def _halved(name: str, leaf: np.ndarray) -> np.ndarray:
     largest = np.finfo(np.float16).max
     if np.abs(leaf).max(initial=0) > largest:
-        raise ValueError(f"{name}: expected weights up to {largest} to be written as float16, found larger ones")
+        raise ValueError(f"{name}: expected values up to {largest}, the limit of float16, found larger values")
     return leaf.astype(np.float16)

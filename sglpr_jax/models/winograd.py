@@ -1,8 +1,8 @@
-"""A 3 x 3 convolution by a quarter of the multiplications: Winograd's minimal filtering, F(4, 3), along both axes.
+"""3 x 3 convolution with a quarter of the multiplications: Winograd's minimal filtering F(4, 3) along both axes.
 
-Six sums of six neighbouring pixels are multiplied with six sums of the kernel's three, and four sums of the products
-are four pixels of the result (Lavin and Gray 2016). Rows that have a stride, or whose number is no multiple of four, go
-without: half of the multiplications. The derivative needs as few.
+Six sums of six neighbouring pixels are multiplied by six sums of the kernel's three values. Four sums of these products
+are four pixels of the result (Lavin and Gray 2016). If the rows have a stride, or if their number is not a multiple of
+four, only the columns use this method, with half of the multiplications. The derivative needs equally few.
 """
 
 import functools
@@ -16,9 +16,9 @@ from jaxtyping import Array, Float
 from sglpr_jax.models.layers import product
 
 AT_ONCE = 4
-"""Pixels of the result, along an axis, from one set of products."""
+"""Number of output pixels along an axis from one set of products."""
 BEYOND = 2
-"""Pixels after the border that fill the last block of four."""
+"""Number of pixels after the border that fill the last block of four."""
 OF_PIXELS = np.array(
     [
         [4, 0, -5, 0, 1, 0],
@@ -37,7 +37,7 @@ OF_PRODUCTS = np.array([[1, 1, 1, 1, 1, 0], [0, 1, -1, 2, -2, 0], [0, 1, 1, 4, 4
 def winograd(
     x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"], stride: int, circular: bool
 ) -> Float[Array, "b _ {x.shape[2]} f"]:
-    """The convolution of an image that gets a border of one pixel; `stride` is along the rows, w a multiple of 4."""
+    """Convolve images with a border of one pixel. `stride` is along the rows; w must be a multiple of 4."""
     beside = (1, 1 + BEYOND)
     if circular:
         wide = jnp.concatenate([x[:, :, -1:], x, x[:, :, : 1 + BEYOND]], axis=2)
@@ -79,9 +79,10 @@ def _along_columns(
 def four_at_once(
     x: Float[Array, "a n i"], kernels: Sequence[Array], multiply: Callable[[Array, Array], Float[Array, "b m j"]]
 ) -> Float[Array, "b n-4 j"]:
-    """Winograd's filtering along the middle axis, n a multiple of 4; `multiply` is what else a kernel does.
+    """Apply Winograd's filtering along the middle axis; n must be a multiple of 4.
 
-    The last two places are there to fill a block: the gradient of whole blocks is quicker than that of slices.
+    `multiply` applies one kernel along the other axes. The last two positions only fill a block, because the gradient
+    of whole blocks is faster than that of slices.
     """
     a, n, i = x.shape
     blocks = x.reshape(a, n // AT_ONCE, AT_ONCE * i)
@@ -100,11 +101,11 @@ def _sums_of_kernel(by: Float[np.ndarray, "s k"], kernel: Float[Array, "3 3 c f"
 
 
 def _each(kernels: Float[Array, "n *dims"]) -> list[Float[Array, "*dims"]]:
-    """The kernels as arrays of their own; of an index the gradient would be an array of zeros for each of them."""
+    """Splits the kernels into separate arrays. The gradient of indexing would create zeros for each kernel."""
     return [of_one[0] for of_one in jax.lax.split(kernels, [1] * len(kernels), 0)]
 
 
 def _weighted(weights: Float[np.ndarray, " n"], parts: Sequence[Array]) -> Array:
-    """The weighted sum; weights of 0 and 1 cost nothing."""
+    """Weighted sum. Weights of 0 and 1 need no multiplication."""
     terms = [part if by == 1 else by * part for by, part in zip(weights, parts, strict=True) if by]
     return functools.reduce(jnp.add, terms)

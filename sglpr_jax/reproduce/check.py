@@ -1,4 +1,4 @@
-"""What can be known to be wrong with a reproduction before anything is trained for it."""
+"""Checks of a reproduction before any training."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,14 +13,21 @@ from sglpr_jax.reproduce.runs import Runs
 def check(
     runs: Runs, names: Sequence[str], seqs: Sequence[str], methods: Sequence[str], nclt: Path | None = None
 ) -> None:
-    """Raise ValueError for an unknown method, recordings without poses, points or labels where they are needed, no
-    second recording to train on, or no second session in `nclt`; FileNotFoundError where no sessions are there at all;
-    ImportError for figures without matplotlib."""
+    """Check recordings, methods and sessions for the chosen tables and figures.
+
+    Raises:
+      ValueError: A method is unknown, or poses, points or labels are missing. Also if there is no second recording to
+        train on, or no second session in `nclt`.
+      FileNotFoundError: `nclt` has no sessions.
+      ImportError: Figures are chosen, but matplotlib is not installed.
+    """
     if not names:
-        raise ValueError(f"expected tables or figures, found none; there are all, {', '.join(EXPERIMENTS)}")
+        raise ValueError(f"expected tables or figures, found none; choose from all, {', '.join(EXPERIMENTS)}")
     if not seqs:
         found = ", ".join(recording_names(runs.data))
-        raise ValueError(f"{runs.data}: expected recordings named as the paper's, found {found}; name yours with --seq")
+        raise ValueError(
+            f"{runs.data}: expected recordings named as in the paper, found {found}; choose yours with --seq"
+        )
     if any(EXPERIMENTS[name].kind == "figure" for name in names) and not figures.can_draw():
         raise ImportError("figures need matplotlib: pip install 'sglpr-jax[viz]'")
     _check_recordings(runs, seqs)
@@ -44,14 +51,14 @@ def _check_recordings(runs: Runs, seqs: Sequence[str]) -> None:
 
 
 def _check_sessions(root: Path) -> None:
-    """The first session is the database, the others ask it."""
+    """The first session is the database, the others are queries."""
     sessions = recording_names(root)
     if len(sessions) < 2:
         raise ValueError(f"{root}: expected two sessions or more, found {', '.join(sessions)}")
 
 
 def _check_labels(runs: Runs, name: str) -> None:
-    """Without labels a segmentation branch has nothing to learn: tables that compare it would compare nothing."""
+    """Tables that compare the segmentation branch need labels, because without labels it learns nothing."""
     if not EXPERIMENTS[name].needs_labels:
         return
     for seq in recording_names(runs.data):

@@ -1,4 +1,4 @@
-"""The paper's experiments as data: which variants of the model each table and figure compares."""
+"""The paper's experiments as data: the variants of the model that each table and figure compares."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ NO_SEGMENTATION = "no-segmentation"
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to train: what a table calls it, and how its configuration differs from the preset's."""
+    """A way to train: its name in tables, and the changes to the preset's configuration."""
 
     label: str
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of TrainConfig by their dotted names, as on the command line of bin/train."""
+    """Fields of TrainConfig with their dotted names, as on the command line of bin/train."""
 
 
 VARIANTS: dict[str, Variant] = {
@@ -39,24 +39,25 @@ VARIANTS: dict[str, Variant] = {
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure: what it shows, and the variants that must be trained for it."""
+    """A table or figure: its content and the variants that it needs."""
 
     kind: Literal["table", "figure"]
     title: str
     variants: tuple[str, ...] = (FULL,)
     labels: tuple[str, ...] = ()
-    """What this experiment calls its variants, where it is not `Variant.label`."""
+    """Names of the variants in this experiment, if they differ from `Variant.label`."""
     rotated: bool = False
-    """Every scan of the test recordings is rotated by its own random angle."""
+    """Whether every scan of the test recordings is rotated by its own random angle."""
     beside_handcrafted: bool = False
-    """Whether handcrafted methods stand beside the variants."""
+    """Whether handcrafted methods are compared with the variants."""
     across_sessions: bool = False
-    """Tested on sessions of another dataset, so that one model serves: the one trained without the first recording."""
+    """Whether the test uses sessions of another dataset. One model per variant then suffices: the one trained without
+    the first recording."""
     needs_labels: bool = False
-    """It compares what is learned from labels, or draws them."""
+    """Whether the experiment draws labels or compares variants that learn from them."""
 
     def names(self) -> dict[str, str]:
-        """The label of each variant, by the variant's name."""
+        """Return the label of each variant, by the variant's name."""
         labels = self.labels or tuple(VARIANTS[name].label for name in self.variants)
         return dict(zip(self.variants, labels, strict=True))
 
@@ -124,7 +125,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 
 
 def variant_config(preset: TrainConfig, variant: str) -> TrainConfig:
-    """The preset with the changes of a variant."""
+    """Return the preset with the changes of a variant."""
     config = preset
     for name, value in VARIANTS[variant].changes.items():
         config = _with_field(config, name.split("."), value)

@@ -1,4 +1,4 @@
-"""Figures 5 to 9 from the runs, as matplotlib figures by the name of the file that each is written to."""
+"""Figures 5 to 9 of finished runs, as matplotlib figures by their file names."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ HEAT_MAPS = ("decoder", "CBAM")
 
 
 def precision_recall(results: Mapping[str, Mapping[str, Result]]) -> Pictures:
-    """Figure 5: a plot for each recording, with a line for each method, from results by recording and method."""
+    """Figure 5: a plot for each recording with a line for each method. `results` are by recording and method."""
     pictures = {}
     for seq, of_method in results.items():
         curves = {method: result.curve for method, result in of_method.items() if result.curve is not None}
@@ -32,7 +32,7 @@ def precision_recall(results: Mapping[str, Mapping[str, Result]]) -> Pictures:
 
 
 def trajectories(runs: Runs, results: Mapping[str, Result]) -> Pictures:
-    """Figure 6: a plot for each recording, of the model's decisions along the way."""
+    """Figure 6: a plot for each recording with the model's decisions along the trajectory."""
     pictures = {}
     for seq, result in results.items():
         positions = runs.recording(seq).positions
@@ -42,7 +42,8 @@ def trajectories(runs: Runs, results: Mapping[str, Result]) -> Pictures:
 
 
 def semantic_maps(runs: Runs, seqs: Sequence[str]) -> Pictures:
-    """Figure 7: a scan from the middle of each recording, as the model that never saw the recording labels it."""
+    """Figure 7: a scan from the middle of each recording, labelled by the model that was not trained on the
+    recording."""
     pictures = {}
     for seq in seqs:
         recording = runs.recording(seq)
@@ -60,7 +61,7 @@ def semantic_maps(runs: Runs, seqs: Sequence[str]) -> Pictures:
 
 
 def feature_heat_maps(runs: Runs, seq: str, recordings: Sequence[Recording]) -> Pictures:
-    """Figure 8: a scan from the middle of each recording, seen by the models without and with the segmentation branch.
+    """Figure 8: feature maps of a scan from the middle of each recording, without and with the segmentation branch.
 
     Both models were trained without `seq`.
     """
@@ -82,7 +83,7 @@ def feature_heat_maps(runs: Runs, seq: str, recordings: Sequence[Recording]) -> 
 
 
 def categories(score: Callable[[str, str], float], seqs: Sequence[str]) -> Pictures:
-    """Figure 9: the score of every recording over the number of categories; `score(variant, seq)`."""
+    """Figure 9: the score of every recording over the number of categories. `score(variant, seq)` returns a score."""
     numbers = EXPERIMENTS["figure9"].names()
     curves = {seq: [(int(number), score(variant, seq)) for variant, number in numbers.items()] for seq in seqs}
     plot = figures.learning_curve(curves, xlabel="categories", ylabel="top-1 F1max")

@@ -1,4 +1,4 @@
-"""What a reproduction will do, said before it is done: which runs are missing, and about how long they take."""
+"""Plan of a reproduction: the missing runs and the estimated training time."""
 
 import time
 from collections.abc import Sequence
@@ -18,33 +18,33 @@ TIMED_STEPS = 3
 
 @dataclass(frozen=True)
 class Plan:
-    """The runs that some experiments rest on, and those of them still to be trained, as (variant, recording)."""
+    """The runs that the experiments need, and those that are not trained yet, as (variant, recording)."""
 
     runs: tuple[tuple[str, str], ...]
     missing: tuple[tuple[str, str], ...]
     steps: int
     without_revisits: tuple[str, ...] = ()
-    """The recordings to be tested on that never come back: nothing scores there."""
+    """Test recordings without revisits. They have no scores."""
 
     def text(self, seconds_per_step: float | None) -> str:
-        """The plan in words."""
+        """Describe the plan."""
         done = len(self.runs) - len(self.missing)
-        lines = [f"{len(self.runs)} leave-one-out runs of {self.steps} steps, {done} of them there already"]
+        lines = [f"{len(self.runs)} leave-one-out runs of {self.steps} steps, {done} of them already trained"]
         for variant in dict.fromkeys(variant for variant, _ in self.missing):
             recordings = ", ".join(seq for name, seq in self.missing if name == variant)
             lines.append(f"  {VARIANTS[variant].label}: to train for {recordings}")
         if self.without_revisits:
-            lines.append(f"no revisits in {', '.join(self.without_revisits)}: no scores there, and no means")
+            lines.append(f"no revisits in {', '.join(self.without_revisits)}: no scores for them, and no means")
         if self.missing and seconds_per_step is not None:
             minutes = len(self.missing) * self.steps * seconds_per_step / 60
-            lines.append(f"about {minutes:.0f} min of training ({seconds_per_step:.2g} s a step), and compilation")
+            lines.append(f"about {minutes:.0f} min of training ({seconds_per_step:.2g} s a step), plus compilation")
         return "\n".join(lines)
 
 
 def make_plan(runs: Runs, names: Sequence[str], seqs: Sequence[str]) -> Plan:
-    """The plan for these experiments and test recordings.
+    """Return the plan for these experiments and test recordings.
 
-    What is tested across sessions needs one run of each variant only. Raises ValueError where a run has other settings.
+    Experiments across sessions need only one run of each variant. Raises ValueError if a run has other settings.
     """
     needed = {}
     for name in names:
@@ -62,7 +62,8 @@ def _comes_back(runs: Runs, seq: str) -> bool:
 
 
 def time_a_step(runs: Runs, variant: str, seq: str) -> float:
-    """Seconds that a training step takes, measured on the run's own first batches; compiles what the run needs."""
+    """Measure the duration of a training step in seconds, on the first batches of the run. The program is compiled
+    first."""
     config = runs.config_of(variant)
     recordings = runs.recordings_but(seq)
     state, batches = new_state(config), TupleBatches(recordings, tuple_pool(recordings, config), config)

@@ -1,4 +1,4 @@
-"""A table or a figure of the paper, made anew from finished runs."""
+"""Tables and figures of the paper, reproduced from finished runs."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -18,18 +18,18 @@ from sglpr_jax.reproduce.tables import PUBLISHED, PaperTable
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What tables and figures are made of."""
+    """Input of tables and figures."""
 
     runs: Runs
     seqs: tuple[str, ...]
-    """The recordings tested on."""
+    """Test recordings."""
     methods: tuple[str, ...]
-    """The handcrafted methods that stand beside."""
+    """Handcrafted methods for comparison."""
     sessions: Callable[[], Path]
-    """Where sessions in NCLT's layout are; asked only for what needs them."""
+    """Returns the folder of sessions in NCLT's layout. Called only by experiments that need sessions."""
 
     def table(self, name: str) -> PaperTable:
-        """Return a table with our numbers beside the paper's."""
+        """Return a table with the reproduced numbers and the paper's."""
         experiment = EXPERIMENTS[name]
         about = f"here: preset {Path(self.runs.preset).stem}, {self.runs.config.steps} steps"
         if experiment.across_sessions:
@@ -43,7 +43,7 @@ class Reproduction:
         return PaperTable(f"{name}: {experiment.title}", rows, columns, caption)
 
     def pictures(self, name: str) -> Pictures:
-        """Return the pictures of a figure by file name, one for each recording where it has several."""
+        """Return the pictures of a figure by their file names. Some figures have one picture for each recording."""
         return _FIGURES[name](self)
 
 
@@ -55,7 +55,7 @@ def write_table(table: PaperTable, name: str, folder: Path) -> None:
 
 
 def write_pictures(found: Pictures, folder: Path) -> list[Path]:
-    """Write pictures; returns their paths."""
+    """Write pictures. Returns their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, picture in found.items():
         figures.save(picture, folder / name)
@@ -101,12 +101,12 @@ _FIGURES: dict[str, Callable[[Reproduction], Pictures]] = {
 
 
 def chosen_experiments(names: Sequence[str]) -> list[str]:
-    """Return the tables and figures asked for, each once; `all` stands for every one."""
+    """Return the chosen tables and figures without duplicates. `all` selects every one."""
     return list(EXPERIMENTS) if "all" in names else list(dict.fromkeys(names))
 
 
 def write_experiment(name: str, found: Reproduction, folder: Path) -> PaperTable | list[Path]:
-    """Make a table or a figure and write it; returns the table, or the paths of the pictures."""
+    """Create and write a table or a figure. Returns the table, or the paths of the pictures."""
     if EXPERIMENTS[name].kind == "figure":
         return write_pictures(found.pictures(name), folder)
     table = found.table(name)

@@ -1,4 +1,4 @@
-"""The trained models and descriptors behind the tables: made where they are missing, kept in one folder per run."""
+"""Trained models and descriptors for the tables, in one folder per run. Missing ones are created."""
 
 import functools
 from collections.abc import Callable
@@ -32,18 +32,18 @@ WITHOUT_TRAINING = "without-training"
 
 @functools.cache
 def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
-    """A recording, listed once: a scan that vanishes later is missed, where another list would do without it."""
+    """Open a recording once. If a scan disappears later, reading it fails; a new listing would silently omit it."""
     return open_recording(data, seq, pose_source=pose_source)
 
 
 def _begun(folder: Path) -> bool:
-    """Whether there is a run to go on with; a process that was killed at once may leave a folder without one."""
+    """Whether there is a run to resume. A process that was killed early may leave a folder without one."""
     return (folder / CONFIG_FILE).is_file()
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Leave-one-out runs: `folder`/VARIANT/SEQ has one model, trained on all recordings of `data` but SEQ."""
+    """Leave-one-out runs: `folder`/VARIANT/SEQ contains a model trained on all recordings of `data` except SEQ."""
 
     folder: Path
     data: Path
@@ -51,14 +51,14 @@ class Runs:
     config: TrainConfig
     pose_source: PoseChoice = "auto"
     progress: Progress = no_progress
-    """Shows how far an embedding is."""
+    """Shows the progress of embeddings."""
 
     def config_of(self, variant: str) -> TrainConfig:
-        """How a variant is trained."""
+        """Return the configuration of a variant."""
         return variant_config(self.config, variant)
 
     def is_trained(self, variant: str, seq: str) -> bool:
-        """Whether nothing is left to train of a run. Raises ValueError where it was made with other settings."""
+        """Whether a run is finished. Raises ValueError if it has other settings."""
         folder = self._folder(variant, seq)
         if not _begun(folder):
             return False
@@ -72,7 +72,7 @@ class Runs:
         return steps == self.config.steps
 
     def train(self, variant: str, seq: str, *, stopped: Callable[[], bool] = lambda: False) -> TrainResult:
-        """Train what is missing of a run. Raises ValueError where it was begun with other settings."""
+        """Train the remaining steps of a run. Raises ValueError if it was started with other settings."""
         folder = self._folder(variant, seq)
         result = train(
             self.config_of(variant),
@@ -89,21 +89,24 @@ class Runs:
         return result
 
     def params(self, variant: str, seq: str) -> Params:
-        """The weights of a finished run."""
+        """Return the weights of a finished run."""
         return load(self._folder(variant, seq))
 
     def recording(self, seq: str) -> Recording:
-        """A recording of the dataset."""
+        """Open a recording of the dataset."""
         return _opened(self.data, seq, self.pose_source)
 
     def recordings_but(self, seq: str) -> list[Recording]:
-        """The recordings that the runs for `seq` train on."""
+        """Return the training recordings of the runs for `seq`."""
         return [self.recording(name) for name in recording_names(self.data) if name != seq]
 
     def descriptors(
         self, method: str, seq: str, *, of: Recording | None = None, rotated: bool = False
     ) -> DescriptorFile:
-        """What a method says of the recording `seq`, or `of` another; a variant's model was trained without `seq`."""
+        """Return a method's descriptors of the recording `seq`, or of the recording `of`.
+
+        The model of a variant was trained without `seq`.
+        """
         recording = of or self.recording(seq)
         folder = self._folder(method, seq) if method in VARIANTS else self.folder / WITHOUT_TRAINING / method
         (folder / "descriptors").mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What every method scores on every recording: the rows of tables 1 to 7, ours and the paper's."""
+"""Scores of every method on every recording: the rows of tables 1 to 7, reproduced and published."""
 
 import dataclasses
 import functools
@@ -18,12 +18,12 @@ from sglpr_jax.reproduce.tables import OURS, PUBLISHED, Row, score_or_none
 
 @functools.cache
 def top1(runs: Runs, method: str, seq: str, *, rotated: bool = False) -> Result:
-    """The paper's F1max (top-1, 3 m / 20 m) of a variant or of a handcrafted method."""
+    """Return the paper's F1max (top-1, 3 m / 20 m) of a variant or of a handcrafted method."""
     return top1_f1max(runs.descriptors(method, seq, rotated=rotated))
 
 
 def f1max_rows(name: str, runs: Runs, seqs: Sequence[str], methods: Sequence[str]) -> list[Row]:
-    """The rows of table 1, 2, 4, 5, 6 or 7, ours first."""
+    """Return the rows of table 1, 2, 4, 5, 6 or 7, the reproduced ones first."""
     rotated = EXPERIMENTS[name].rotated
     ours = []
     for method, label in methods_of(name, methods).items():
@@ -37,10 +37,10 @@ def f1max_rows(name: str, runs: Runs, seqs: Sequence[str], methods: Sequence[str
 def across_sessions_rows(
     name: str, runs: Runs, seq: str, root: Path, methods: Sequence[str]
 ) -> tuple[list[str], list[Row]]:
-    """The columns and rows of a table across sessions: Recall@1 of each later session of `root` in the first one.
+    """Return the columns and rows of a table across sessions.
 
-    The model is the one trained without `seq`; it has seen none of the sessions. Methods that need labels are left out
-    where there are none.
+    The scores are Recall@1 of each later session of `root` in the first one. The model was trained without `seq` and
+    has seen none of the sessions. Methods that need labels are omitted if the sessions have no labels.
     """
     database, *queries = (open_recording(root, session) for session in recording_names(root))
     fitting = [other for other in methods if HANDCRAFTED[other].takes != "labelled points" or database.has_labels]
@@ -54,13 +54,13 @@ def across_sessions_rows(
 
 
 def methods_of(name: str, methods: Sequence[str]) -> Mapping[str, str]:
-    """What a table or figure calls its variants, and the handcrafted methods beside them, by their names."""
+    """Return the label of each variant of a table or figure by its name, and of the handcrafted methods."""
     experiment = EXPERIMENTS[name]
     return experiment.names() | ({other: other for other in methods} if experiment.beside_handcrafted else {})
 
 
 def published_rows(name: str, columns: Sequence[str]) -> list[Row]:
-    """The paper's rows of a table, where it has any of these columns."""
+    """Return the paper's rows of a table, if it has any of these columns."""
     return [
         Row(row.method, PUBLISHED, dict(zip(table.columns, row.scores, strict=True)))
         for table in TABLES

@@ -1,4 +1,4 @@
-"""Tables 1 to 7 with our numbers beside the paper's, for the terminal, as JSON and as Markdown."""
+"""Tables 1 to 7 with the reproduced and the published numbers, for the terminal, as JSON and as Markdown."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,28 +11,29 @@ from sglpr_jax.evaluation.report import PrintsItself
 
 OURS, PUBLISHED = "here", "published"
 NONE, NO_REVISITS = "-", "no revisits"
-"""What a cell says in place of a number: there is none, and why ours is missing."""
+"""Text of a cell without a number, and of a missing score of a reproduced row."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method: its score on each test recording by name (None: it has none there), measured here or published."""
+    """Scores of one method by test recording (None: no score), reproduced here or published."""
 
     label: str
     source: str
     scores: Mapping[str, float | None]
     change: float | None = None
-    """What the mean differs by from the one before the scans were rotated (table 2's Cmp)."""
+    """Change of the mean when the scans are rotated (table 2's Cmp)."""
 
     def mean(self, columns: Sequence[str]) -> float | None:
-        """The mean over the columns; None where one is missing, for it would be another mean."""
+        """Return the mean over the columns. If a column is missing, return None, because the mean would not be
+        comparable."""
         values = [self.scores.get(name) for name in columns]
         return None if None in values or not values else sum(values) / len(values)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, repr=False)
 class PaperTable(PrintsItself):
-    """A table of the paper: our rows, then the published ones. Prints itself."""
+    """A table of the paper: the reproduced rows, then the published ones. It can be printed."""
 
     title: str
     rows: Sequence[Row]
@@ -82,7 +83,7 @@ class PaperTable(PrintsItself):
 
 
 def score_or_none(score: float) -> float | None:
-    """A protocol's score; None for the NaN of a recording without revisits."""
+    """Return a protocol's score, or None for NaN, the score of a recording without revisits."""
     return None if math.isnan(score) else score
 
 

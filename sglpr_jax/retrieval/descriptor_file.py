@@ -1,4 +1,4 @@
-"""The descriptor file: what embedding writes and evaluation reads, whatever method made the descriptors."""
+"""Descriptor files, written by embedding and read by evaluation, for descriptors of any method."""
 
 import json
 from collections import Counter
@@ -11,42 +11,42 @@ import numpy as np
 from sglpr_jax.files import json_in_short, parse_json, read_arrays, replacing
 
 FORMAT = "sglpr-jax descriptors 2"
-"""Stands in every file; its number grows when an older reader could no longer understand one."""
+"""Format in every file. The number increases if older readers cannot read the new files."""
 SKIPPED = "skipped"
-"""The key of `config` under which stand the rows of a recording that were left out."""
+"""Key of `config` for the rows of a recording that were skipped."""
 FORMAT_1 = "sglpr-jax descriptors 1"
-"""Knew no distance: its descriptors are compared by L2."""
+"""Older format, without a distance. Its descriptors are compared by L2."""
 
 REQUIRED = ("about", "ids", "descriptors")
 ABOUT = {"sequence": str, "pose_source": str | None, "config": dict, "weights_hash": str, "distance": str}
-"""What stands in `about` beside the format, and of what types."""
+"""Fields of `about` besides the format, and their types."""
 
 
 @dataclass(frozen=True, eq=False)
 class DescriptorFile:
-    """The descriptors of one sequence, with all that scoring them needs.
+    """Descriptors of one sequence, with everything needed to evaluate them.
 
-    Row i of every array is frame `ids[i]`, in the order of recording. Raises ValueError where the numbers of rows
-    differ, a value is not finite, an id stands there twice or times run backwards.
+    Row i of every array belongs to frame `ids[i]`, in the order of recording. Raises ValueError if the arrays have
+    different numbers of rows, a value is not finite, an id is repeated, or times decrease.
     """
 
     sequence: str
     ids: tuple[str, ...]
     """File stems of the scans."""
     positions: np.ndarray | None
-    """(n, 3) float64, metres, z up, or None where the source has no poses."""
+    """Positions (n, 3) float64 in metres, z up, or None without poses."""
     times: np.ndarray | None
-    """(n,) float64 seconds, or None where the source has none."""
+    """Times (n,) float64 in seconds, or None if unknown."""
     descriptors: np.ndarray
-    """(n, d) float32."""
+    """Descriptors (n, d) float32."""
     pose_source: str | None
-    """Which poses `positions` are, in words: a protocol gives another number on other poses."""
+    """Source of `positions`, in words. A protocol gives other results for other poses."""
     config: dict[str, Any]
-    """How the descriptors were made, as JSON can hold it."""
+    """How the descriptors were made, as JSON data."""
     weights_hash: str
-    """Names the weights; empty for a method without any."""
+    """Hash of the weights. Empty for a method without weights."""
     distance: str = "l2"
-    """The name in `retrieval.distances` of the function that compares two descriptors."""
+    """Name in `retrieval.distances` of the function that compares two descriptors."""
 
     def __post_init__(self):
         n = len(self.ids)
@@ -54,35 +54,35 @@ class DescriptorFile:
             raise ValueError("expected at least one scan, found none")
         twice = next((name for name, times in Counter(self.ids).items() if times > 1), None)
         if twice is not None:
-            raise ValueError(f"expected an id of its own for each scan, found {twice!r} {self.ids.count(twice)} times")
+            raise ValueError(f"expected a unique id for each scan, found {twice!r} {self.ids.count(twice)} times")
         _check("descriptors", self.descriptors, np.float32, (n, None))
         if self.descriptors.shape[1] == 0:
-            raise ValueError(f"expected descriptors of at least one number, found {self.descriptors.shape}")
+            raise ValueError(f"expected descriptors with at least one number, found {self.descriptors.shape}")
         if self.positions is not None:
             _check("positions", self.positions, np.float64, (n, 3))
         if self.times is not None:
             _check("times", self.times, np.float64, (n,))
             backwards = np.flatnonzero(np.diff(self.times) < 0)
             if backwards.size:
-                raise ValueError(f"expected times in order, found an earlier one in row {backwards[0] + 1}")
+                raise ValueError(f"expected times in ascending order, found an earlier time in row {backwards[0] + 1}")
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @property
     def recorded(self) -> np.ndarray:
-        """Of each scan of the recording, those too that were left out, whether it is here.
+        """Mask over all scans of the recording, including skipped ones: whether each scan is in this file.
 
-        Raises ValueError where `config` does not say it in numbers of rows.
+        Raises ValueError if the skipped rows in `config` are invalid.
         """
         skipped = self.config.get(SKIPPED, [])
         n = len(self) + len(skipped) if isinstance(skipped, list) else 0
         if not n or len({row for row in skipped if type(row) is int and 0 <= row < n}) < len(skipped):
-            raise ValueError(f"expected the rows that were skipped, found {skipped!r:.60}")
+            raise ValueError(f"expected row numbers of the skipped scans, found {skipped!r:.60}")
         return ~np.isin(np.arange(n), skipped)
 
     def only(self, rows: np.ndarray) -> "DescriptorFile":
-        """The file of those of its scans of which `rows`, a mask, says that they stay."""
+        """Return the file with only the scans that the mask `rows` selects."""
         arrays = {name: getattr(self, name) for name in ("positions", "times", "descriptors")}
         chosen = {name: None if array is None else array[rows] for name, array in arrays.items()}
         recorded = self.recorded
@@ -91,7 +91,7 @@ class DescriptorFile:
         return replace(self, ids=tuple(np.array(self.ids)[rows].tolist()), config=config, **chosen)
 
     def save(self, path: Path | str) -> None:
-        """Write the file whole or not at all: a broken run leaves what was at `path` before."""
+        """Write the file atomically. If writing fails, the previous file at `path` stays."""
         about = {"format": FORMAT, **{name: getattr(self, name) for name in ABOUT}}
         arrays = {"descriptors": self.descriptors, "positions": self.positions, "times": self.times}
         present = {name: array for name, array in arrays.items() if array is not None}
@@ -100,9 +100,11 @@ class DescriptorFile:
 
     @classmethod
     def load(cls, path: Path | str) -> "DescriptorFile":
-        """Read a file that `save` wrote.
+        """Read a file written by `save`.
 
-        Raises FileNotFoundError, or ValueError naming the file, what was expected and what was found.
+        Raises:
+          FileNotFoundError: If the file does not exist.
+          ValueError: If the file is invalid. The message names the file, what was expected and what was found.
         """
         path = Path(path)
         arrays = read_arrays(path, expected="a descriptor file (.npz)")
@@ -122,7 +124,7 @@ class DescriptorFile:
 
 
 def _check(name: str, array: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
-    """Raise ValueError unless `array` has this type and shape (None: any length) and is finite."""
+    """Raises ValueError unless `array` is finite and has this type and shape (None: any length)."""
     fits = len(array.shape) == len(shape) and all(
         want is None or want == size for want, size in zip(shape, array.shape, strict=True)
     )
@@ -133,13 +135,15 @@ def _check(name: str, array: np.ndarray, dtype: type, shape: tuple[int | None, .
         )
     broken = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
     if broken.size:
-        raise ValueError(f"expected finite {name}, found others in {broken.size} rows, the first in row {broken[0]}")
+        raise ValueError(
+            f"expected finite {name}, found NaN or infinity in {broken.size} rows, first in row {broken[0]}"
+        )
 
 
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
-    """Raise ValueError unless the descriptors of both files can be compared: one method, one model, the same weights.
+    """Raise ValueError unless the descriptors of two files can be compared: same method, model and weights.
 
-    What the two were made of may differ: another recording, another rotation.
+    The recordings and the rotations may differ.
     """
     for what in ("numbers", "distance", "method", "model", "weights"):
         ours, theirs = _made_by(a)[what], _made_by(b)[what]
@@ -156,13 +160,13 @@ def _made_by(file: DescriptorFile) -> dict[str, Any]:
         "numbers": file.descriptors.shape[1],
         "distance": file.distance,
         "method": config["method"],
-        "model": json.loads(json.dumps([config["model"], config["grid"]])),  # as a file has them: tuples are lists
+        "model": json.loads(json.dumps([config["model"], config["grid"]])),  # Tuples become lists, as in a file.
         "weights": file.weights_hash,
     }
 
 
 def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
-    """Return the file's JSON part; ValueError where another program or version wrote it."""
+    """Returns the JSON part of the file. Raises ValueError if another program or version wrote it."""
     if text.ndim != 0 or text.dtype.kind != "U":
         raise ValueError(f"{path}: expected JSON in `about`, found an array {text.dtype} {text.shape}")
     about = parse_json(str(text), source=f"{path}, `about`")
@@ -180,7 +184,7 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
 
 
 def _ids(names: np.ndarray) -> tuple[str, ...]:
-    """The ids of an archive; ValueError where they are no row of names."""
+    """Returns the ids of an archive. Raises ValueError if they are not an array (n,) of strings."""
     if names.ndim != 1 or names.dtype.kind != "U":
-        raise ValueError(f"expected ids as a row of names, found {names.dtype} {names.shape}")
+        raise ValueError(f"expected ids as an array (n,) of strings, found {names.dtype} {names.shape}")
     return tuple(names.tolist())

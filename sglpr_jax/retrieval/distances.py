@@ -1,8 +1,8 @@
-"""How two descriptors are compared, by the name that a descriptor file records (`DescriptorFile.distance`).
+"""Distance functions of descriptors, by the name in a descriptor file (`DescriptorFile.distance`).
 
-Every function takes queries (q, d) and a database (n, d), float32, and returns the distances (q, n), float32, smaller
-for places more alike. It is a pure function, works in blocks so that it needs little memory beside the result, and
-knows from its method what the numbers of a row are.
+Every function takes queries (q, d) and a database (n, d), float32, and returns distances (q, n), float32. More similar
+places have smaller distances. Each function is pure, and works in blocks to need little memory besides the result. The
+method of the descriptors defines the meaning of their numbers.
 """
 
 import difflib
@@ -18,7 +18,7 @@ BLOCK = 1024
 
 
 def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
-    """Return the Euclidean distances |q - d|. Sums are taken in float64: near zero the squares cancel."""
+    """Return the Euclidean distances |q - d|. Sums are in float64, because the squares cancel near zero."""
 
     def compare(queries, database):
         squares = np.sum(queries**2, axis=1)[:, None] + np.sum(database**2, axis=1)[None, :]
@@ -28,7 +28,7 @@ def l2(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]
 
 
 def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "q n"]:
-    """Return 1 - q . d / (|q| |d|), from 0 to 2; 1 where either is zero."""
+    """Return 1 - q . d / (|q| |d|), from 0 to 2. The result is 1 if either vector is zero."""
 
     def unit(rows):
         lengths = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
@@ -38,12 +38,12 @@ def cosine(queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n
 
 
 def smallest(values: Float[np.ndarray, "q n"], k: int) -> Int[np.ndarray, "q {k}"]:
-    """Return the columns of the k smallest values of each row, rising; equal ones in the order of their columns."""
+    """Return the columns of the k smallest values of each row, in ascending order. Ties keep the order of columns."""
     if k == 1:
         return np.argmin(values, axis=1)[:, None]
     columns = np.sort(np.argpartition(values, k - 1, axis=1)[:, :k], axis=1)
     largest = np.take_along_axis(values, columns, axis=1).max(axis=1, keepdims=True)
-    for row in np.flatnonzero((values <= largest).sum(axis=1) > k):  # others are as small as the last
+    for row in np.flatnonzero((values <= largest).sum(axis=1) > k):  # Other columns tie with the last one.
         columns[row] = np.sort(np.argsort(values[row], kind="stable")[:k])
     order = np.argsort(np.take_along_axis(values, columns, axis=1), axis=1, kind="stable")
     return np.take_along_axis(columns, order, axis=1)
@@ -54,11 +54,11 @@ DISTANCES: dict[str, DistanceFn] = {
     "cosine": cosine,
     **{name: method.distance for name, method in HANDCRAFTED.items() if method.distance is not None},
 }
-"""Every distance by its name."""
+"""All distances by name."""
 
 
 def distance_function(name: str) -> DistanceFn:
-    """Return the distance called `name`. Raises ValueError with the names there are and the nearest of them."""
+    """Return the distance called `name`. For an unknown name, ValueError contains all names and the nearest one."""
     if name not in DISTANCES:
         near = difflib.get_close_matches(name, DISTANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""

@@ -1,4 +1,4 @@
-"""From a recording to its descriptor file: by a model, or by any function of images or of points."""
+"""Computes the descriptor file of a recording, with a model or with any function of images or points."""
 
 import functools
 import os
@@ -30,7 +30,7 @@ from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
 OnBadScan = Callable[[str, Exception], None]
 T = TypeVar("T")
 SCANS_AHEAD = 8
-"""So many scans are read before the first of them is needed."""
+"""Number of scans that are read ahead."""
 
 
 def embed(
@@ -42,12 +42,20 @@ def embed(
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
-    """Describe every scan or image of a recording by a model's weights, or by another method.
+    """Describe every scan or image of a recording with a model or another method.
 
-    With `rotation_seed` every scan is first rotated about z by its own random angle. A model describes `batch` scans
-    at a time. A scan that cannot be read, or shows no place, raises its error, or, given `on_bad_scan(id, error)`, is
-    left out. `on_progress` is told how many scans are done. Raises ValueError where the recording has not the points or
-    the labels that the method needs, for ready-made images that cannot be what the model wants, and for no batch.
+    Arguments:
+      method: Weights of a model, or another method.
+      recording: Scans or images to describe.
+      rotation_seed: With a seed, every scan is first rotated about z by its own random angle.
+      batch: Number of scans that a model describes at a time.
+      on_bad_scan: Called with the id and the error of a scan that cannot be read or shows no place. The scan is then
+        skipped. By default, its error is raised.
+      on_progress: Called with the number of finished scans.
+
+    Raises:
+      ValueError: If the recording lacks points or labels that the method needs, if ready-made images do not fit the
+        model, or if `batch` is below 1.
 
     Example:
       params = sglpr_jax.load("sglpr")
@@ -82,11 +90,17 @@ def embed_images(
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
-    """Describe the image of every scan of a recording.
+    """Describe the image of every scan of a recording. Arguments that are not listed are those of `embed`.
 
-    `grid` is the window to rasterise, or to cut ready-made images to; None leaves those whole. `image` says what raw
-    scans are made into, `field` in which cells the method looks (None: in all). With `categories` the labels beside the
-    scans are read too, and `describe` gets each scan's map of so many classes. The other options are those of `embed`.
+    Arguments:
+      describe: Function from images, and maps of classes with `categories`, to descriptors.
+      recording: Scans or images to describe.
+      grid: Grid for rasterising scans and cropping ready-made images. None leaves images whole.
+      config: How the descriptors are made, for `DescriptorFile.config`.
+      weights_hash: Hash of the weights. Empty for a method without weights.
+      categories: Number of classes of the maps. With 0, labels are not read.
+      image: Kind of image to compute from scans.
+      field: Cells that the method uses, or None for all.
     """
     check_value(batch, Size, "batch")
     batch = _batch_for(len(recording), batch)
@@ -118,19 +132,19 @@ def embed_images(
 
 
 class _Descriptors:
-    """What was described, batch by batch. JAX computes the last one while the next images are being read."""
+    """Descriptors of finished batches. JAX computes the last batch while the next images are read."""
 
     def __init__(self):
         self._done: list[Float32[np.ndarray, "b d"]] = []
         self._computing: list[Num[Array | np.ndarray, "b d"]] = []
 
     def add(self, batch: Num[Array | np.ndarray, "b d"]) -> None:
-        """Wait for the batch before, so that no more than two are in memory."""
+        """Adds a batch and waits for the previous one, so that at most two are in memory."""
         self._done += [np.asarray(one, np.float32) for one in self._computing]
         self._computing = [batch]
 
     def all(self) -> list[Float32[np.ndarray, "b d"]]:
-        """The descriptors, after the last batch has ended, and behind them those of its padding."""
+        """Waits for the last batch. Returns all descriptors, at the end those of its padding."""
         return [*self._done, *(np.asarray(one, np.float32) for one in self._computing)]
 
 
@@ -145,10 +159,16 @@ def embed_scans(
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
-    """Describe the finite points of every scan of a recording, with `labels` and their classes.
+    """Describe the finite points of every scan of a recording. Arguments that are not listed are those of `embed`.
 
-    `distance` names the function that compares the descriptors; the other options are those of `embed`, and equal seeds
-    rotate by equal angles. Where labels are asked for, a scan without them is one that cannot be read.
+    Equal rotation seeds give the same angles as in `embed_images`.
+
+    Arguments:
+      describe: Function from points, and classes with `labels`, to a descriptor.
+      recording: Scans to describe.
+      config: How the descriptors are made, for `DescriptorFile.config`.
+      distance: Name of the function that compares the descriptors.
+      labels: Whether `describe` needs classes. A scan without labels then counts as unreadable.
     """
     angles = _angles(len(recording), rotation_seed)
     rows, descriptors = [], []
@@ -167,11 +187,18 @@ def embed_scans(
 def scan_image(
     points: Float32[np.ndarray, "n 3"], config: ModelConfig, *, mounting: Mounting | None = None
 ) -> Float[Array, "h w"]:
-    """The image of a scan (metres; x forward, y left, z up) that a model describes: see `ModelConfig.image`.
+    """Compute the image of a scan that a model describes (see `ModelConfig.image`).
 
-    `mounting` says how the sensor was mounted (None: upright, 1.73 m above the ground); `estimate_mounting` finds it.
-    Raises ValueError for a scan that shows no place: no finite points, no metres, next to nothing where the model
-    looks. For images from elsewhere there is `is_describable`.
+    Images from other sources can be checked with `is_describable`.
+
+    Arguments:
+      points: Points in metres: x forward, y left, z up.
+      config: Configuration of the model.
+      mounting: Mounting of the sensor, from `estimate_mounting`. None means gravity-aligned, 1.73 m above the ground.
+
+    Raises:
+      ValueError: If the scan shows no place: no finite points, coordinates not in metres, or almost no points where the
+        model looks.
     """
     image = view(Record(points=points, mounting=mounting), config.grid, image=config.image).image
     _check_view(np.asarray(image), field_of_view(config)[0], name="the scan")
@@ -179,21 +206,21 @@ def scan_image(
 
 
 def _check_view(image: Float[np.ndarray, "h w"], field: Bool[np.ndarray, "h w"] | None, *, name: str) -> None:
-    """Raise ValueError where a method sees too little of an image; `field` says where it looks, None: everywhere."""
+    """Raises ValueError if too few cells of an image within `field` (None: everywhere) are occupied."""
     cells = np.count_nonzero(image if field is None else image * field)
     if cells < FEWEST_CELLS:
         raise ValueError(
             f"{name}: expected points in at least {FEWEST_CELLS} cells of the window of {image.shape[0]} x"
-            f" {image.shape[1]}, found them in {cells}"
+            f" {image.shape[1]} cells, found points in {cells}"
         )
 
 
 def _check(method: Method, recording: Recording) -> None:
-    """Raise ValueError where the recording has not the points or the labels that the method needs."""
+    """Raises ValueError if the recording lacks points or labels that the method needs."""
     name, beside = method.about["method"], f"labels beside the scans, found none in sequence {recording.name}"
     if isinstance(method, ImageMethod):
         if method.categories and not recording.has_labels:
-            raise ValueError(f"this model describes a place from its labels too (model.head.input): expected {beside}")
+            raise ValueError(f"this model also needs labels (model.head.input): expected {beside}")
         return
     if recording.has_images:
         others = ", ".join(other.name for other in HANDCRAFTED.values() if other.takes == "images")
@@ -212,10 +239,10 @@ def _readable(
     then: Callable[..., T],
     on_bad_scan: OnBadScan | None,
 ) -> Iterator[tuple[int, T]]:
-    """Every readable scan's row and what `then` makes of what `read` gives, in order.
+    """Yields the row of every readable scan, and the result of `then` for the output of `read`, in order.
 
-    `read` is called here, for not every file can be read by two at once; `then`, a pure function, in other threads, a
-    few scans ahead.
+    `read` runs in this thread, because not every file can be read in parallel. `then` is a pure function and runs in
+    other threads, a few scans ahead.
     """
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         ahead: deque[tuple[int, Future[T]]] = deque()
@@ -233,7 +260,7 @@ def _readable(
 
 
 def _begun(threads: ThreadPoolExecutor, read: Callable[[int], tuple], then: Callable[..., T], row: int) -> Future[T]:
-    """What will come of a row; where it cannot be read, the error that says so."""
+    """Starts `then` for a row. If the row cannot be read, the future raises the error."""
     try:
         return threads.submit(then, *read(row))
     except (ValueError, OSError) as error:
@@ -243,10 +270,13 @@ def _begun(threads: ThreadPoolExecutor, read: Callable[[int], tuple], then: Call
 
 
 def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], **about: Any) -> DescriptorFile:
-    """The descriptors of these rows of a recording, the first ones given; ValueError where there are none."""
+    """Returns the descriptor file of the given rows. Raises ValueError if there are no rows.
+
+    `descriptors` may contain additional rows at the end, the padding of the last batch.
+    """
     if not rows:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
-    if len(rows) < len(recording):  # so that poses of all its scans can be given later
+    if len(rows) < len(recording):  # Needed to add poses of all scans later.
         about["config"] = {**about["config"], SKIPPED: sorted(set(range(len(recording))) - set(rows))}
     return DescriptorFile(
         sequence=recording.name,
@@ -262,7 +292,8 @@ def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], 
 def _finite_points(
     record: Record, *, labels: bool
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """The finite points of one scan and, with `labels`, their classes; ValueError where it shows no place."""
+    """Returns the finite points of one scan and, with `labels`, their classes. Raises ValueError if it shows no
+    place."""
     assert record.points is not None
     check_cloud(record.points, name=record.name)
     finite = np.isfinite(record.points).all(axis=1)
@@ -270,12 +301,14 @@ def _finite_points(
 
 
 def _batch_for(scans: int, batch: int) -> int:
-    """`batch`, or for fewer scans the next power of two: few sizes to compile, and little is described in vain."""
+    """Reduces `batch` for few scans to the next power of two: few sizes are compiled, and little padding is
+    described."""
     return min(batch, 2 ** max(scans - 1, 0).bit_length())
 
 
 def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Num[Array | np.ndarray, "b d"]:
-    """Describe up to `batch` images in a call of always the same shape, so that it compiles once; does not wait."""
+    """Describes up to `batch` images in a call of constant shape, so that it compiles once. Does not wait for the
+    result."""
     padded = views + [views[-1]] * (batch - len(views))
     stacked = jax.tree.map(lambda *each: np.stack(each), *padded)
     inputs = [each for each in stacked if each is not None]

@@ -1,7 +1,7 @@
-"""An index for more places than one machine's memory: `Index`'s questions, answered by LanceDB (extra `fleet`).
+"""An index for more places than fit into memory, with the interface of `Index`, based on LanceDB (extra `fleet`).
 
-A table lies in a folder or in object storage; no server runs. Its answers are exact too: LanceDB compares all rows in
-float32, and the distances of a few more than asked for are taken again in float64.
+A table is stored in a folder or in object storage, without a server. The answers are exact, too: LanceDB compares all
+rows in float32, and the distances of a few additional rows are recomputed in float64.
 """
 
 import json
@@ -28,16 +28,17 @@ from sglpr_jax.retrieval.index_rows import (
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
 FORMAT = "sglpr-jax fleet index 1"
-"""Stands in every table."""
+"""Format in every table."""
 TABLE = "places"
 SPARE = 16
-"""So many rows more than asked for are compared in float64: float32 may swap those that are almost equally near."""
+"""Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
 
 
 class FleetIndex:
-    """Places by their descriptors, in the order they were added: row i is the i-th. Descriptors are compared by L2.
+    """Places by their descriptors, in the order they were added: row i is the i-th place.
 
-    Any number of processes may ask while one adds: each answer knows all places that were there when it was asked for.
+    Descriptors are compared by L2. Any number of processes may query while one adds. Each answer includes all places
+    that existed at the time of the query.
 
     Example:
       index = FleetIndex("s3://bucket/town", weights_hash=file.weights_hash)   # or a folder
@@ -48,16 +49,22 @@ class FleetIndex:
     distance = "l2"
 
     def __init__(self, place: Path | str, *, width: int = 256, weights_hash: str | None = None):
-        """Open the table in a folder or at an address of object storage; without one, it is made by the first `add`.
+        """Open a table in a folder or in object storage. If there is no table, the first `add` creates it.
 
-        Raises ImportError without the extra, ValueError where the table is no index, or one of another width or, by
-        `weights_hash`, of other weights.
+        Arguments:
+          place: Folder, or address in object storage.
+          width: Length of a descriptor.
+          weights_hash: Hash of the weights that the table must have. None accepts any weights.
+
+        Raises:
+          ImportError: If the extra `fleet` is not installed.
+          ValueError: If the table is not an index, or has another width or other weights.
         """
         self.place = str(place)
         self._connection = _connect(self.place)
         self.width, self.weights_hash = width, weights_hash or ""
         self.table: Any = _open(self._connection, self.place)
-        """LanceDB's own, for what it can do beside; None while there are no places."""
+        """LanceDB's table, for its other functions. None while the index is empty."""
         if self.table is not None:
             self._check_about(weights_hash)
 
@@ -66,17 +73,17 @@ class FleetIndex:
 
     @property
     def ids(self) -> list[str]:
-        """The names of all places: the whole column is read."""
+        """Names of all places. Reads the whole column."""
         return self._column("id").tolist()
 
     @property
     def times(self) -> Float[np.ndarray, " n"] | None:
-        """Seconds of all places, or None where they have none."""
+        """Times of all places in seconds, or None if they have no times."""
         return self._column("time") if "time" in self._names() else None
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"] | None:
-        """Metres, z up, of all places, or None where they have none."""
+        """Positions of all places in metres, z up, or None if they have no positions."""
         return np.stack(list(self._column("position"))) if "position" in self._names() else None
 
     def add(
@@ -88,13 +95,13 @@ class FleetIndex:
         positions: Float[np.ndarray, "*n 3"] | None = None,
         weights_hash: str | None = None,
     ) -> None:
-        """Add places as `Index.add` does, in one step: all of them or none. Many at a time are quicker than one."""
+        """Add places like `Index.add`, atomically. Adding many places at once is faster than one by one."""
         check_weights(self.weights_hash, weights_hash)
         first = len(self)
         before = [named for named, stored in _STORED.items() if stored in self._names()]
         about = {"ids": ids, "times": times, "positions": positions}
         names, columns = new_places(descriptors, width=self.width, first=first, before=before, **about)
-        if not names:  # no rows begin no column
+        if not names:  # An empty call creates no columns.
             return
         rows = self._arrow(first, names, columns)
         if self.table is None:
@@ -103,7 +110,7 @@ class FleetIndex:
             self.table.add(rows)
 
     def add_file(self, file: DescriptorFile) -> None:
-        """Add the places of a descriptor file. Raises ValueError where another model or method made it."""
+        """Add the places of a descriptor file. Raises ValueError if another model or method made it."""
         self.add(**places_of(file, distance=self.distance))
 
     def query(
@@ -114,10 +121,11 @@ class FleetIndex:
         exclude: Bool[np.ndarray, " n"] | None = None,
         weights_hash: str | None = None,
     ) -> Found:
-        """Find the nearest `k` places of one descriptor (d,) or of several (q, d) as `Index.query` does.
+        """Find the nearest `k` places of one descriptor (d,) or of several (q, d), like `Index.query`.
 
-        Fewer flags to `exclude` than there are places are those of the first ones: places that another process has
-        added since are not left out. Few runs of flags, as those of `recent`, cost little; thousands are slow.
+        If `exclude` has fewer flags than there are places, it covers the first places. Places that another process
+        added later are not excluded. A few runs of flags, such as those of `recent`, cost little, but thousands of runs
+        are slow.
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
@@ -136,13 +144,13 @@ class FleetIndex:
     def recent(
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
-        """Which places show where a query still is; see `Index.recent`."""
+        """Return which places are too recent to be a revisit. See `Index.recent`."""
         if now is not None and (times := self.times) is not None:
             return times > now - seconds
         return np.arange(len(self)) >= len(self) - frames
 
     def _candidates(self, query: Float[np.ndarray, " d"], k: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-        """The rows and descriptors of the nearest k, by LanceDB, without any approximate index of its own."""
+        """Returns the rows and descriptors of the nearest k places by LanceDB, without its approximate index."""
         search = self.table.search(query).distance_type("l2").bypass_vector_index()
         search = search.where(where, prefilter=True) if where else search
         found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
@@ -150,7 +158,7 @@ class FleetIndex:
         return found["row"].to_numpy(), vectors.reshape(-1, self.width)
 
     def _arrow(self, first: int, ids: list[str], columns: dict[str, np.ndarray]) -> Any:
-        """Rows as LanceDB takes them; what the table is about stands in its schema."""
+        """Returns rows as an Arrow table for LanceDB. The schema contains the metadata of the index."""
         import pyarrow
 
         def vectors(values: np.ndarray) -> Any:
@@ -165,7 +173,7 @@ class FleetIndex:
         return pyarrow.table({**rows, **stored}).replace_schema_metadata({"about": json.dumps(about)})
 
     def _check_about(self, weights_hash: str | None) -> None:
-        """Take over what the table says of itself; ValueError where it is not what was asked for."""
+        """Reads the metadata of the table. Raises ValueError if they contradict the arguments."""
         try:
             about = json.loads((self.table.schema.metadata or {}).get(b"about", b"{}"))
         except ValueError:
@@ -191,16 +199,16 @@ class FleetIndex:
 
 
 _STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"}
-"""What the columns of `NewPlaces` are called in the table, where a row is one place."""
+"""Table columns for the columns of `NewPlaces`."""
 
 
 def _without(exclude: Bool[np.ndarray, " n"]) -> str:
-    """A condition that leaves out these rows, run by run."""
+    """SQL condition that excludes the given rows, run by run."""
     return " AND ".join(f"NOT (row BETWEEN {first} AND {last})" for first, last in _runs(exclude))
 
 
 def _runs(flags: Bool[np.ndarray, " n"]) -> Iterable[tuple[int, int]]:
-    """The first and last of each run of set flags."""
+    """First and last index of each run of set flags."""
     steps = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
     return zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True)
 
@@ -214,10 +222,10 @@ def _connect(place: str) -> Any:
 
 
 def _open(connection: Any, place: str) -> Any:
-    """The table, or None where there is none yet."""
+    """Returns the table, or None if it does not exist yet."""
     if TABLE not in connection.list_tables().tables:
         return None
     try:
         return connection.open_table(TABLE)
-    except Exception as error:  # LanceDB raises a dozen kinds for damaged files
+    except Exception as error:  # LanceDB raises many types of errors for damaged files.
         raise ValueError(f"{place}: expected an index of LanceDB, found a broken one ({in_short(error)})") from error

@@ -1,4 +1,4 @@
-"""From an image to maps of how strongly the features of the network answer, on the grid of the image."""
+"""Maps of the strength of the network's features, on the grid of the image."""
 
 from collections.abc import Mapping
 
@@ -16,10 +16,17 @@ from sglpr_jax.models.sglpr import forward
 def heat_maps(
     params: Params, bev: Num[Array | np.ndarray, "h w"], labels: Int[Array | np.ndarray, "h w"] | None = None
 ) -> Mapping[str, Float[np.ndarray, "h w"]]:
-    """The root mean square over the channels of some feature maps, by name; from 0 to 1, NaN where the model is blind.
+    """Compute the root mean square over the channels of some feature maps, scaled from 0 to 1.
 
-    The model says which maps they are (`config.pictures`): those of its backbone, and the first of its place head.
-    `bev` is one image of point counts, `labels` its map of classes where `describe` needs one.
+    The model selects the feature maps (`config.pictures`): those of its backbone, and the first of its place head.
+
+    Arguments:
+      params: Weights of the model.
+      bev: One image of point counts.
+      labels: Map of classes, if `describe` needs it.
+
+    Returns:
+      Maps by title, with NaN outside the field of view of the model.
     """
     found = jax.device_get(_maps(params, jnp.asarray(bev), None if labels is None else jnp.asarray(labels)))
     return {title: _scaled(found[name]) for title, name in params.config.pictures.items()}

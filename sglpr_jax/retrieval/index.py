@@ -1,7 +1,7 @@
-"""An index of places: descriptors that are added as they come, asked for the nearest, and kept in a file.
+"""An index of places: descriptors are added over time, searched for the nearest, and saved in a file.
 
-The answers are exact: a product of float32 chooses a few more rows than asked for, and their distances are taken
-again in float64. Room for rows doubles when it is full, so that adding stays cheap and nothing is compiled.
+The answers are exact: a float32 product selects a few additional rows, and their distances are recomputed in float64.
+The capacity doubles when it is reached, so that adding stays cheap and nothing is compiled.
 """
 
 import dataclasses
@@ -32,18 +32,18 @@ from sglpr_jax.retrieval.index_rows import (
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
 
 FORMAT = "sglpr-jax index 1"
-"""Stands in every file."""
+"""Format in every file."""
 FIRST_ROOM = 256
-"""Rows that an empty index has room for."""
+"""Number of rows that an empty index has capacity for."""
 SPARE = 16
-"""So many rows more than asked for are compared in float64: float32 may swap those that are almost equally near."""
+"""Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
 BLOCK = 64
-"""Queries compared with all rows at a time."""
+"""Number of queries compared with all rows at a time."""
 
 
 @dataclasses.dataclass(eq=False)
 class Index:
-    """Places by their descriptors, in the order they were added: row i is the i-th.
+    """Places by their descriptors, in the order they were added: row i is the i-th place.
 
     Example:
       index = sglpr_jax.Index.empty()
@@ -53,28 +53,28 @@ class Index:
     """
 
     width: int
-    """Numbers of a descriptor."""
+    """Length of a descriptor."""
     weights_hash: str
-    """Names the weights that made the descriptors; empty for a method without any."""
+    """Hash of the weights that made the descriptors. Empty for a method without weights."""
     distance: str
-    """The name in `retrieval.distances` of the function that compares two descriptors."""
+    """Name in `retrieval.distances` of the function that compares two descriptors."""
     ids: list[str]
-    """The names of the places."""
+    """Names of the places."""
     _columns: dict[str, np.ndarray]
     _lengths: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, np.float32), repr=False)
-    """Squared; of the places that were there when the index was last asked."""
+    """Squared lengths of the descriptors, up to the last query."""
 
     @classmethod
     def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2") -> "Index":
-        """An index without places. Raises ValueError for an unknown distance."""
+        """Create an index without places. Raises ValueError if the distance is unknown or `width` is below 1."""
         distance_function(distance)
         if width < 1:
-            raise ValueError(f"expected descriptors of 1 number or more, found {width}")
+            raise ValueError(f"expected a descriptor width of 1 or more, found {width}")
         return cls(width, weights_hash, distance, [], {"descriptors": np.empty((FIRST_ROOM, width), np.float32)})
 
     @classmethod
     def of(cls, file: DescriptorFile) -> "Index":
-        """The places of a descriptor file."""
+        """Create an index from the places of a descriptor file."""
         index = cls.empty(file.descriptors.shape[1], weights_hash=file.weights_hash, distance=file.distance)
         index.add_file(file)
         return index
@@ -84,17 +84,17 @@ class Index:
 
     @property
     def descriptors(self) -> Float[np.ndarray, "n d"]:
-        """Of all places, float32; a view, not to be changed."""
+        """Descriptors of all places, float32. This is a view and must not be changed."""
         return self._columns["descriptors"][: len(self)]
 
     @property
     def times(self) -> Float[np.ndarray, " n"] | None:
-        """Seconds, or None where the places have none."""
+        """Times of all places in seconds, or None if they have no times."""
         return self._columns["times"][: len(self)] if "times" in self._columns else None
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"] | None:
-        """Metres, z up, or None where the places have none."""
+        """Positions of all places in metres, z up, or None if they have no positions."""
         return self._columns["positions"][: len(self)] if "positions" in self._columns else None
 
     def add(
@@ -106,10 +106,20 @@ class Index:
         positions: Float[np.ndarray, "*n 3"] | None = None,
         weights_hash: str | None = None,
     ) -> None:
-        """Add places: one, or several in order. Without `ids` they are called by their row, as "000052".
+        """Add one place, or several in order.
 
-        Either all places have times (seconds) or none, and positions (metres, z up) likewise. Raises ValueError for
-        descriptors of another width or, by `weights_hash`, of another model, and for values that are not finite.
+        Either all places of an index have times or none has. The same applies to positions.
+
+        Arguments:
+          descriptors: One descriptor (d,) or several (n, d).
+          ids: Names of the places. By default their rows, such as "000052".
+          times: Times in seconds.
+          positions: Positions in metres, z up.
+          weights_hash: Hash of the weights that made the descriptors. None skips the check.
+
+        Raises:
+          ValueError: If the descriptors have another width or come from other weights, if a value is not finite, or if
+            the places have other fields than the places before.
         """
         check_weights(self.weights_hash, weights_hash)
         n, about = len(self), {"ids": ids, "times": times, "positions": positions}
@@ -119,7 +129,7 @@ class Index:
         self.ids += names
 
     def add_file(self, file: DescriptorFile) -> None:
-        """Add the places of a descriptor file. Raises ValueError where another model or method made it."""
+        """Add the places of a descriptor file. Raises ValueError if another model or method made it."""
         self.add(**places_of(file, distance=self.distance))
 
     def query(
@@ -132,8 +142,18 @@ class Index:
     ) -> Found:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d).
 
-        `exclude` says of each place whether it is left out (see `recent`). Equally near places come in the order they
-        were added. Raises ValueError for descriptors of another width or, by `weights_hash`, of another model.
+        Arguments:
+          descriptors: Descriptors to search for.
+          k: Number of places for each descriptor.
+          exclude: Whether each place is excluded (see `recent`).
+          weights_hash: Hash of the weights that made the descriptors. None skips the check.
+
+        Returns:
+          Rows and distances, nearest first. Places with equal distances are in the order they were added. If fewer than
+            `k` places can be returned, the remaining rows are -1.
+
+        Raises:
+          ValueError: If the descriptors have another width or come from other weights.
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
@@ -152,22 +172,22 @@ class Index:
     def recent(
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
-        """Which places show where a query still is: those less than `seconds` old at the time `now`.
+        """Return which places are too recent to be a revisit: those less than `seconds` old at the time `now`.
 
-        Where the places have no times, or `now` is None, they are the last `frames`.
+        Without times or without `now`, these are the last `frames` places.
         """
         if now is not None and self.times is not None:
             return self.times > now - seconds
         return np.arange(len(self)) >= len(self) - frames
 
     def save(self, path: Path | str) -> None:
-        """Write one file, whole or not at all: safetensors, with ids and the rest as JSON in its header."""
+        """Write the index to one safetensors file, atomically. Its header contains the ids and metadata as JSON."""
         content = self.to_bytes()
         with replacing(Path(path)) as temporary:
             temporary.write_bytes(content)
 
     def to_bytes(self, more: Mapping[str, np.ndarray] | None = None) -> bytes:
-        """What `save` writes, with `more` arrays of the caller's, which `load_with` gives back."""
+        """Return the content of the file that `save` writes, with additional arrays that `load_with` returns."""
         arrays = {name: values[: len(self)] for name, values in self._columns.items()} | dict(more or {})
         about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash, "distance": self.distance}
         text = json.dumps({**about, "ids": self.ids})
@@ -176,16 +196,21 @@ class Index:
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "Index":
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
-        Raises FileNotFoundError; ValueError, naming the file, where it is damaged or, by `weights_hash`, of another
-        model.
+        Arguments:
+          path: File of the index.
+          weights_hash: Hash of the weights that the index must have. None skips the check.
+
+        Raises:
+          FileNotFoundError: If the file does not exist.
+          ValueError: If the file is damaged, or the index has other weights. The message names the file.
         """
         return cls.load_with(path, weights_hash=weights_hash)[0]
 
     @classmethod
     def load_with(cls, path: Path | str, *, weights_hash: str | None = None) -> tuple["Index", dict[str, np.ndarray]]:
-        """Read what `to_bytes` made: the index, and the other arrays. Errors are those of `load`."""
+        """Read the output of `to_bytes`: the index, and the additional arrays. Errors are those of `load`."""
         path = Path(path)
         about, arrays = _read(path)
         columns = {name: arrays.pop(name) for name in COLUMNS if name in arrays}
@@ -199,7 +224,7 @@ class Index:
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The rows and distances (q, k) of the nearest k that are `allowed`, of which there are k or more."""
+        """Returns the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed."""
         if self.distance != "l2":
             rows = np.flatnonzero(allowed)
             every = distance_function(self.distance)(queries, self.descriptors[rows])
@@ -213,7 +238,7 @@ class Index:
         return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
 
     def _squares(self) -> Float[np.ndarray, " n"]:
-        """The squared lengths of all descriptors, those of new places taken now."""
+        """Returns the squared lengths of all descriptors, after computing those of new places."""
         new = self.descriptors[len(self._lengths) :]
         if len(new):
             self._lengths = np.concatenate([self._lengths, np.einsum("nd,nd->n", new, new)])
@@ -221,7 +246,7 @@ class Index:
 
 
 def _appended(old: np.ndarray | None, new: np.ndarray, n: int) -> np.ndarray:
-    """A column with room, whose rows from `n` on are the new ones."""
+    """Returns a column with spare capacity, with the new rows from row `n` on."""
     room = FIRST_ROOM if old is None else max(len(old), FIRST_ROOM)
     while room < n + len(new):
         room *= 2
@@ -242,7 +267,7 @@ def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The JSON part and the arrays of an index; ValueError where a byte of it is not what was written."""
+    """Returns the JSON part and the arrays of an index. Raises ValueError if the checksum is wrong."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an index, found {'a folder' if path.is_dir() else 'none'}")
     try:
@@ -250,10 +275,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             metadata = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (safetensors.SafetensorError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected an index, found no whole safetensors file ({error})") from error
+        raise ValueError(f"{path}: expected an index, found an invalid safetensors file ({error})") from error
     text = metadata.get("about", "")
     if metadata.get("sha256") != _checksum(text, arrays):
-        raise ValueError(f"{path}: expected an index as it was written, found a damaged one: its checksum is another")
+        raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")
     about = json.loads(text)
     if about.get("format") != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT!r}, found {about.get('format')!r}")

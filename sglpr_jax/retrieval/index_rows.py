@@ -1,4 +1,4 @@
-"""What every index asks of descriptors and places that come in: shapes, numbers, and the weights that made them."""
+"""Checks of descriptors and places for every index: shapes, finite values, and the weights that made them."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,20 +14,20 @@ MOST = 2**20
 
 
 class Found(NamedTuple):
-    """The nearest k rows of each query, nearest first."""
+    """Nearest k places of each query, nearest first."""
 
     rows: Int[np.ndarray, "*q k"]
-    """-1 where fewer than k may be answers."""
+    """Row of each place; -1 if fewer than k places can be returned."""
     distances: Float[np.ndarray, "*q k"]
-    """Of the descriptors; infinite there."""
+    """Descriptor distance of each place; infinite if fewer than k places can be returned."""
 
 
 class NewPlaces(NamedTuple):
-    """Places to be added, checked."""
+    """Checked places to be added."""
 
     ids: list[str]
     columns: dict[str, np.ndarray]
-    """The descriptors (n, d) float32 and, where they are known, times (n,) and positions (n, 3) float64."""
+    """Descriptors (n, d) float32 and, if known, times (n,) and positions (n, 3) float64."""
 
 
 def new_places(
@@ -40,32 +40,43 @@ def new_places(
     positions: Any,
     before: Sequence[str],
 ) -> NewPlaces:
-    """Check places that are added from row `first` on, after others that have the columns `before`.
+    """Check places to be added from row `first` on.
 
-    Raises ValueError for descriptors of another width, for values that are not finite, and for other columns than
-    before.
+    Arguments:
+      descriptors: One descriptor (d,) or several (n, d).
+      width: Length of a descriptor.
+      first: Row of the first new place.
+      ids: Names of the places. By default their rows.
+      times: Times in seconds, or None.
+      positions: Positions in metres, or None.
+      before: Columns that the existing places have.
+
+    Raises:
+      ValueError: If the descriptors have another width, a value is not finite, or the columns differ from `before`.
     """
     rows = checked_rows(descriptors, width)
     names = [f"{row:06d}" for row in range(first, first + len(rows))] if ids is None else ids
     names = [names] if isinstance(names, str) else [str(name) for name in names]
     if len(names) != len(rows):
-        raise ValueError(f"expected {len(rows)} ids, one a descriptor, found {len(names)}")
+        raise ValueError(f"expected {len(rows)} ids, one per descriptor, found {len(names)}")
     columns = {"descriptors": rows}
     if times is not None:
         columns["times"] = _finite("times", np.reshape(times, -1), (len(rows),))
     if positions is not None:
         columns["positions"] = _finite("positions", np.reshape(positions, (-1, 3)), (len(rows), 3))
     if first and set(columns) != set(before):
-        raise ValueError(f"expected places with {', '.join(before)}, as before, found {', '.join(columns)}")
-    if before and not len(rows):  # to begin a column would say that all places after these have it
+        raise ValueError(
+            f"expected places with {', '.join(before)}, like the existing places, found {', '.join(columns)}"
+        )
+    if before and not len(rows):  # A new column would require all later places to have it.
         columns = {name: values for name, values in columns.items() if name in before}
     return NewPlaces(names, columns)
 
 
 def places_of(file: DescriptorFile, *, distance: str) -> dict[str, Any]:
-    """The places of a descriptor file, as `add` of an index takes them.
+    """Return the places of a descriptor file as arguments of an index's `add`.
 
-    Raises ValueError for descriptors that are not compared by `distance`.
+    Raises ValueError if `distance` does not compare its descriptors.
     """
     if file.distance != distance:
         raise ValueError(f"expected descriptors compared by {distance}, found {file.distance}")
@@ -74,13 +85,13 @@ def places_of(file: DescriptorFile, *, distance: str) -> dict[str, Any]:
 
 
 def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
-    """One descriptor or several as rows of float32. Raises ValueError for another width and what is not finite."""
+    """Return one descriptor or several as float32 rows. Raises ValueError for a wrong width, NaN or infinity."""
     rows = np.atleast_2d(np.asarray(descriptors, np.float32))
     return _finite("descriptors", rows, (len(rows), width)).astype(np.float32)
 
 
 def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, places: int) -> None:
-    """Raise ValueError for a k below 1 or above `MOST` and the number of places, and for flags of another length."""
+    """Raise ValueError if k is below 1, k exceeds both `MOST` and `places`, or `exclude` does not fit."""
     if k < 1:
         raise ValueError(f"expected k of 1 or more, found {k}")
     if k > max(MOST, places):
@@ -90,18 +101,18 @@ def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, places: int) 
 
 
 def check_weights(expected: str, found: str | None) -> None:
-    """Raise ValueError where descriptors are those of other weights; None says nothing."""
+    """Raise ValueError if descriptors come from other weights. None skips the check."""
     if found is not None and found != expected:
         raise ValueError(
             f"expected descriptors of the weights {expected[:12] or '(none)'}, "
-            f"found those of {found[:12] or '(none)'}: models cannot read each other's"
+            f"found those of {found[:12] or '(none)'}: descriptors of different models are not comparable"
         )
 
 
 def nearest_of(
     query: Float[np.ndarray, " d"], descriptors: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " n"], k: int
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """The nearest k of a few candidates by their distances in float64; equally near ones in the order of their rows."""
+    """Return the nearest k of a few candidates by their distances in float64, ties in the order of their rows."""
     apart = np.linalg.norm(query.astype(np.float64) - descriptors, axis=1)
     order = np.lexsort((rows, apart))[:k]
     return rows[order], apart[order]

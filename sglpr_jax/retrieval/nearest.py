@@ -1,4 +1,4 @@
-"""Which places look most like a query: exact nearest neighbours among descriptors, as their method compares them."""
+"""Exact nearest neighbours among descriptors, by the distance of their method."""
 
 from dataclasses import dataclass
 
@@ -9,36 +9,36 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_metho
 from sglpr_jax.retrieval.distances import distance_function, smallest
 
 BLOCK = 512
-"""Queries compared with the whole database at a time."""
+"""Number of queries compared with the whole database at a time."""
 SHOWN = 10
-"""Queries of which a printed result tells the answer."""
+"""Maximum number of queries in a printed result."""
 
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """The nearest k places of every query, nearest first."""
+    """Nearest k places of every query, nearest first."""
 
     queries: DescriptorFile
     database: DescriptorFile
     rows: Int[np.ndarray, "q k"]
-    """Which of the database; -1 where fewer than k may be answers."""
+    """Row of each place in the database; -1 if fewer than k places can be returned."""
     distances: Float32[np.ndarray, "q k"]
-    """Of the descriptors; infinite there."""
+    """Descriptor distance of each place; infinite if fewer than k places can be returned."""
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def ids(self, query: int | np.integer) -> tuple[str, ...]:
-        """The names of the places found for a query, nearest first."""
+        """Return the names of the places found for a query, nearest first."""
         return tuple(self.database.ids[row] for row in self.rows[query] if row >= 0)
 
     def __str__(self) -> str:
-        """The nearest place of the queries that are least far from it."""
+        """Lists the queries with the smallest distances, and their nearest places."""
         found = int((self.rows[:, 0] >= 0).sum())
         best = np.argsort(self.distances[:, 0], kind="stable")[: min(SHOWN, found)]
         lines = (f"{self.queries.ids[q]} -> {self.ids(q)[0]}  {self.distances[q, 0]:.4f}" for q in best)
         where = f"{self.queries.sequence} in {self.database.sequence}"
-        return "\n".join([f"{found} of {len(self)} queries of {where} have an answer; the surest:", *lines])
+        return "\n".join([f"{found} of {len(self)} queries of {where} have a match; the nearest ones:", *lines])
 
 
 def nearest(
@@ -49,12 +49,23 @@ def nearest(
     exclude_frames: int = 50,
     exclude_s: float = 0.0,
 ) -> Nearest:
-    """Find the nearest `k` places of every query by the distance that their descriptor files name.
+    """Find the nearest `k` places of every query by the distance that the descriptor files name.
 
-    Without a `database` a query looks among the frames before it in its own recording, of which the last
-    `exclude_frames` and those less than `exclude_s` seconds old are left out: they show where it still is. Equally near
-    places come in the order of the database. Raises ValueError where the files are not of one method
-    and one set of weights, and for seconds where there are no times.
+    Arguments:
+      queries: Descriptors of the queries.
+      database: Descriptors to search. Without a database, each query is compared with the earlier frames of its own
+        recording.
+      k: Number of places for each query.
+      exclude_frames: Without a database, number of frames before the query that are excluded, because they are no
+        revisit.
+      exclude_s: Without a database, frames less than this number of seconds old are excluded, too.
+
+    Returns:
+      Rows and distances, nearest first. Places with equal distances are in the order of the database.
+
+    Raises:
+      ValueError: If the files have different methods or weights, if `k` is below 1, or if `exclude_s` is set and there
+        are no times.
 
     Example:
       print(nearest(file))              # places that one recording comes back to
@@ -80,7 +91,7 @@ def nearest(
 def _old_enough(
     file: DescriptorFile, block: Int[np.ndarray, " q"], frames: int, seconds: float
 ) -> Bool[np.ndarray, "q n"]:
-    """Which frames may be answers to the queries `block` of the same recording."""
+    """Which frames are old enough to be answers to the queries `block` of the same recording."""
     allowed = np.arange(len(file))[None, :] < block[:, None] - max(frames, 0)
     if seconds > 0 and file.times is not None:
         allowed &= file.times[block, None] - file.times[None, :] >= seconds
@@ -92,4 +103,4 @@ def _check(queries: DescriptorFile, database: DescriptorFile, k: int, seconds: f
     if k < 1:
         raise ValueError(f"expected k of 1 or more, found {k}")
     if seconds > 0 and queries.times is None:
-        raise ValueError(f"sequence {queries.sequence}: expected times to leave out seconds by, found none")
+        raise ValueError(f"sequence {queries.sequence}: expected times for excluding recent seconds, found none")

@@ -1,4 +1,4 @@
-"""Descriptor files of a method and a corruption, used again only if they were made with the same settings."""
+"""Descriptor files of a method and a corruption, reused only if they were made with the same settings."""
 
 import dataclasses
 import hashlib
@@ -16,7 +16,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
 
 SETTINGS = "made_with"
-"""The key of a descriptor file's `config` under which they stand."""
+"""Key of the settings in the `config` of a descriptor file."""
 
 
 def embed_or_reuse(
@@ -30,10 +30,20 @@ def embed_or_reuse(
     title: str = "",
     progress: Progress = no_progress,
 ) -> DescriptorFile:
-    """Describe the corrupted recording and write the file; read it where it is there already.
+    """Describe the corrupted recording and write the descriptor file. If the file exists, read it instead.
 
-    `progress` shows under the `title` how many scans are done. Raises ValueError where the file was made with other
-    settings, on other scans or with other weights.
+    Arguments:
+      path: Descriptor file.
+      method: Method that describes the scans.
+      recording: Recording without corruption.
+      corruption: Corruption of the scans.
+      seed: Seed of the corruption.
+      batch: Number of scans that a model describes at a time.
+      title: Title of the progress display.
+      progress: Progress display.
+
+    Raises:
+      ValueError: If the existing file was made with other settings, scans or weights.
     """
     wanted = _settings(method, recording, corruption, seed)
     if path.exists():
@@ -48,10 +58,11 @@ def embed_or_reuse(
 
 
 def fingerprint(recording: Recording) -> str:
-    """Name what a recording holds without reading its scans: ids, files, how they are read, positions and times.
+    """Hash a recording without reading its scans.
 
-    Of the files of scans and labels the size counts, and when they were last changed. Scans that are no files, as those
-    of a bag, are told by the rest.
+    The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels count by their
+    size and modification time. Scans that are not files of their own, such as those of a bag, are identified by the
+    other data.
     """
     scans, labels = ([_state(path) for path in paths] for paths in (recording.paths, recording.label_paths))
     mounting = None if recording.mounting is None else dataclasses.asdict(recording.mounting)
@@ -63,7 +74,7 @@ def fingerprint(recording: Recording) -> str:
 
 
 def _state(path: Path | None) -> tuple[int, int] | None:
-    """Size and last change of a file; None where there is none."""
+    """Size and modification time of a file, or None if it does not exist."""
     if path is None or not path.is_file():
         return None
     found = path.stat()
@@ -79,7 +90,7 @@ def _settings(method: Method, recording: Recording, corruption: Corruption, seed
         "weights": method.weights_hash,
         "method": method.about,
     }
-    return json.loads(json.dumps(settings))  # as it will be read again: lists in place of tuples
+    return json.loads(json.dumps(settings))  # Tuples become lists, as in a file.
 
 
 def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
@@ -89,6 +100,6 @@ def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
         if found.get(name) != value:
             raise ValueError(
                 f"{path}: expected descriptors made with {name} {json_in_short(value)}, found "
-                f"{json_in_short(found.get(name))}; name another --out, or delete the file"
+                f"{json_in_short(found.get(name))}; choose another --out, or delete the file"
             )
     return file

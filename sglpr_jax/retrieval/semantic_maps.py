@@ -1,4 +1,4 @@
-"""From a scan or a ready-made image to its semantic map, by the head that training uses."""
+"""Semantic maps of scans and ready-made images, by the segmentation head that training uses."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -23,26 +23,31 @@ from sglpr_jax.models.sglpr import segment
 
 
 class SemanticMap(NamedTuple):
-    """What a scan shows, cell by cell (h, w)."""
+    """Point counts and classes of the cells of a scan (h, w)."""
 
     counts: Float[np.ndarray, "h w"]
     predicted: Int[np.ndarray, "h w"]
-    """Class ids; 0 where no point fell, the network does not look or is not sure enough."""
+    """Predicted class ids; 0 for cells that are empty, outside the field of view, or uncertain."""
     truth: Int[np.ndarray, "h w"]
-    """The class of the last point; 0 in the same places, and where the scan has no label."""
+    """Class of the last point in each cell; 0 for cells that are empty, outside the field of view, or without a
+    label."""
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
-        """The cells that hold points and of which the network says something."""
+        """Cells that have a predicted class."""
         return self.predicted != UNLABELLED
 
 
 def semantic_map(params: Params, record: Record, *, min_confidence: float = 0.0) -> SemanticMap:
-    """Predict the class of every cell of a scan, or of a ready-made image, that holds a point.
+    """Predict the class of every occupied cell of a scan or a ready-made image.
 
-    An image is cut to the model's grid, and its pixels above 0 are the cells that hold a point. Labels of the record
-    become the true map. A class is as probable as in the mean over the scan and its mirror image. Cells whose likeliest
-    class is less probable than `min_confidence` are left unlabelled.
+    The probabilities are the mean over the image and its mirror image.
+
+    Arguments:
+      params: Weights of the model.
+      record: Scan, or ready-made image that is cropped to the model's grid. Cells above 0 are occupied. Labels of the
+        record become the true map.
+      min_confidence: Minimum probability of the most probable class. Cells below it stay unlabelled.
 
     Example:
       found = semantic_map(params, recording.record(0))
@@ -62,9 +67,14 @@ def semantic_maps(
     min_confidence: float = 0.0,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Iterator[tuple[int, Record, SemanticMap]]:
-    """Yield the row, the record and the semantic map of every scan of a recording, or of those in `rows`.
+    """Yield the row, the record and the semantic map of every scan of a recording, or of the given rows.
 
-    `on_progress` is told how many are done. See `semantic_map`.
+    Arguments:
+      params: Weights of the model.
+      recording: Scans or ready-made images.
+      rows: Rows of the recording, or None for all.
+      min_confidence: See `semantic_map`.
+      on_progress: Called with the number of finished scans.
     """
     for done, row in enumerate(range(len(recording)) if rows is None else rows):
         record = recording.record(row)
@@ -73,7 +83,7 @@ def semantic_maps(
 
 
 def save_map(path: Path, found: SemanticMap, record: Record, *, categories: int) -> None:
-    """Write a map as a PNG: class ids on the model's grid; of a ready-made image its label image, 0 beyond the grid."""
+    """Write the class ids of a map as a PNG. For a ready-made image, write its label image, with 0 outside the grid."""
     if record.image is None:
         pixels = found.predicted.astype(np.uint8)
     else:
@@ -95,9 +105,10 @@ def _maps(
 
 
 def _class_probabilities(params: Params, counts: Float[Array, "h w"]) -> Float[Array, "h w known"]:
-    """The mean over the image and its mirror image, of the classes that a cell with points in it can have.
+    """Returns the mean probabilities over the image and its mirror image, of all classes except unlabelled.
 
-    The network turns with the scan, so a turn would tell nothing new, but it does not mirror: two views for one.
+    The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds
+    information.
     """
     logits = segment(params, jnp.stack([counts, counts[:, ::-1]]))
     as_it_is, mirrored = jax.nn.softmax(logits[..., UNLABELLED + 1 :])

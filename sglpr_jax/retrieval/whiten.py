@@ -1,4 +1,4 @@
-"""Weights fitted to a sensor of one's own: its scans' descriptors say how the last layer spreads them."""
+"""Fits the whitening layer of a model to the scans of another sensor."""
 
 from collections.abc import Callable, Iterable
 
@@ -19,15 +19,21 @@ def whiten(
     power: float = WHITENING_POWER,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Params:
-    """`params` with a last layer fitted to the descriptors of all scans, in place of one that is there.
+    """Return the weights with a whitening layer fitted to the descriptors of all scans. It replaces an existing layer.
 
-    It needs neither labels nor poses. `power` says by which power of their spread principal components are divided: 1
-    evens out all. `on_progress` is told how many scans of a recording are done. So few scans that they say nothing of
-    some directions are told by a warning.
+    Labels and poses are not needed. If there are not more scans than numbers in a descriptor, a warning is issued.
+
+    Arguments:
+      params: Weights of the model.
+      recordings: Recordings of the sensor.
+      power: Principal components are divided by their spread to this power. With 1, all have equal spread.
+      on_progress: Called with the number of finished scans of a recording.
     """
     params = unwhitened(params)
     found = np.concatenate([embed(params, each, on_progress=on_progress).descriptors for each in recordings])
     n, d = found.shape
     if n <= d:
-        warn(f"expected more scans than a descriptor has numbers, {d}, to whiten with; better ten times, found {n}")
+        warn(
+            f"expected more than {d} scans for whitening (the length of a descriptor), better ten times that, found {n}"
+        )
     return whitened(params, found, power=power)

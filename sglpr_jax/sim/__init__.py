@@ -1,4 +1,4 @@
-"""A simulator of drives through a town: LiDAR scans with poses and semantic labels, free of anybody's licence."""
+"""Simulator of drives through towns: LiDAR scans with poses and semantic labels, without any dataset licence."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,7 @@ _HOME_OF = {
     "write_dataset": "dataset",
     "write_sessions": "dataset",
 }
-"""Where each name is defined, to be imported when it is first asked for."""
+"""Module of each public name. A module is imported when one of its names is first used."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Buildings: boxes at different depths with windows, porches, balconies and garages."""
+"""Buildings made of boxes at different depths, with windows, porches, balconies and garages."""
 
 import dataclasses
 
@@ -8,14 +8,14 @@ from sglpr_jax.sim.raw_ids import BUILDING
 from sglpr_jax.sim.things import Part, Thing
 
 _BELOW_M = 1.0
-"""How deep a building reaches into the ground, so that none hovers on a slope."""
+"""Depth of a building below the ground, in metres. It prevents gaps under buildings on slopes."""
 _FACADE_M = 0.06
-"""How uneven a facade is: in real scans the points of a metre of facade lie 4 cm (rms) off their plane."""
+"""Roughness of a facade, in metres. In real scans, points within 1 m of facade are 4 cm (rms) off their plane."""
 
 
 @dataclasses.dataclass(frozen=True)
 class House:
-    """The size of a house, metres, and the share of its facade that is window."""
+    """Size of a house in metres, and the fraction of its facade that is window."""
 
     width: float
     depth: float
@@ -24,16 +24,16 @@ class House:
 
 
 def _block(width: float, depth: float, height: float, x: float, front: float, glass: float) -> Part:
-    """A box whose front is at y = `front`, standing in the ground."""
+    """Box with its front at y = `front`. It extends below the ground."""
     size = width, depth, height + _BELOW_M
     return Part("box", BUILDING, size, x, front + depth / 2, -_BELOW_M, roughness=_FACADE_M, glass=glass)
 
 
 def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
-    """A house with the middle of its front at the origin; y leads into it.
+    """House with the middle of its front at the origin. The y axis points into the house.
 
-    Two of three have a recess or a wing: a second box at another depth. Some have balconies; where there is room in
-    front for a `porch`, some have one.
+    About two of three houses have a recess or a wing: a second box at another depth. Some houses have balconies. With
+    `porch`, which needs room in front of the house, some have a porch.
     """
     width, depth, height = plan.width, plan.depth, plan.height
     parts = [_block(width, depth, height, 0.0, 0.0, plan.glass)]
@@ -54,5 +54,5 @@ def house(rng: np.random.Generator, plan: House, *, porch: bool) -> Thing:
 
 
 def garage(rng: np.random.Generator, width: float) -> Thing:
-    """A garage or a shed, its front at the origin."""
+    """Garage or shed with its front at the origin."""
     return (_block(width, rng.uniform(4, 6.5), rng.uniform(2.2, 3.0), 0.0, 0.0, 0.0),)

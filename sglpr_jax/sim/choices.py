@@ -1,9 +1,9 @@
-"""What a drive is where a user chooses nothing else.
+"""Default settings of a simulated drive.
 
-Here, because a command line names it in its help without importing the rest.
+This module imports nothing, so a command line can show the defaults in its help without loading the simulator.
 """
 
 SCANS = 300
-"""Of each recording."""
+"""Number of scans of each recording."""
 RATE_HZ = 4.0
-"""Scans per second, so that at a car's speed they lie some 2 m apart; KITTI's car took 10."""
+"""Scans per second. At a car's speed, the scans are about 2 m apart. KITTI has 10 scans per second."""

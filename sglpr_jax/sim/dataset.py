@@ -1,4 +1,4 @@
-"""Simulated drives on disk, resumable: the same seed gives the same bytes."""
+"""Writing of simulated drives to disk. An interrupted run can be resumed, and the same seed gives the same bytes."""
 
 import dataclasses
 import functools
@@ -20,11 +20,11 @@ from sglpr_jax.sim.sessions import plan_sessions
 
 SETTINGS_FILE = "simulation.json"
 VERSION = 3
-"""Of what the simulator makes of a seed; a change in its scans needs a new one."""
+"""Version of the simulator's output. It changes whenever the scans of a seed change."""
 OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}
-"""Of fields of a scenery, as older datasets note them, and those of today."""
+"""Field names of a scenery in older datasets, and their current names."""
 WORKERS = 2
-"""Threads that render; the compiled program leaves other threads room."""
+"""Number of rendering threads. The compiled program leaves capacity for more than one."""
 
 Progress = Callable[[str, int, int], None]
 
@@ -42,15 +42,31 @@ def write_dataset(
     layout: str = "scans",
     progress: Progress | None = None,
 ) -> Path:
-    """Write the routes `names`, and the drives along the pose files `along`, into the folder `root`; return `root`.
+    """Writes simulated drives into a folder.
 
-    Every drive has a town of its own, drawn from `seed` and the drive's name, and `scans` scans (along a pose file: at
-    most so many, see `simulate_recording`). `layout` is "scans", "images" or "varied", see `LAYOUTS`. Files that are
-    there are kept, so a run that was cut off goes on where it stopped, to the same bytes; every file is whole or not
-    there. `progress(name, done, scans)` is called as scans are done.
+    Each drive has its own town, which depends on `seed` and the name of the drive. Existing files are kept. The same
+    call resumes an interrupted run and gives the same bytes. Files are written atomically.
 
-    Raises ValueError for unknown names, a rate not above 0, a seed below 0, malformed pose files, and where `root`
-    holds another dataset or one of other settings; OSError, with the file's name, where something cannot be written.
+    Arguments:
+      root: Output folder.
+      names: Routes, from `ROLES`.
+      along: KITTI pose files to drive along, see `read_path`.
+      scans: Number of scans of each drive. Along a pose file it is the maximum, see `simulate_recording`.
+      sensor: LiDAR.
+      seed: Seed of the towns, at least 0.
+      rate_hz: Scans per second of a route. Not used along pose files.
+      scenery: Scenery of the towns.
+      layout: "scans", "images" or "varied", see `LAYOUTS`.
+      progress: Function that is called as `progress(name, done, scans)` whenever scans are done.
+
+    Returns:
+      `root`.
+
+    Raises:
+      ValueError: A route or the layout is unknown, two drives have one name, or `scans` is below 2. Or `rate_hz` is
+        not positive, `seed` is negative, or a pose file is malformed. Or `root` holds other files, or a dataset with
+        other settings.
+      OSError: A file cannot be read or written. The message names the file.
     """
     check_drawing(rate_hz, seed)
     files = {**dict.fromkeys(names), **{name_of_path(file): file for file in along}}
@@ -86,10 +102,10 @@ def write_sessions(
     scenery: Scenery = TOWN,
     progress: Progress | None = None,
 ) -> Path:
-    """Write one town on several days into the folder `root`, in NCLT's layout; return `root`.
+    """Writes one town on several days into the folder `root`, in NCLT's layout, and returns `root`.
 
-    Of the arguments and the drives see `plan_sessions`, of files, progress and errors `write_dataset`. Sessions cannot
-    be added: with more days the streets are others.
+    `plan_sessions` describes the other arguments and the drives. `write_dataset` describes files, progress and errors.
+    Sessions cannot be added to a dataset, because the streets depend on the number of days.
     """
     what = {"route": route, "scans": scans, "seed": seed, "rate_hz": rate_hz}
     sessions = plan_sessions(dates, sensor=sensor, scenery=scenery, **what)
@@ -101,19 +117,19 @@ def write_sessions(
 
 
 def _settings(sensor: Sensor, scenery: Scenery) -> dict:
-    """What is noted of all datasets."""
+    """Settings that are stored with every dataset."""
     return {"version": VERSION, "sensor": dataclasses.asdict(sensor), "scenery": dataclasses.asdict(scenery)}
 
 
 def _fingerprint(file: Path | None) -> str:
-    """What tells one way from another; reads the file whole, so that a malformed one is noticed first."""
+    """Hash of a pose file, or "route". The whole file is read, so a malformed file raises an error early."""
     if file is None:
         return "route"
     return hashlib.sha256(b"".join(values.tobytes() for values in read_path(file))).hexdigest()[:16]
 
 
 def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
-    """Note settings and ways in `root`, or make sure that they are those already there; new drives may be added."""
+    """Stores settings and drives in `root`, or checks that they match the stored ones. New drives are added."""
     path = root / SETTINGS_FILE
     if path.exists():
         found = _read_settings(path)
@@ -121,7 +137,7 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
         raise ValueError(f"{root} holds files that were not simulated (no {SETTINGS_FILE}); choose another folder")
     else:
         found = {}
-    expected = json.loads(json.dumps({**settings, **ways}))  # as JSON gives them back: tuples are lists
+    expected = json.loads(json.dumps({**settings, **ways}))  # as read from JSON: tuples become lists
     claimed = {**(found or expected), **{way: ways[way] for way in ways if way not in found}}
     different = [key for key, value in expected.items() if claimed.get(key) != value]
     if different:
@@ -132,7 +148,7 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    """The settings that were noted, by the names of today; datasets of before there were sceneries are towns."""
+    """Stored settings with the current field names. Older datasets without a scenery have `TOWN`."""
     settings = read_json(path)
     scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
     if not isinstance(scenery, dict):
@@ -150,7 +166,7 @@ def _write_drive(
     layout: Layout,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Write what is missing of one drive; its town is built only where something is."""
+    """Writes the missing files of one drive. The town is built only if files are missing."""
     scans = len(ids)
     missing = [i for i in range(scans) if not all(file.exists() for file in layout.files_of_scan(root, name, ids[i]))]
     progress(scans - len(missing), scans)
@@ -175,6 +191,6 @@ def _write_drive(
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
+    """Writes a file atomically."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)

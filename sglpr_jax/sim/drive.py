@@ -1,4 +1,4 @@
-"""Where the vehicle goes and when: along one of the eleven routes, or along a given pose file."""
+"""Path and times of the vehicle, along one of the eleven routes or along a given pose file."""
 
 import hashlib
 import math
@@ -17,46 +17,51 @@ from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.routes import ROLES, STEP_M, plan_route, travelled
 
 PATH_HZ = 10.0
-"""Poses per second, roughly, of the path between scans."""
+"""Approximate number of poses per second along the path. The scans use some of these poses."""
 SHORTEST_S = 60.0
-"""Of a drive; a shorter one could not come back after 30 s. Few scans are spread over that time."""
+"""Minimum duration of a drive, in seconds. It allows revisits after 30 s. Few scans are spread over this time."""
 LANE_M = (0.9, 1.6)
-"""How far right of the middle of the street the vehicle keeps; both directions mostly lie within 3 m."""
+"""Range of the vehicle's distance to the right of the middle of the street, in metres.
+
+The paths of both directions are mostly within 3 m of each other.
+"""
 SWAY_WAVELENGTH_M = (60.0, 150.0)
 STEERING_M = 3.0
-"""Width of the Gaussian that smooths the path once more: a steering wheel does not jump."""
+"""Standard deviation of the Gaussian that smooths the path, in metres. A steering wheel does not jump."""
 LATERAL_ACCELERATION = 2.0
 ACCELERATION = 1.5
-"""In metres per square second, as is the lateral one: how fast a corner is taken, and how fast speeds change."""
+"""Maximum lateral and longitudinal acceleration, in m/s^2. They limit speed in corners and changes of speed."""
 TILT_DEG = 0.6
-"""Standard deviation of pitch and of roll against the ground: springs, bumps, and a road that is not quite smooth."""
+"""Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
 TILT_S = 0.5
-"""About how long a tilt lasts."""
+"""Approximate duration of a tilt, in seconds."""
 FREE_SPEED = 1.35
-"""Speed on a free street, as a multiple of the mean one."""
+"""Speed on a free street, as a multiple of the mean speed."""
 
 
 class PlanarPath(NamedTuple):
-    """The vehicle's way in the plane."""
+    """Path of the vehicle in the plane, with times."""
 
-    xy: np.ndarray  # (n, 2) metres, of the LiDAR
-    yaw: np.ndarray  # (n,) radians, where the vehicle heads
+    xy: np.ndarray  # (n, 2) position of the LiDAR, metres
+    yaw: np.ndarray  # (n,) heading of the vehicle, radians
     times: np.ndarray  # (n,) seconds, from 0
 
 
 class TimedPoses(NamedTuple):
-    """Where the LiDAR was, and when."""
+    """Poses of the LiDAR and their times."""
 
     world_from_lidar: np.ndarray  # (n, 4, 4) float64; x forward, y left, z up, metres
     times: np.ndarray  # (n,) seconds
 
 
 def plan_scan_path(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> PlanarPath:
-    """Return where the `scans` scans of route `name` are taken, evenly spread in time.
+    """Returns the poses of the `scans` scans of route `name`, evenly spaced in time.
 
-    The route is as long as a car gets in `scans / rate_hz` seconds, but takes SHORTEST_S at least. The vehicle keeps to
-    the right and sways a little, differently on every visit; it slows down in corners. Raises ValueError for an unknown
-    name.
+    The drive lasts `scans / rate_hz` seconds, but at least SHORTEST_S. The vehicle keeps right with a small sway that
+    differs between visits. It slows down in corners.
+
+    Raises:
+      ValueError: The route is unknown.
     """
     return thinned(plan_path(rng, name, scans=scans, rate_hz=rate_hz), scans)
 
@@ -64,9 +69,10 @@ def plan_scan_path(rng: np.random.Generator, name: str, *, scans: int, rate_hz: 
 def plan_path(
     rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ, days: int = 1
 ) -> PlanarPath:
-    """Return the whole way of `plan_scan_path`, a pose about every 0.1 s: a whole multiple of `scans * days` poses.
+    """Returns the complete path of `plan_scan_path`, with a pose about every 0.1 s.
 
-    With more than one `days`, equal parts of it are that many drives through the same streets, one after the other.
+    The number of poses is a multiple of `scans * days`. If `days` is above 1, the path has one part for each day. The
+    parts are equally long and use the same streets.
     """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
@@ -77,9 +83,9 @@ def plan_path(
 
 
 def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
-    """Return the drive along `line` with a pose about every 0.1 s: a whole multiple of `poses`.
+    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `poses`.
 
-    `free_mps` is the mean speed where nothing slows the vehicle down. It is slower in corners.
+    `free_mps` is the mean speed on free streets, in m/s. The vehicle is slower in corners.
     """
     heading = np.unwrap(np.arctan2(*np.gradient(line, axis=0).T[::-1]))
     clock = _clock(rng, line, heading, free_mps)
@@ -89,10 +95,14 @@ def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps:
 
 
 def read_path(file: Path) -> PlanarPath:
-    """Return the way of a KITTI pose file: 12 numbers a line, the camera's pose; 0.1 s a line.
+    """Reads the path of a KITTI pose file, with the camera's pose as 12 numbers per line.
 
-    Where a `times.txt` lies beside it, the times are its. Distances in x and y are exactly the file's; heights, pitch
-    and roll are dropped. Raises FileNotFoundError, and ValueError naming file, line, what was expected and found.
+    Times come from a `times.txt` in the same folder. Without it, the lines are 0.1 s apart. Distances in x and y are
+    those of the file. Height, pitch and roll are dropped.
+
+    Raises:
+      FileNotFoundError: The file does not exist.
+      ValueError: A file is malformed. The message names file and line, and what was expected and found.
     """
     poses = read_poses(file)
     if len(poses) < 2:
@@ -109,27 +119,27 @@ def read_path(file: Path) -> PlanarPath:
 
 
 def name_of_path(file: Path) -> str:
-    """The name of the drive along a pose file: the file's stem, or its folder's name for a `poses.txt`."""
+    """Name of the drive along a pose file: the stem of the file, or the name of its folder for a `poses.txt`."""
     return file.resolve().parent.name if file.name == "poses.txt" else file.stem
 
 
 def thinned(path: PlanarPath, scans: int) -> PlanarPath:
-    """Every k-th pose, with the smallest k that leaves at most `scans` of them."""
+    """Returns every k-th pose, with the smallest k that gives at most `scans` poses."""
     return PlanarPath(*(values[every_kth(path, scans)] for values in path))
 
 
 def every_kth(path: PlanarPath, scans: int) -> slice:
-    """Which poses of `path` are those of `thinned`."""
+    """Indices of the poses that `thinned` keeps."""
     return slice(None, None, -(-len(path.times) // scans))
 
 
 def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
-    """How fast the vehicle is at every pose, in metres per second."""
+    """Speed of the vehicle at each pose, in m/s."""
     return np.linalg.norm(np.gradient(path.xy, path.times, axis=0), axis=1)
 
 
 def check_drawing(rate_hz: float, seed: int) -> None:
-    """Raise ValueError for scans per second, or for a seed, that no drive can be drawn with."""
+    """Raises ValueError if `rate_hz` is not positive and finite, or if `seed` is negative."""
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ValueError(f"rate_hz: expected scans per second, more than 0, found {rate_hz}")
     if seed < 0:
@@ -137,16 +147,16 @@ def check_drawing(rate_hz: float, seed: int) -> None:
 
 
 def drive_seed(seed: int, name: str) -> tuple[int, int]:
-    """The seed of one drive of a dataset: drives of other names are others."""
+    """Seed of one drive of a dataset. It depends on the name of the drive."""
     return seed, int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
 
 
 def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Return pitch and roll of the vehicle's body against the ground at `times`, radians."""
+    """Draws pitch and roll of the vehicle's body relative to the ground at `times`, in radians."""
     steps = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
     width = TILT_S * PATH_HZ
     noise = gaussian_filter1d(rng.normal(size=(len(steps), 2)), width, axis=0, mode="wrap")
-    noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # the filter had made it smaller
+    noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # undoes the loss of variance in the filter
     return np.stack([np.interp(times, steps, axis) for axis in noise.T], axis=1)
 
 
@@ -158,9 +168,10 @@ def poses_on(
     height_m: float,
     tilt: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Return world_from_lidar for a vehicle on hills: z along the ground's normal, x forward, `height_m` above it.
+    """Returns world_from_lidar of a vehicle on hills: x points forward, z along the normal of the ground.
 
-    `tilt` is pitch and roll (radians) against the ground, see `body_tilt`.
+    The LiDAR is `height_m` above the ground along the normal. `tilt` is pitch and roll relative to the ground, in
+    radians, see `body_tilt`.
     """
     slope = relief_gradient(relief, xy)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -179,13 +190,13 @@ def poses_on(
 
 
 def _waves(rng: np.random.Generator, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """A slow random curve along a path, between -1 and 1."""
+    """Slowly varying random values along a path, between -1 and 1."""
     wavelengths, phases = rng.uniform(*SWAY_WAVELENGTH_M, 3), rng.uniform(0, 2 * np.pi, 3)
     return np.sin(2 * np.pi * length[:, None] / wavelengths + phases).mean(axis=1)
 
 
 def _in_lane(rng: np.random.Generator, middle: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """`middle` moved to the right, with a slow sway."""
+    """`middle` shifted to the right, with a slow sway."""
     offset = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * _waves(rng, travelled(middle))
     tangent = np.gradient(middle, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -196,7 +207,7 @@ def _in_lane(rng: np.random.Generator, middle: Float[np.ndarray, "n 2"]) -> Floa
 def _clock(
     rng: np.random.Generator, path: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], free_mps: float
 ) -> Float[np.ndarray, " n"]:
-    """When each point of `path` is passed: as fast as streets and corners allow, with a car's accelerations."""
+    """Time of each point of `path`, for the highest speed that streets, corners and a car's acceleration allow."""
     length = travelled(path)
     curvature = np.abs(np.gradient(heading, length)).clip(min=1e-6)
     limit = np.minimum((free_mps * (1 + 0.2 * _waves(rng, length))) ** 2, LATERAL_ACCELERATION / curvature)

@@ -1,6 +1,6 @@
-"""What stands along one side of a street: on the strips beside the road, and on the plots behind them.
+"""Things along one side of a street: on the strips beside the road, and on the plots behind the strips.
 
-Everything is placed in the side's own frame: s runs along the street, d leads outwards from the kerb.
+Positions are in the frame of the side: s is the distance along the street, d the distance outwards from the kerb.
 """
 
 import itertools
@@ -14,19 +14,19 @@ from sglpr_jax.sim.styles import Side, draw_house
 from sglpr_jax.sim.things import Part, Placed, Range, Thing, Zone
 
 Clock = tuple[float, float]
-"""When the drive begins and ends, seconds."""
+"""Start and end of a period, such as the drive, in seconds."""
 STAY_S = 600.0
-"""How long a parked car stays, on average."""
+"""Mean time that a parked car stays, in seconds."""
 CHANGING_BUSHES = 0.1
-"""Share of the bushes that are there only for a while: they grow and are cut between two visits."""
+"""Fraction of the bushes that are present only temporarily. They model growth and cutting between two visits."""
 
 
 def frontage(
     rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock, bystanders: Iterator[Callable]
 ) -> Iterator[Placed]:
-    """Yield all that stands along one side from s = `start` to `stop`, where no other street joins.
+    """Yields the things along one side from s = `start` to `stop`, where no other street joins.
 
-    `bystanders` yields the makers of people, bicycles and the like, in the order in which they shall occur.
+    `bystanders` yields functions that draw people, bicycles and similar things, in the order of their use.
     """
     if side.bays:
         yield from _parked_cars(rng, side, start, stop, clock)
@@ -50,7 +50,7 @@ def frontage(
 
 
 def _steps(rng: np.random.Generator, start: float, stop: float, spacing: Range) -> Iterator[float]:
-    """Yield places from `start` to `stop`, randomly spaced."""
+    """Yields randomly spaced positions from `start` to `stop`."""
     place = start + rng.uniform(0, spacing[1])
     while place < stop:
         yield place
@@ -62,7 +62,10 @@ def _poisson(rng: np.random.Generator, per_metre: float, start: float, stop: flo
 
 
 def stays(rng: np.random.Generator, clock: Clock, occupied: float, stay_s: float = STAY_S) -> Iterator[Clock]:
-    """Yield when a place that is taken for a share `occupied` of the time is taken: stays of `stay_s` on average."""
+    """Yields the stays at a place that is occupied for the fraction `occupied` of the time.
+
+    A stay lasts `stay_s` seconds on average. A stay that exists at the start of the drive begins at -inf.
+    """
     time = clock[0]
     taken = rng.random() < occupied
     while time < clock[1]:
@@ -82,7 +85,7 @@ def _changing(
     clock: Clock,
     occupied: float,
 ) -> Iterator[Placed]:
-    """Yield what stands at one place, one after the other."""
+    """Yields the things that occupy one place one after another."""
     for since, until in stays(rng, clock, occupied):
         shift, turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
         yield Placed(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, zone, since, until)
@@ -96,7 +99,7 @@ def _parked_cars(rng: np.random.Generator, side: Side, start: float, stop: float
 
 
 def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
-    """Lamp posts, signs and bins at the inner edge of the sidewalk."""
+    """Lamp posts, bins, benches, posts and signs at the edge of the sidewalk nearest to the road."""
     d = side.verge - side.strips[-1].width + 0.35 if side.strips else 0.7
     zone: Zone = "verge" if side.strips else "plot"
     if side.style.lamps:
@@ -116,7 +119,7 @@ def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: 
 
 
 def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
-    """Street trees, on the median where there is one; a highway's median has a guard rail instead."""
+    """Street trees, on the median if the street has one. The median of a highway has a guard rail instead."""
     if side.median and side.border == "rail":
         yield from _in_pieces(rng, "rail", start, stop, side.median / 2, "verge")
         return
@@ -136,7 +139,7 @@ def _tree(rng: np.random.Generator, side: Side, spread: Range) -> Thing:
 
 
 _BORDERS: dict[str, tuple[float, Range, float]] = {
-    # thickness, range of heights, share of the line that is closed
+    # thickness and range of heights in metres, fraction of the line that is closed
     "hedge": (1.0, (0.9, 2.6), 0.9),
     "trimmed": (0.8, (0.9, 2.2), 0.9),
     "hedgerow": (0.3, (1.2, 3.0), 0.95),
@@ -167,7 +170,7 @@ def _piece(rng: np.random.Generator, border: str, length: float, thickness: floa
 
 
 def _lattice(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
-    """A low fence that one sees through, on posts, with a bush behind it here and there."""
+    """Low see-through fence on posts, with a bush behind some pieces."""
     size, porosity = (length, thickness, height + 0.3), rng.uniform(0.4, 0.8)
     parts = [
         Part("box", FENCE, size, bottom=-0.3, porosity=porosity),
@@ -182,7 +185,7 @@ def _lattice(rng: np.random.Generator, length: float, thickness: float, height: 
 def _in_pieces(
     rng: np.random.Generator, border: str, start: float, stop: float, d: float, zone: Zone
 ) -> Iterator[Placed]:
-    """A line along the street, in short pieces so that it follows curves and slopes."""
+    """Border along the street, in short pieces that follow curves and slopes."""
     thickness, heights, _ = _BORDERS[border]
     height = rng.uniform(*heights)
     count = int((stop - start) / 5) + 1
@@ -192,7 +195,7 @@ def _in_pieces(
 
 
 def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
-    """What closes the plots off from the sidewalk, with entrances between."""
+    """Border between the plots and the sidewalk, with entrances."""
     if side.border == "none":
         return
     thickness, _, closed = _BORDERS[side.border]
@@ -206,7 +209,7 @@ def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> 
 
 
 def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
-    """The row of houses; gaps hold cars, a garage, a wall or a hedge between neighbours."""
+    """Row of houses. Gaps between houses may hold cars, a garage, a wall or a hedge."""
     style = side.style
     s = start + max(rng.uniform(*style.gap), 0) / 2
     while s < stop - 3.5:
@@ -238,7 +241,7 @@ def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, 
 
 
 def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
-    """Trees and bushes on the plots, more of them near the street."""
+    """Trees and bushes on the plots, most of them near the street."""
     for s in _poisson(rng, side.style.trees, start, stop):
         d, kind = side.verge + 1.0 + 14 * rng.random() ** 2, rng.random()
         if kind < 0.28:
@@ -252,7 +255,7 @@ def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, c
 
 
 def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
-    """The edge of a wood, some rows deep."""
+    """Edge of a wood, three rows deep."""
     edge = side.verge + rng.uniform(2.5, 6)
     for row in range(3):
         for s in _steps(rng, start, stop, (3.0 + row, 5.5 + 2 * row)):
@@ -260,7 +263,7 @@ def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> It
 
 
 def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
-    """Ground that rises beside the road, with bushes on it."""
+    """Banks beside the road, with bushes on them."""
     for s in _steps(rng, start, stop, (9.0, 14.0)):
         length, width, height = rng.uniform((16, 9, 1.5), (30, 16, 4.0)).tolist()
         bank = Part("ellipsoid", TERRAIN, (length, width, 2 * height), bottom=-height, roughness=0.02)
@@ -272,7 +275,7 @@ def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
 
 
 def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
-    """The foot of a hill: long mounds that lie deep in the ground and overlap."""
+    """Foot of a hill: long, overlapping mounds that are mostly below the ground."""
     length, width, height, sunk = rng.uniform((20, 16, 3.0, 0.3), (35, 50, 8.0, 0.8)).tolist()
     for s in _steps(rng, start, stop, (5.0, 7.0)):
         across = width * rng.uniform(0.95, 1.05)
@@ -281,13 +284,16 @@ def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> I
 
 
 def bin_or_bench(rng: np.random.Generator) -> Thing:
-    """What has no class of its own."""
+    """Bin or bench, as a box of the class other-object."""
     length, width, height = rng.uniform((0.5, 0.5, 0.8), (1.8, 0.8, 1.3)).tolist()
     return (Part("box", OTHER_OBJECT, (length, width, height)),)
 
 
 def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], Thing]]:
-    """Yield makers without end; every kind comes once in any ten."""
+    """Yields functions that draw bystanders, without end.
+
+    Each block of ten contains three people, three bicycles and one of each other kind.
+    """
     person, bicycle = vehicles.person, vehicles.bicycle
     kinds = [person, person, person, bicycle, bicycle, bicycle]
     kinds += [vehicles.bicyclist, vehicles.motorcycle, vehicles.motorcyclist, bin_or_bench]

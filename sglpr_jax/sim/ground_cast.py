@@ -1,12 +1,12 @@
-"""Where rays meet the ground: hills with kerbs on them.
+"""Intersection of rays with the ground: hills with kerbs.
 
-Along one ray, the ground is taken for a parabola that starts with the height and slope below the sensor, so that the
-ray meets it by a quadratic equation. The first parabola has the curvature below the sensor too, and tells about where
-the ray meets the ground; the second one passes through the true height there.
+Along a ray, a parabola approximates the ground, so the intersection is the solution of a quadratic equation. Two
+parabolas are used, both with the height and slope of the ground below the sensor. The first one also has the curvature
+there and gives the approximate distance. The second one passes through the true height at that distance.
 
-That is made for the gentle hills of towns, where hits are off by at most .04 m at 30 to 40 m and .21 m at 40 to 60 m.
-In the outskirts they are off by up to .04 m up to 20 m, 6 % of them by more than .2 m at 30 to 40 m (at most .85 m),
-and 14 % by more than .2 m at 40 to 60 m. Shapes stand on the true height.
+The approximation is made for the gentle hills of towns. Its error is at most .04 m at distances of 30 to 40 m, and
+.21 m at 40 to 60 m. In the outskirts, errors are up to .04 m within 20 m. At 30 to 40 m, 6 % of the errors exceed .2 m
+(maximum .85 m). At 40 to 60 m, 14 % exceed .2 m. Shapes stand on the true height.
 """
 
 from typing import NamedTuple
@@ -29,23 +29,23 @@ from sglpr_jax.sim.ground import (
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 
 _NEAR_M = 3.0
-"""The parabola is fitted no nearer than this: there the hills bend by less than a millimetre."""
+"""Minimum distance of the fitted point, in metres. At smaller distances, hills bend by less than a millimetre."""
 
 
 class GroundView(NamedTuple):
-    """The ground around a sensor that is at the origin of x and y; arrays of one size for every scan."""
+    """Ground around a sensor at x = y = 0. Array shapes are the same for every scan."""
 
     label: AnyArray  # (rows, columns) uint8 raw ids of the cells
     corner: AnyArray  # (2,) x and y of the raster's first corner, metres
-    relief: Relief  # its phases count from the sensor's x and y
-    sensor_z: AnyArray  # () metres, in the world frame
-    height: AnyArray  # () metres, of the sensor above the road level below it
-    gradient: AnyArray  # (2,) slope of the road level there, along x and y
-    curvature: AnyArray  # (2, 2) its second derivatives, 1 / metres
+    relief: Relief  # with phases relative to the sensor's x and y
+    sensor_z: AnyArray  # () z of the sensor in the world frame, metres
+    height: AnyArray  # () height of the sensor above the road level below it, metres
+    gradient: AnyArray  # (2,) slope of this road level along x and y
+    curvature: AnyArray  # (2, 2) second derivatives of this road level, 1 / metres
 
 
 def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: float) -> GroundView:
-    """The ground up to `reach_m` around a sensor at `sensor`, in the world frame."""
+    """Crops the ground to `reach_m` around a sensor at the world position `sensor`."""
     xy, relief = sensor[:2], ground.relief
     near = ground.around(xy, reach_m)
     local = relief._replace(phase=(relief.wave @ xy + relief.phase) % (2 * np.pi))
@@ -63,11 +63,11 @@ def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: floa
 def meet_ground(
     rays: Vectors, ground: GroundView, *, reach_m: float
 ) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"], Float[Array, "*rays"]]:
-    """Return distance, label and facing of the ground that each ray from the sensor meets.
+    """Returns distance, label and facing of the ground hit by each ray from the sensor.
 
-    `rays` are of length 1, along the world's axes. Facing is the cosine between ray and normal. A ray that meets no
-    ground has distance inf; beyond `reach_m`, distances are rough. A ray into a kerb's face gets the label of what lies
-    behind the kerb, and the distance at which it would meet the road there.
+    `rays` are unit vectors in the world's axes. Facing is the cosine of the angle between ray and normal. A ray that
+    misses the ground has distance inf. Beyond `reach_m`, distances are rough. A ray that hits the vertical face of a
+    kerb gets the label of the ground behind the kerb, and the distance at which it would hit the road there.
     """
     slope = ground.gradient[0] * rays.x + ground.gradient[1] * rays.y
     curvature, closing = ground.curvature, slope - rays.z
@@ -86,19 +86,19 @@ def meet_ground(
 
 
 def _height(relief: Relief, x: Array, y: Array) -> Array:
-    """Height of the road level at x and y, metres."""
+    """Height of the road level at x and y, in metres."""
 
     def add_wave(height: Array, wave: Relief) -> tuple[Array, None]:
         return height + wave.amplitude * jnp.sin(wave.wave[0] * x + wave.wave[1] * y + wave.phase), None
 
-    # A loop, for XLA would compute a plain sum anew for each of its uses, and sines take long.
+    # A loop, because XLA would recompute a plain sum at each of its uses, and sines are slow.
     return jax.lax.scan(add_wave, jnp.zeros_like(x), relief)[0]
 
 
 def _crossing(bend: Array, closing: Array, height: AnyArray) -> Array:
-    """The first t > 0 at which the ray is in the ground: bend t^2 + closing t > height; inf where there is none.
+    """Smallest t > 0 at which the ray enters the ground: bend t^2 + closing t = height; inf if it never does.
 
-    This form of the root holds for bend = 0 as well. `height` is positive.
+    This form of the root also holds for bend = 0. `height` is positive.
     """
     discriminant = closing**2 + 4 * bend * height
     slope = closing + jnp.sqrt(jnp.maximum(discriminant, 0))

@@ -1,4 +1,4 @@
-"""How a simulated drive lies on disk: scans in KITTI's layout or NCLT's, or images with label images in BEVPlace's."""
+"""File layouts of simulated drives: scans as in KITTI or NCLT, or images with label images as in BEVPlace."""
 
 import io
 from collections.abc import Callable
@@ -20,29 +20,32 @@ from sglpr_jax.sim.variety import vary
 
 
 class Layout(NamedTuple):
-    """The files of a drive, all named relative to the dataset's folder."""
+    """Folder, file names and file contents of a drive."""
 
     folder: str
-    """Of the drive `{name}`."""
+    """Folder of drive `{name}`, relative to the dataset's folder."""
     scan_files: tuple[str, ...]
-    """Of scan `{id}`."""
+    """Files of scan `{id}`, relative to the drive's folder."""
     scan_contents: Callable[[np.ndarray, np.ndarray, Mounting | None], tuple[bytes, ...]]
-    """What is in them, from points (n, 4), labels (n,), and how the sensor was mounted (None: as models know it)."""
+    """Function that returns the contents of these files from points (n, 4), labels (n,) and the sensor's mounting.
+
+    A mounting of None is the mounting that the models expect.
+    """
     drive_contents: Callable[[TimedPoses], dict[str, bytes]]
-    """The files of the drive as a whole, by their names, written when all its scans are there."""
+    """Function that returns the files of the whole drive by name. They are written after all scans."""
     last_file: str
-    """Of these; says that the drive is finished."""
+    """Last of the files of the whole drive. If it exists, the drive is complete."""
 
     def files_of_scan(self, root: Path, name: str, id: str) -> tuple[Path, ...]:
-        """Where scan `id` of drive `name` lies."""
+        """Paths of the files of scan `id` of drive `name`."""
         return tuple(root / self.folder.format(name=name) / file.format(id=id) for file in self.scan_files)
 
     def file_of_drive(self, root: Path, name: str, file: str) -> Path:
-        """Where one of the files of drive `name` as a whole lies."""
+        """Path of a file of the whole drive `name`."""
         return root / self.folder.format(name=name) / file.format(name=name)
 
     def is_finished(self, root: Path, name: str) -> bool:
-        """Whether drive `name` was written to its end."""
+        """Whether drive `name` is complete."""
         return self.file_of_drive(root, name, self.last_file).exists()
 
 
@@ -55,9 +58,9 @@ def _points_and_labels(
 def _image_and_labels(
     points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None
 ) -> tuple[bytes, ...]:
-    """A density image and the raw ids of what its pixels show; an empty pixel shows nothing.
+    """Density image, and image of the raw ids of its pixels. Empty pixels have the id 0.
 
-    Images are those of a sensor at the height that models know, as those made of the drive's scans are.
+    The scan is first levelled to the height that the models expect, as in images made from the drive's scans.
     """
     xyz = points[:, :3].astype(np.float32)
     return _pngs(xyz if mounting is None else mounting.level(xyz), labels)
@@ -66,7 +69,7 @@ def _image_and_labels(
 def _varied_image_and_labels(
     points: Float[np.ndarray, "n 4"], labels: np.ndarray, mounting: Mounting | None
 ) -> tuple[bytes, ...]:
-    """The same of a varied scan."""
+    """Density image and label image of a scan after `vary`."""
     return _pngs(*vary(points[:, :3].astype(np.float32), labels, mounting))
 
 
@@ -87,9 +90,9 @@ def _row(matrix: Float[np.ndarray, "r 4"]) -> str:
 
 
 def _kitti_files(poses: TimedPoses) -> dict[str, bytes]:
-    """Calibration, times and poses; nothing here has a camera, so its projections are identities.
+    """Calibration, times and poses. The simulator has no camera, so the projections are identities.
 
-    A line of poses.txt is world_from_camera, in a world whose axes are a camera's as well.
+    A line of poses.txt is world_from_camera. The axes of its world are those of a camera, too.
     """
     projections = "".join(f"P{i}: {_row(np.eye(4))}" for i in range(4))
     world_from_camera = CAMERA_FROM_LIDAR @ poses.world_from_lidar @ CAMERA_FROM_LIDAR.T
@@ -105,10 +108,10 @@ def _bevplace_files(poses: TimedPoses) -> dict[str, bytes]:
 
 
 def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: Mounting | None) -> tuple[bytes, ...]:
-    """Return the bytes of a scan in NCLT's body frame: x forward, y right, z down, from the ground below the sensor.
+    """Returns the bytes of a scan in NCLT's body frame: x forward, y right, z down, origin on the ground.
 
-    `points` are metres from the sensor, z up, and reflectivities 0 to 1. Lasers are not told apart. NCLT's numbers
-    reach from -100 to 227 m in steps of 5 mm.
+    `points` are x, y, z in metres from the sensor, with z up, and reflectivities from 0 to 1. All points have laser 0.
+    NCLT's coordinates range from -100 to 227 m in steps of 5 mm.
     """
     above_ground = np.add(points[:, :3].astype(np.float64), [0, 0, NCLT_HEIGHT_M])
     body = above_ground * Z_UP_FROM_Z_DOWN
@@ -119,7 +122,7 @@ def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: 
 
 
 def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
-    """The ground truth, north, east, down: one row per scan, where NCLT has a hundred a second."""
+    """Ground truth in the axes north, east, down. It has one row per scan; NCLT has 100 rows per second."""
     lidar_from_body = np.eye(4)
     lidar_from_body[2, 3] = -NCLT_HEIGHT_M
     world_from_body = poses.world_from_lidar @ lidar_from_body
@@ -132,7 +135,7 @@ def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
 
 
 def to_utime(seconds: float) -> int:
-    """Return seconds since 1970 as the whole microseconds that name NCLT's scans."""
+    """Converts seconds since 1970 to whole microseconds, which are the names of NCLT's scans."""
     return round(seconds * 1e6)
 
 
@@ -161,5 +164,8 @@ LAYOUTS = {
         last_file="groundtruth_{name}.csv",
     ),
 }
-"""KITTI odometry's and SemanticKITTI's layout; BEVPlace's density images, which have no times, with label images;
-NCLT's sessions, which have no labels."""
+"""Layouts by name.
+
+"scans" is the layout of KITTI odometry and SemanticKITTI. "images" and "varied" hold BEVPlace's density images with
+label images, without times. "nclt" is the layout of NCLT's sessions, without labels.
+"""

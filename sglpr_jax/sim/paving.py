@@ -1,4 +1,4 @@
-"""What the ground is called, painted from the distance to the nearest street."""
+"""Painting of the ground's labels by the distance to the nearest street."""
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -9,14 +9,14 @@ from sglpr_jax.sim.raw_ids import LANE_MARKING, OTHER_GROUND, ROAD, TERRAIN
 from sglpr_jax.sim.streets import Island, Network, Stretch
 
 REACH_M = 40.0
-"""How far from the nearest street the ground is painted; farther out it is terrain."""
+"""Maximum distance of painted ground from a street, in metres. Farther ground is terrain."""
 GARDEN_M = 30.0
-"""How far the gardens reach behind the sidewalk."""
+"""Depth of the gardens behind the sidewalk, in metres."""
 BLOCK_CELLS = 2
-"""A block of 2 x 2 cells belongs to one point of a street."""
+"""Width of a block in cells. All cells of a block use the same nearest point of a street."""
 
 _CHUNK = 500_000
-_STRIPS = 5  # at most, on one side
+_STRIPS = 5  # maximum on one side
 
 Profiles = tuple[np.ndarray, np.ndarray]
 """Bounds (2 n, strips) and labels (2 n, strips + 1) across both sides of n stretches."""
@@ -25,7 +25,7 @@ Profiles = tuple[np.ndarray, np.ndarray]
 def paint_ground(
     network: Network, islands: tuple[Island, ...], relief: Relief, path: Float[np.ndarray, "n 2"]
 ) -> Ground:
-    """The ground around the streets; within 1.5 m of `path` it is road."""
+    """Paints the ground around the streets. Ground within 1.5 m of `path` is road."""
     block_m = BLOCK_CELLS * CELL_M
     low = np.floor(network.middle.min(axis=0) - REACH_M - 20)
     columns, rows = np.ceil((network.middle.max(axis=0) + REACH_M + 20 - low) / block_m).astype(int).tolist()
@@ -45,7 +45,7 @@ def paint_ground(
 
 
 def _near_streets(points: Float[np.ndarray, "n 2"], size: tuple[int, int], reach: int) -> Int[np.ndarray, "m 2"]:
-    """Column and row of all blocks that lie within about `reach` blocks of a point."""
+    """Column and row of all blocks within about `reach` blocks of a point."""
     coarse = max(reach // 4, 1)
     near = np.zeros([-(-axis // coarse) for axis in size], bool)
     near[tuple((points // coarse).astype(int).T)] = True
@@ -59,7 +59,7 @@ def _near_streets(points: Float[np.ndarray, "n 2"], size: tuple[int, int], reach
 def _labels(
     network: Network, profiles: Profiles, xy: Float[np.ndarray, "m 2"], nearest: Int[np.ndarray, " m"]
 ) -> UInt8[np.ndarray, " m"]:
-    """Label of each place, given the nearest point of a street."""
+    """Label at each position, from the nearest point of a street."""
     bounds, names = profiles
     offset = network.offset(xy, nearest)
     profile = 2 * network.stretch[nearest] + (offset < 0)
@@ -72,7 +72,7 @@ def _labels(
 
 
 def _profiles(stretches: tuple[Stretch, ...]) -> Profiles:
-    """Of both sides of every stretch: where the strips begin, metres from the middle, and the labels between."""
+    """Bounds of the strips on both sides of each stretch, in metres from the middle, and the labels between them."""
     bounds = np.full((2 * len(stretches), _STRIPS + 1), np.inf)
     names = np.full((2 * len(stretches), _STRIPS + 2), TERRAIN)
     for i, stretch in enumerate(stretches):
@@ -92,7 +92,7 @@ def _paint_disc(label: UInt8[np.ndarray, "r c"], centre: Float[np.ndarray, "2"],
 
 
 def _paint_way(label: UInt8[np.ndarray, "r c"], path: Float[np.ndarray, "n 2"]) -> None:
-    """Road under the vehicle; lane markings stay. Points of `path` lie a metre apart, in cells."""
+    """Paints road under the vehicle, but keeps lane markings. `path` has one point per metre, in units of cells."""
     around = np.stack(np.meshgrid(*2 * [np.arange(-6, 7)]), axis=-1).reshape(-1, 2)
     around = around[np.hypot(*around.T) < 6.5]
     cells = np.unique((np.floor(path)[:, None] + around).astype(int).reshape(-1, 2), axis=0)

@@ -1,4 +1,4 @@
-"""From things beside streets to shapes in the world, with nothing in the way of the vehicle or of another street."""
+"""Conversion of things beside streets to shapes in the world, clear of the vehicle and of other streets."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -14,21 +14,21 @@ from sglpr_jax.sim.streets import Island, Network, runs
 from sglpr_jax.sim.things import KINDS, Part, Placed
 
 CLEARANCE_M = 1.6
-"""What stands keeps this far from the vehicle's way."""
+"""Minimum distance of standing things from the vehicle's path, in metres."""
 
 _TOLERANCE_M = 0.3
 _HEAD_ROOM_M = 2.0
-"""What begins higher may hang over a sidewalk."""
+"""Minimum height of parts that may overhang a street or its sidewalk, in metres."""
 
 
 class Anchors(NamedTuple):
-    """Where the frames of things lie in the world, one row per part; `side` is -1 where y is mirrored."""
+    """Poses of the frames of things in the world, one row per part. `side` is -1 if y is mirrored."""
 
     xy: np.ndarray  # (n, 2) metres
     heading: np.ndarray  # (n,) radians
     side: np.ndarray  # (n,) 1 or -1
-    since: np.ndarray  # (n,) seconds
-    until: np.ndarray  # (n,)
+    since: np.ndarray  # (n,) seconds, start of the presence
+    until: np.ndarray  # (n,) seconds, end of the presence
 
 
 _NO_ROWS = Shapes(
@@ -40,7 +40,7 @@ _NO_ROWS = Shapes(
 
 
 def place(parts: list[Part], anchors: Anchors, ground: Ground) -> Shapes:
-    """The parts in the world, of all kinds in one table; every thing stands on the ground at its anchor."""
+    """Converts parts of all kinds to one table of shapes in the world. Things stand on the ground at their anchors."""
     x, y, bottom, yaw, size = (
         np.array([getattr(part, field) for part in parts], dtype=np.float64).reshape(len(parts), *more)
         for field, *more in (("x",), ("y",), ("bottom",), ("yaw",), ("size", 3))
@@ -67,17 +67,17 @@ def place(parts: list[Part], anchors: Anchors, ground: Ground) -> Shapes:
 
 
 def select(shapes: Shapes, keep: np.ndarray) -> Shapes:
-    """The rows of `shapes` that a mask or indices name."""
+    """Selects rows of `shapes` by a mask or by indices."""
     return Shapes(*(leaf[keep] for leaf in shapes))
 
 
 def join(*tables: Shapes) -> Shapes:
-    """All rows of the tables, of which there may be none."""
+    """Concatenates the rows of the tables. Without tables, the result is empty."""
     return Shapes(*(np.concatenate(leaves) for leaves in zip(_NO_ROWS, *tables, strict=True)))
 
 
 def to_scene(shapes: Shapes, parts: list[Part]) -> Scene:
-    """Sort a table into boxes, cylinders and ellipsoids, given the part of every row."""
+    """Splits a table into boxes, cylinders and ellipsoids, given the part of each row."""
     kinds = np.array([part.kind for part in parts])
     return Scene(*(select(shapes, kinds == kind) for kind in KINDS))
 
@@ -90,7 +90,10 @@ def furnish(
     path: Float[np.ndarray, "n 2"],
     clock: Clock,
 ) -> tuple[Shapes, list[Part]]:
-    """All that stands along the streets of `network`, clear of them and of `path`, and the part of every row."""
+    """Places things along the streets of `network`, clear of the streets and of `path`.
+
+    Returns the shapes, and the part of each row.
+    """
     placed, place_of = [], []
     makers = bystanders(rng)
     for stretch, side_index, first, start, stop in _spans(network):
@@ -112,7 +115,7 @@ def furnish(
 
 
 def _spans(network: Network) -> Iterator[tuple]:
-    """Yield stretch, 0 for left or 1 for right, the street's first point, and s from where to where a side is free."""
+    """Yields stretch, side (0 left, 1 right), first point of the street, and the bounds in s of each free interval."""
     free = _free(network)
     first, index = 0, 0
     for street in network.streets:
@@ -127,7 +130,7 @@ def _spans(network: Network) -> Iterator[tuple]:
 
 
 def _free(network: Network) -> Bool[np.ndarray, "n 2"]:
-    """Whether the edge of the plots beside each point of a street lies off all other streets: left and right."""
+    """Whether the edge of the plots beside each street point is clear of all other streets, left and right."""
     left = np.stack([-np.sin(network.heading), np.cos(network.heading)], axis=1)
     sides = []
     for column, sign in ((0, 1), (1, -1)):
@@ -137,7 +140,7 @@ def _free(network: Network) -> Bool[np.ndarray, "n 2"]:
 
 
 def _margin(network: Network, xy: np.ndarray, whole_street: np.ndarray) -> np.ndarray:
-    """How far each place lies off the nearest street's road, or off its strips too where `whole_street`."""
+    """Distance of each position outside the nearest road, or outside its strips where `whole_street` is true."""
     nearest = network.nearest(xy)
     offset = network.offset(xy, nearest)
     verge = network.verge[nearest, (offset < 0).astype(int)]
@@ -145,7 +148,7 @@ def _margin(network: Network, xy: np.ndarray, whole_street: np.ndarray) -> np.nd
 
 
 def _parts(placed: list[Placed]) -> tuple[np.ndarray, list[Part]]:
-    """All parts of all things, and the index of the thing of each."""
+    """Index of the thing of each part, and all parts of all things."""
     thing = np.repeat(np.arange(len(placed)), [len(item.thing) for item in placed])
     return thing, [part for item in placed for part in item.thing]
 
@@ -166,7 +169,7 @@ def _anchors(
 def _on_a_street(
     network: Network, shapes: Shapes, street: np.ndarray, zone: np.ndarray, bottom: np.ndarray
 ) -> Bool[np.ndarray, " n"]:
-    """Which shapes touch a road, or the strips along one if they belong behind them; cars park on their own street."""
+    """Whether each shape touches a road, or strips that it belongs behind. Cars must park on their own street."""
     bad = np.zeros(len(zone), bool)
     cos, sin = np.cos(shapes.yaw), np.sin(shapes.yaw)
     for u in np.linspace(-1, 1, 7):
@@ -179,7 +182,7 @@ def _on_a_street(
 
 
 def _in_the_way(shapes: Shapes, path: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, " n"]:
-    """Which shapes come nearer to the vehicle's way than CLEARANCE_M."""
+    """Whether each shape is closer to the vehicle's path than CLEARANCE_M."""
     dense = np.concatenate([path, (path[1:] + path[:-1]) / 2])
     reach = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + CLEARANCE_M
     near = KDTree(dense).query_ball_point(shapes.centre[:, :2], reach)
@@ -194,7 +197,7 @@ def _in_the_way(shapes: Shapes, path: Float[np.ndarray, "p 2"]) -> Bool[np.ndarr
 def footprint_distance(
     away: Float[np.ndarray, "n 2"], yaw: Float[np.ndarray, " n"], half: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance from the rectangle of half sizes `half`, turned by `yaw`, to the place `away` from its middle."""
+    """Distance from the rectangle of half sizes `half`, rotated by `yaw`, to the point `away` from its centre."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     along, across = cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]
     outside = np.stack([np.abs(along) - half[:, 0], np.abs(across) - half[:, 1]], axis=1)
@@ -202,7 +205,7 @@ def footprint_distance(
 
 
 def _on_an_island(shapes: Shapes, islands: tuple[Island, ...]) -> Bool[np.ndarray, " n"]:
-    """Which shapes would stand inside a roundabout."""
+    """Whether each shape is inside a roundabout."""
     bad = np.zeros(len(shapes.label), bool)
     for island in islands:
         away = np.linalg.norm(shapes.centre[:, :2] - island.centre, axis=1)
@@ -213,7 +216,10 @@ def _on_an_island(shapes: Shapes, islands: tuple[Island, ...]) -> Bool[np.ndarra
 def plant_islands(
     rng: np.random.Generator, islands: tuple[Island, ...], ground: Ground, make: Callable
 ) -> tuple[Shapes, list[Part]]:
-    """What `make` draws, in the middle of every roundabout."""
+    """Places a thing drawn by `make` in the middle of each roundabout.
+
+    Returns the shapes, and the part of each row.
+    """
     things = [make(rng) for _ in islands]
     owner = np.repeat(np.arange(len(things)), [len(thing) for thing in things])
     centre = np.array([island.centre for island in islands]).reshape(-1, 2)[owner]

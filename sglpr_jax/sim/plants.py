@@ -1,4 +1,4 @@
-"""Trees, bushes, hedges and the edge of a wood: porous, rough ellipsoids and boxes."""
+"""Trees, bushes, hedges and edges of woods, made of porous, rough ellipsoids and boxes."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ def _leaves(
 
 
 def tree(rng: np.random.Generator, spread: Range) -> Thing:
-    """A trunk under a crown whose diameter is in the range `spread`; a large crown is several ellipsoids."""
+    """Tree whose crown has a diameter in the range `spread`, in metres. A large crown has several ellipsoids."""
     crown, below = rng.uniform(*spread), rng.uniform(0.9, 2.6)
     thick = 0.12 + 0.05 * crown * rng.uniform(0.6, 1.4)
     parts = [Part("cylinder", TRUNK, (thick, thick, below + 0.35 * crown))]
@@ -28,7 +28,7 @@ def tree(rng: np.random.Generator, spread: Range) -> Thing:
 
 
 def limbed_tree(rng: np.random.Generator, spread: Range) -> Thing:
-    """A thick trunk and bare limbs under a crown that begins above most lasers, as of an old street tree."""
+    """Old street tree: a thick trunk and bare limbs under a crown that begins above most lasers."""
     crown, fork = rng.uniform(*spread), rng.uniform(1.2, 2.2)
     thick = rng.uniform(0.25, 0.7)
     parts = [Part("cylinder", TRUNK, (thick, thick, fork + 1.5), roughness=0.05)]
@@ -42,14 +42,14 @@ def limbed_tree(rng: np.random.Generator, spread: Range) -> Thing:
 
 
 def conifer(rng: np.random.Generator) -> Thing:
-    """A crown that reaches down to the ground."""
+    """Conifer with a crown that reaches the ground."""
     spread = rng.uniform(1.5, 4)
     leaves = _leaves((spread, spread, 3 * spread), 0.0, 0.0, -0.8 * spread, roughness=0.5, porosity=0.45)
     return Part("cylinder", TRUNK, (0.3, 0.3, 1.5)), leaves
 
 
 def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
-    """One or two lumps of leaves; `large` scales them."""
+    """Bush of one or two ellipsoids. `large` scales their size."""
     parts = []
     large *= rng.uniform(0.6, 1.7)
     for i in range(int(rng.integers(1, 3))):
@@ -63,18 +63,18 @@ def bush(rng: np.random.Generator, large: float = 1.0) -> Thing:
 
 
 def hedge(length: float, thickness: float, height: float) -> Thing:
-    """A trimmed hedge along x."""
+    """Trimmed hedge along x."""
     return (Part("box", VEGETATION, (length, thickness, height + 0.3), bottom=-0.3, roughness=0.3, porosity=0.25),)
 
 
 def trimmed_hedge(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
-    """A hedge along x that is cut so straight and grows so dense that it could be a wall."""
+    """Hedge along x that is straight and dense like a wall."""
     size, roughness, porosity = (length, thickness, height + 0.3), rng.uniform(0.05, 0.2), rng.uniform(0.05, 0.25)
     return (Part("box", VEGETATION, size, bottom=-0.3, roughness=roughness, porosity=porosity),)
 
 
 def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
-    """A piece of an overgrown hedge along x: a dense face, and thinner and thinner leaves behind it (y > 0)."""
+    """Piece of an overgrown hedge along x: a dense face, with leaves behind it (y > 0) that become thinner."""
     face, porosity = (length, thickness, height + 0.3), rng.uniform(0.2, 0.5)
     parts = [Part("box", VEGETATION, face, bottom=-0.3, roughness=0.12, porosity=porosity)]
     behind = thickness / 2
@@ -87,7 +87,7 @@ def hedgerow(rng: np.random.Generator, length: float, thickness: float, height: 
 
 
 def thicket(rng: np.random.Generator) -> Thing:
-    """A piece of a wood's edge: undergrowth, and trunks that show through it."""
+    """Piece of the edge of a wood: undergrowth with visible trunks."""
     parts = [*bush(rng, rng.uniform(1.2, 2.4))]
     for _ in range(int(rng.integers(1, 4))):
         x, y = rng.uniform(-2.5, 2.5, 2).tolist()

@@ -1,4 +1,4 @@
-"""SemanticKITTI's raw label ids by name, of all that the simulator shows."""
+"""Raw label ids of SemanticKITTI for the classes in the simulator."""
 
 CAR, BICYCLE, BUS, MOTORCYCLE, TRUCK, OTHER_VEHICLE = 10, 11, 13, 15, 18, 20
 PERSON, BICYCLIST, MOTORCYCLIST = 30, 31, 32
@@ -6,4 +6,4 @@ ROAD, PARKING, SIDEWALK, OTHER_GROUND, LANE_MARKING, TERRAIN = 40, 44, 48, 49, 6
 BUILDING, FENCE, VEGETATION, TRUNK, POLE, TRAFFIC_SIGN, OTHER_OBJECT = 50, 51, 70, 71, 80, 81, 99
 
 MOVING = {CAR: 252, BICYCLIST: 253, PERSON: 254, MOTORCYCLIST: 255, BUS: 257, TRUCK: 258, OTHER_VEHICLE: 259}
-"""The id of a thing that moves, by that of its twin that stands still."""
+"""Id of the moving class for each static class."""

@@ -1,8 +1,8 @@
-"""Which shape every ray meets first.
+"""First hit of each ray with a shape.
 
-The columns of a turn are split into sectors. On the host, every sector gets a list of the shapes that reach into it,
-nearest first. On the device, all sectors go through their lists at once, one shape of each at a time, until what is
-left is farther than everything that was hit.
+The columns of a revolution are divided into sectors. The host lists the shapes that overlap each sector, nearest first.
+The device processes all sectors in parallel, one shape per sector at a time. It stops when the remaining shapes are
+farther than all hits.
 """
 
 from collections.abc import Sequence
@@ -16,47 +16,47 @@ from jaxtyping import Array, Float, Int
 from sglpr_jax.sim.shapes import SOLIDS, AnyArray, Scene, Shapes, Solid, Vectors, at_time
 
 COLUMNS = 32
-"""Azimuth steps in a sector."""
+"""Number of azimuth steps in a sector."""
 SLOTS = 64, 48, 128
-"""The most boxes, cylinders and ellipsoids that a sector may meet; of more, the nearest are kept.
+"""Maximum numbers of boxes, cylinders and ellipsoids in a sector. If there are more, the nearest are kept.
 
-Not all that towns have: in two of them (counted once, routes 00 and 02) up to 50 cylinders and 160 ellipsoids fell into
-one sector. About one sector in a hundred has too many ellipsoids; what is left out there is 47 m away or farther.
+In the towns of routes 00 and 02, sectors have up to 50 cylinders and 160 ellipsoids. About one sector in a hundred has
+too many ellipsoids. The omitted shapes are at least 47 m away.
 """
 UNROLL = 2
-"""Shapes tried between two looks at what is left; divides every number of slots."""
+"""Number of shapes tested between two checks of the stop condition. It must divide all numbers of slots."""
 _MARGIN = 1e-3
 _PORE_FACTORS = np.random.default_rng(0).integers(2**32, size=sum(SLOTS), dtype=np.uint32) | np.uint32(1)
 
 
 class Candidates(NamedTuple):
-    """The shapes of one kind that each sector may meet, nearest first; every array is (slots, sectors).
+    """Shapes of one kind that the rays of each sector may hit, nearest first. Every array is (slots, sectors).
 
-    Shapes are given by the way into their unit frame, from the frame at the sensor along the world's axes.
+    A shape is given by the transformation to its unit frame, from the frame at the sensor with the world's axes.
     """
 
-    xx: AnyArray  # unit x = xx x + xy y + origin x, and so on, 1 / metres
+    xx: AnyArray  # unit x = xx x + xy y + origin x, likewise for y and z; 1 / metres
     xy: AnyArray
     yx: AnyArray
     yy: AnyArray
     zz: AnyArray
-    origin: Vectors  # the sensor in the unit frame
-    nearest: AnyArray  # metres: no part of the shape is nearer to the sensor; inf marks an empty slot
+    origin: Vectors  # position of the sensor in the unit frame
+    nearest: AnyArray  # lower bound of the distance from the sensor, metres; inf in an empty slot
     roughness: AnyArray
-    porosity: AnyArray  # uint32: as a share of 2^32
+    porosity: AnyArray  # uint32, as a fraction of 2^32
     glass: AnyArray
     label: AnyArray  # int32
 
 
 class Chance(NamedTuple):
-    """One random number of each sort for every ray."""
+    """Random numbers for each ray."""
 
-    depth: AnyArray  # exponentially distributed, mean 1: how far the ray goes into what is rough
-    pores: AnyArray  # uint32, uniform: which of the porous shapes let it through
+    depth: AnyArray  # exponentially distributed with mean 1: depth at which a rough shape returns the ray
+    pores: AnyArray  # uint32, uniform: selects the porous shapes that the ray passes
 
 
 def sector_count(azimuth_steps: int) -> int:
-    """How many sectors make a turn; the last one may reach into the first."""
+    """Number of sectors in a revolution. The last one may overlap the first one."""
     return -(-azimuth_steps // COLUMNS)
 
 
@@ -69,7 +69,7 @@ def find_candidates(
     reach_m: float,
     slots: tuple[int, ...] = SLOTS,
 ) -> tuple[Candidates, ...]:
-    """The boxes, cylinders and ellipsoids that each sector of a turn may meet at `time` within `reach_m`."""
+    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`."""
     step = 2 * np.pi / azimuth_steps
     middle = (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
     half_width = (COLUMNS - 1) / 2 * step + _MARGIN
@@ -83,12 +83,12 @@ def find_candidates(
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """The same angles in [-pi, pi)."""
+    """Wraps angles to [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _bearings(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and half width of the azimuths, in the LiDAR frame, between which each shape lies."""
+    """Middle and half width of the azimuth interval of each shape, in the LiDAR frame."""
     signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
     corners = signs * shapes.half[:, None]
     cos, sin = np.cos(shapes.yaw)[:, None], np.sin(shapes.yaw)[:, None]
@@ -100,12 +100,12 @@ def _bearings(shapes: Shapes, world_from_lidar: Float[np.ndarray, "4 4"]) -> tup
     centre = np.arctan2(*(offset @ world_from_lidar[:3, 1::-1]).T)
     side = _wrapped(azimuth - centre[:, None])
     low, high = side.min(axis=1), side.max(axis=1)
-    # A shape that spans half a turn or more is around, above or below the sensor: any ray may meet it.
+    # A shape that spans half a revolution or more is around, above or below the sensor, so any ray may hit it.
     return centre + (low + high) / 2, np.where(high - low < np.pi, (high - low) / 2, np.pi)
 
 
 def _listed(shapes: Shapes, sensor: Float[np.ndarray, "3"], overlap: np.ndarray, slots: int) -> Candidates:
-    """Per sector the nearest `slots` shapes of those whose `overlap` (n, sectors) is true."""
+    """Nearest `slots` shapes of each sector, among the shapes with a true `overlap` (n, sectors)."""
     cos, sin, offset = np.cos(shapes.yaw), np.sin(shapes.yaw), shapes.centre - sensor
     along, across = cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]
     inside = np.stack([along, across, offset[:, 2]], axis=1)
@@ -127,7 +127,7 @@ def _listed(shapes: Shapes, sensor: Float[np.ndarray, "3"], overlap: np.ndarray,
         yx=fill(-sin / hy, 0.0),
         yy=fill(cos / hy, 1.0),
         zz=fill(1 / hz, 1.0),
-        origin=Vectors(*(fill(axis, 1e6) for axis in origin.T)),  # a thousand kilometres off: never hit
+        origin=Vectors(*(fill(axis, 1e6) for axis in origin.T)),  # 1000 km away, so never hit
         nearest=fill(nearest, np.inf),
         roughness=fill(shapes.roughness, 0.0),
         porosity=fill(np.minimum(shapes.porosity * 2.0**32, 2.0**32 - 1), 0.0, np.uint32),
@@ -137,7 +137,7 @@ def _listed(shapes: Shapes, sensor: Float[np.ndarray, "3"], overlap: np.ndarray,
 
 
 def into_unit_frame(vectors: Vectors, shape: Candidates) -> Vectors:
-    """The same directions in the shape's unit frame."""
+    """Transforms directions into the unit frame of a shape."""
     return Vectors(
         shape.xx * vectors.x + shape.xy * vectors.y,
         shape.yx * vectors.x + shape.yy * vectors.y,
@@ -146,17 +146,17 @@ def into_unit_frame(vectors: Vectors, shape: Candidates) -> Vectors:
 
 
 Nearest = tuple[Array, Array]
-"""Of every ray: the distance to the nearest hit so far, and the slot of what was hit, -1 for nothing."""
+"""Distance and slot of the nearest hit of each ray. The slot is -1 without a hit."""
 
 
 def nearest_hit(
     rays: Vectors, candidates: Sequence[Candidates], limit: Float[Array, "lasers azimuths"], chance: Chance
 ) -> tuple[Float[Array, "lasers azimuths"], Int[Array, "lasers azimuths"]]:
-    """Distance to the first shape that each ray from the sensor meets, and its slot.
+    """Returns the distance to the first shape that each ray from the sensor hits, and its slot.
 
-    `rays` have length 1 and as many azimuths as all sectors together. A ray that meets nothing nearer than `limit` has
-    that distance and slot -1. Slots count boxes, then cylinders, then ellipsoids. A shape around the sensor is not
-    seen. A rough shape returns a ray from some depth; one that is thinner there lets it through.
+    `rays` are unit vectors for the azimuths of all sectors. Slots count boxes, then cylinders, then ellipsoids. A ray
+    without a hit nearer than `limit` has the distance `limit` and slot -1. Shapes around the sensor are not hit. A
+    rough shape returns a ray from a random depth. If the shape is thinner than this depth, the ray passes.
     """
     sectors = (limit.shape[0], -1, COLUMNS)
     rays, limit, chance = jax.tree.map(
@@ -173,7 +173,7 @@ def nearest_hit(
 def _nearest_of_kind(
     rays: Vectors, candidates: Candidates, first: int, solid: Solid, best: Nearest, chance: Chance
 ) -> Nearest:
-    """`best` after rays (lasers, sectors, columns) have been tried against a kind whose slots begin at `first`."""
+    """Updates `best` with one kind of shapes. `rays` are (lasers, sectors, columns), and slots begin at `first`."""
     slots = len(candidates.nearest)
     pore_factors = jnp.asarray(_PORE_FACTORS[first : first + slots])
 

@@ -1,4 +1,4 @@
-"""A simulated drive as a recording whose scans are rendered when they are asked for: nothing lies on disk."""
+"""Simulated drive as a recording. Its scans are rendered on demand and not stored on disk."""
 
 import functools
 from collections.abc import Callable
@@ -31,17 +31,20 @@ from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
 from sglpr_jax.sim.world import World, build_world
 
 KEPT_SCANS = 8
-"""The last ones rendered, so that asking for a scan's points and then for its labels costs one rendering."""
+"""Number of cached scans. Because of the cache, reading the points and labels of a scan renders it only once."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRecording(Recording):
-    """A recording whose scans, all with labels, are rendered on demand; `paths` and `label_paths` name no files."""
+    """Recording whose labelled scans are rendered on demand. `paths` and `label_paths` do not name files."""
 
     poses: TimedPoses = field(kw_only=True)
-    """Where the LiDAR was at every scan, and when."""
+    """Pose of the LiDAR and time of each scan."""
     render: Callable[[int], tuple[np.ndarray, np.ndarray]] = field(kw_only=True)
-    """Points (n, 4) with intensities and labels (n,) of scan i, the same on every call; do not change them in place."""
+    """Function that returns points (n, 4) with intensities and labels (n,) of scan i.
+
+    Every call gives the same values. The arrays are cached and must not be modified in place.
+    """
 
 
 def simulate_recording(
@@ -54,13 +57,23 @@ def simulate_recording(
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
 ) -> SimulatedRecording:
-    """Build the town around a drive and return its recording: along route `name`, or along the pose file `along`.
+    """Builds the town around a drive and returns the recording of the drive.
 
-    Takes some seconds; every scan then takes some hundredths of one. Of a pose file with more than `scans` lines every
-    k-th is taken, and `rate_hz` is not used. The scans are those that `write_dataset` writes for the same arguments.
+    Building takes some seconds, and rendering a scan takes some hundredths of a second. `write_dataset` writes the same
+    scans for the same arguments.
 
-    Raises ValueError for an unknown route, a rate not above 0 and a seed below 0; for the errors of a pose file see
-    `read_path`.
+    Arguments:
+      name: Route, from `ROLES`.
+      along: KITTI pose file to drive along instead of a route, see `read_path`.
+      scans: Number of scans. Along a pose file it is the maximum: of a longer file, every k-th line is used.
+      sensor: LiDAR.
+      seed: Seed of the town, at least 0.
+      rate_hz: Scans per second of a route. Not used along a pose file.
+      scenery: Scenery of the town.
+
+    Raises:
+      ValueError: The route is unknown, `rate_hz` is not positive, `seed` is negative, or the pose file is malformed.
+      FileNotFoundError: The pose file does not exist.
     """
     check_drawing(rate_hz, seed)
     if along is not None:
@@ -97,10 +110,18 @@ def drive_through(
     key: PRNGKeyArray,
     rng: np.random.Generator,
 ) -> SimulatedRecording:
-    """Return the recording `name` of a drive through a town, with a scan at each of these `rows` of `path`.
+    """Returns the recording of a drive through a town.
 
-    `ids` and `times` (seconds) are what the scans are called and when they are said to be taken; the town's own clock
-    is that of `path`. `key` draws what the sensor measures, `rng` how the vehicle's body tilts.
+    Arguments:
+      world: Town.
+      path: Path of the vehicle. Its times are those of the town.
+      rows: Rows of `path` at which scans are taken.
+      name: Name of the recording.
+      ids: Names of the scans.
+      times: Times of the scans in the recording, in seconds. They may differ from the times of the town.
+      sensor: LiDAR.
+      key: Random key of the measurements.
+      rng: Random generator of the tilt of the vehicle's body.
     """
     xy, yaw, clock = (values[rows] for values in path)
     tilt = body_tilt(rng, clock)

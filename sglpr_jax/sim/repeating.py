@@ -14,9 +14,9 @@ from sglpr_jax.sim.sensor import HDL64E, Sensor
 from sglpr_jax.sim.world import World
 
 SHORTEST_S = 75.0
-"""Minimum duration of a drive; fewer scans are farther apart."""
+"""Minimum duration of a drive, in seconds. Few scans are spread over this time."""
 LEAST_RANGE_M = 0.5
-"""Minimum range of the sensor of a small robot, at most."""
+"""Highest minimum range of the sensor of a small robot, in metres."""
 
 
 def simulate_repeating(
@@ -28,17 +28,19 @@ def simulate_repeating(
     revisit: Revisit = "none",
     rate_hz: float | None = None,
 ) -> SimulatedRecording:
-    """Return the recording of a drive through scenery `name`, one of `REPEATING`, drawn by `seed`.
+    """Returns the recording of a drive through a scenery where places repeat.
 
     Arguments:
-      scans: number of scans, evenly spread over the drive.
-      sensor: the LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of 0.5 m.
+      name: Scenery, from `REPEATING`.
+      scans: Number of scans, evenly spaced over the drive.
+      seed: Seed of the scenery and the drive, at least 0.
+      sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
       revisit: "none" never returns to a place: frames 30 s apart are more than `other_m` apart. "opposite" drives to
-        the end and returns. "same" drives one and a half laps around a closed way.
-      rate_hz: scans per second; None for the scenery's own.
+        the end and returns. "same" drives one and a half laps along a closed path.
+      rate_hz: Scans per second. None uses the rate of the scenery.
 
     Raises:
-      ValueError: the name or `revisit` is unknown, the rate is not above 0, or the seed is below 0.
+      ValueError: The name or `revisit` is unknown, `rate_hz` is not positive, or `seed` is negative.
 
     Example:
       drive = simulate_repeating("tunnel", seed=1, revisit="opposite")
@@ -68,7 +70,7 @@ def simulate_repeating(
 def plan_drive(
     scenery: Repeating, seeds: tuple[int, ...], *, scans: int, revisit: Revisit, rate_hz: float
 ) -> tuple[World, PlanarPath]:
-    """Draw a scenery and the drive through it, a whole multiple of `scans` poses."""
+    """Draws a scenery and the drive through it. The number of poses is a multiple of `scans`."""
     rng = np.random.default_rng((*seeds, 1))
     speed = rng.uniform(*scenery.speed_mps)
     length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
@@ -78,7 +80,7 @@ def plan_drive(
 
 
 def mounted(sensor: Sensor, scenery: Repeating) -> Sensor:
-    """The sensor as the vehicle of a scenery carries it."""
+    """`sensor` with the height and minimum range for the scenery's vehicle."""
     if scenery.height_m is None:
         return sensor
     least = min(LEAST_RANGE_M, sensor.min_range_m)

@@ -1,4 +1,4 @@
-"""What comes back to the sensor of what its rays meet: labels, windows, weak echoes, noise, mixed edges."""
+"""Returns of the rays: surfaces and labels, windows, weak echoes and mixed edges."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,13 +13,13 @@ from sglpr_jax.sim.raycast import COLUMNS, Candidates, into_unit_frame
 from sglpr_jax.sim.shapes import Vectors
 
 STOREY_M, BAY_M = 3.0, 2.5
-"""Height and width of the piece of a facade that has one window."""
+"""Height and width of a piece of facade with one window, in metres."""
 WINDOW_LOSS = 0.9
-"""Share of the rays into a window that do not come back."""
+"""Fraction of the rays into a window that do not return."""
 LEAF_FACING = 0.5
-"""The mean cosine between a ray and a leaf's normal, whichever way the ray comes: for all that is rough."""
+"""Mean cosine of the angle between a ray and the normal of a leaf, for all rough shapes and all directions."""
 EDGE_JUMP_M = 2.0
-"""Echoes farther apart than this are told apart by the sensor; nearer ones are mixed."""
+"""Distance above which the sensor separates two echoes, in metres. Closer echoes are mixed."""
 
 _REFLECTIVITY = np.full(260, 0.35, np.float32)
 for _id, _value in {
@@ -35,12 +35,12 @@ for _id, _value in {
 
 
 class Surface(NamedTuple):
-    """What a ray meets, nearer or farther; every array is (lasers, azimuths)."""
+    """Surface hit by each ray. Every array is (lasers, azimuths)."""
 
-    distance: Array  # metres; the range limit where there is nothing
+    distance: Array  # metres; the maximum range without a hit
     label: Array  # int32 raw ids
-    facing: Array  # cosine of the angle between the ray and the surface's normal
-    window: Array  # bool
+    facing: Array  # cosine of the angle between ray and normal
+    window: Array  # bool, whether the ray hits a window
 
 
 def surface_of_shapes(
@@ -49,7 +49,7 @@ def surface_of_shapes(
     slot: Int[Array, "lasers azimuths"],
     candidates: Sequence[Candidates],
 ) -> Surface:
-    """The surface that each ray meets at `distance` on the shape in `slot`; of any shape where `slot` is -1."""
+    """Surface that each ray hits at `distance` on the shape in `slot`. If `slot` is -1, the values are arbitrary."""
     first_cylinder, first_ellipsoid = np.cumsum([len(kind.nearest) for kind in candidates])[:2]
     sectors = candidates[0].nearest.shape[1]
     row = jnp.maximum(slot, 0) * sectors + (jnp.arange(slot.shape[1]) // COLUMNS)[None, :]
@@ -69,7 +69,7 @@ def surface_of_shapes(
 
 
 def _normal(at: Vectors, *, is_box: Array, is_ball: Array) -> Vectors:
-    """A normal, of any length, of the unit solid's surface at `at`."""
+    """Normal of any length of a unit solid at the point `at`."""
     x, y, z = (jnp.abs(axis) for axis in at)
     box = Vectors((x >= y) & (x >= z), (y > x) & (y >= z), (z > x) & (z > y))
     cap = x**2 + y**2 < z**2
@@ -78,29 +78,30 @@ def _normal(at: Vectors, *, is_box: Array, is_ball: Array) -> Vectors:
 
 
 def _in_window(along: Array, up: Array, glass: Array) -> Bool[Array, "lasers azimuths"]:
-    """Whether a place on a facade lies in a window: one in the middle of each bay of each storey."""
+    """Whether a position on a facade is in a window. Each bay of each storey has one window in its middle."""
     half_side = jnp.sqrt(glass) / 2
     beside, above = (jnp.abs(place / size % 1 - 0.5) for place, size in ((along, BAY_M), (up, STOREY_M)))
     return (beside < half_side) & (above < half_side)
 
 
 def nearer(a: Surface, b: Surface) -> Surface:
-    """Of every ray, the surface of `b` where that is nearer, else that of `a`."""
+    """Surface of `b` for each ray whose surface in `b` is nearer, otherwise that of `a`."""
     return jax.tree.map(lambda of_a, of_b: jnp.where(b.distance < a.distance, of_b, of_a), a, b)
 
 
 def reflectivity(label: Int[Array, "lasers azimuths"]) -> Float[Array, "lasers azimuths"]:
-    """How much of the light a surface of this label sends back, 0 to 1."""
+    """Fraction of the light that a surface with this label reflects, from 0 to 1."""
     return jnp.asarray(_REFLECTIVITY)[label]
 
 
 def echo_returns(
     chance: Float[Array, "lasers azimuths"], surface: Surface, *, faintest_echo: float, dropout: float
 ) -> Bool[Array, "lasers azimuths"]:
-    """Whether a ray's echo is seen. `chance` is uniform in [0, 1).
+    """Whether the echo of each ray is detected. `chance` is uniform in [0, 1).
 
-    An echo is as strong as e = reflectivity x facing / distance^2, and seen with probability
-    1 - exp(-(e / faintest_echo)^2): a flat road vanishes between 35 and 55 m, as in KITTI's scans, a wall much later.
+    The strength of an echo is e = reflectivity x facing / distance^2. It is detected with probability
+    1 - exp(-(e / faintest_echo)^2), reduced by `dropout` and by windows. A flat road vanishes between 35 and 55 m, as
+    in KITTI's scans. A wall vanishes at a much larger distance.
     """
     echo = reflectivity(surface.label) * surface.facing / jnp.maximum(surface.distance, 1) ** 2
     seen = (1 - dropout) * -jnp.expm1(-((echo / faintest_echo) ** 2))
@@ -114,9 +115,10 @@ def mix_edges(
     *,
     share: float,
 ) -> Float[Array, "lasers azimuths"]:
-    """Ranges of which `share` lie anywhere between their own and that of the next azimuth: beams have a width.
+    """Replaces the fraction `share` of the ranges by random values between them and the range of the next azimuth.
 
-    Only where both came back and are less than EDGE_JUMP_M apart. `chance` is uniform in [0, 1).
+    This models the width of beams. It requires that both rays returned and their ranges differ by less than
+    EDGE_JUMP_M. `chance` is uniform in [0, 1).
     """
     jump = jnp.roll(reach, -1, axis=1) - reach
     mixed = returned & jnp.roll(returned, -1, axis=1) & (jnp.abs(jump) < EDGE_JUMP_M) & (chance < share)

@@ -1,7 +1,8 @@
-"""Which streets are driven: eleven routes through a lattice of streets, with the revisits of their namesakes in KITTI.
+"""Eleven routes through a lattice of streets, with revisits as in the KITTI sequences of the same names.
 
-A route is first a walk over the crossings of the lattice, then a line: crossings are moved at random, streets are bent,
-some crossings are roundabouts, and corners are rounded. A street that is driven twice is the same line both times.
+A route is first a walk over the crossings of the lattice. The walk is then converted to a line: crossings are moved at
+random, streets are bent, some crossings become roundabouts, and corners are rounded. A street that is driven twice has
+the same line both times.
 """
 
 import dataclasses
@@ -13,39 +14,43 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 STEP_M = 0.5
-"""Distance between two points of a route's line."""
+"""Distance between two points of a route's line, in metres."""
 BLOCKS_PER_LOOP = 12
 ROUNDABOUT_RADIUS_M = 10.0
 SHORTEST_LOOP = {False: 6, True: 4}
-"""Streets between two visits in the same (False) or the opposite direction: they take 30 s or more."""
+"""Minimum number of streets between two visits in the same (False) or the opposite (True) direction.
+
+They take at least 30 s.
+"""
 TRIES, TRIES_PER_LOOP = 100, 30
 
 Node = tuple[int, int]
-"""A crossing of the lattice: the number of its column and of its row."""
+"""Crossing of the lattice: column and row."""
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 @dataclasses.dataclass(frozen=True)
 class Role:
-    """What kind of drive a route is."""
+    """Parameters of the drive along a route."""
 
     speed_mps: float
-    """On the way as a whole, roughly; faster on a free street, slower in corners."""
+    """Approximate mean speed, in m/s. The vehicle is faster on free streets and slower in corners."""
     again: float = 0.0
-    """Share of the streets that are driven a second time."""
+    """Fraction of the streets that are driven a second time."""
     opposite: bool = False
-    """Whether the second time goes in the opposite direction."""
+    """Whether the second visit is in the opposite direction."""
     loops: int = 1
-    """At most so many; a route with one ends with its second visit."""
+    """Maximum number of loops. A route with one loop ends with its second visit."""
     straight: float = 0.5
-    """Probability of going straight on at a crossing."""
+    """Probability of driving straight ahead at a crossing."""
     block_m: float = 60.0
+    """Distance between neighbouring crossings of the lattice, in metres."""
     winding: float = 0.2
-    """How far crossings are moved, and twice how far streets are bent, as a share of `block_m`."""
+    """Maximum shift of a crossing, and twice the maximum bend of a street, as fractions of `block_m`."""
     corner_m: float = 9.0
-    """Corners are rounded by a Gaussian of this width, and have about this radius."""
+    """Standard deviation of the Gaussian that rounds corners, in metres. Corners have about this radius."""
     roundabouts: float = 0.08
-    """Share of the crossings."""
+    """Fraction of the crossings that are roundabouts."""
 
 
 ROLES = {
@@ -61,14 +66,18 @@ ROLES = {
     "09": Role(9.5, again=0.07, straight=0.6),
     "10": Role(8.0, straight=0.6),
 }
-"""As in KITTI, 00, 02, 05, 06 and 07 come back to places in the same direction, 08 in the opposite one, 09 at its very
-end, and 01 (a highway), 03, 04 (a straight road) and 10 never. Shares are larger than KITTI's where those are small."""
+"""Routes by name.
+
+As in KITTI, 00, 02, 05, 06 and 07 revisit places in the same direction, 08 in the opposite direction, and 09 at its
+very end. 01 (a highway), 03, 04 (a straight road) and 10 have no revisits. Where KITTI has few revisits, the routes
+have more.
+"""
 
 
 def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int = 1) -> Float[np.ndarray, "n 2"]:
-    """Return the middle of the streets that a drive of about `blocks` blocks takes, a point every STEP_M metres.
+    """Returns the middle line of the streets of a drive of about `blocks` blocks, with a point every STEP_M metres.
 
-    With more than one day, as many blocks of the same streets follow for each, see `plan_days`.
+    If `days` is above 1, each further day adds the same number of blocks along the same streets, see `plan_days`.
     """
     walk = plan_walk(rng, role, blocks=blocks) if days == 1 else plan_days(rng, role, blocks=blocks, days=days)
     corners = resampled(_Streets(rng, role, np.array(walk)).line(), STEP_M)
@@ -76,21 +85,22 @@ def plan_route(rng: np.random.Generator, role: Role, *, blocks: int, days: int =
 
 
 def travelled(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """The length of a line up to each of its points."""
+    """Length of a line up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 def resampled(line: Float[np.ndarray, "n 2"], step_m: float) -> Float[np.ndarray, "m 2"]:
-    """The same line with points every `step_m` metres."""
+    """Resamples a line to points about `step_m` metres apart."""
     length = travelled(line)
     at = np.linspace(0, length[-1], max(2, round(length[-1] / step_m) + 1))
     return np.stack([np.interp(at, length, axis) for axis in line.T], axis=1)
 
 
 def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node]:
-    """Return the crossings that a route passes: `blocks` streets, give or take one for every loop.
+    """Returns the crossings along a route of `blocks` streets, plus or minus one street for each loop.
 
-    Raises ValueError where `blocks` is too few for a loop.
+    Raises:
+      ValueError: `blocks` is too small for a loop.
     """
     if role.again == 0:
         return _walk_onward(rng, role, blocks)
@@ -103,10 +113,11 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
 
 
 def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -> list[Node]:
-    """Return a walk as long as `days` of `plan_walk`: on the later days it keeps to the streets of the first.
+    """Returns a walk with `days` times the length of `plan_walk`. The later days use the streets of the first day.
 
-    A later day begins with a turn at a roundabout, as every street that ends is left. Of the ways ahead the one is
-    taken that was driven least in that direction, so that the later days go partly in the opposite one.
+    Each later day begins with a U-turn at a roundabout, as at a dead end. At a crossing, the walk takes the street
+    ahead that was driven least often in that direction. The later days therefore partly drive in the opposite
+    direction.
     """
     walk = plan_walk(rng, role, blocks=blocks)
     ahead = defaultdict(set)
@@ -117,14 +128,14 @@ def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -
     for step in range(blocks * (days - 1)):
         here, before = walk[-1], walk[-2]
         ways = sorted(ahead[here] - {before}) if step % blocks else []
-        taken = [driven[here, way] + rng.random() for way in ways]  # at random where driven equally often
+        taken = [driven[here, way] + rng.random() for way in ways]  # random among streets driven equally often
         walk.append(ways[np.argmin(taken)] if ways else before)
         driven[here, walk[-1]] += 1
     return walk
 
 
 def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> list[Node]:
-    """A walk with one loop of about `share` streets after the other, or an empty list where it came to a dead end."""
+    """Walk with one loop of about `share` streets after another, or an empty list at a dead end."""
     walk = [(0, 0)]
     for share in shares:
         again = max(1, round(role.again * share))
@@ -136,7 +147,7 @@ def _walk_in_loops(rng: np.random.Generator, role: Role, shares: list[int]) -> l
 
 
 def _walk_onward(rng: np.random.Generator, role: Role, blocks: int) -> list[Node]:
-    """A walk that never goes west, and so never meets itself."""
+    """Walk that never goes west and therefore never meets itself."""
     nodes, heading = [(0, 0)], (1, 0)
     for _ in range(blocks):
         if rng.random() >= role.straight:
@@ -146,9 +157,9 @@ def _walk_onward(rng: np.random.Generator, role: Role, blocks: int) -> list[Node
 
 
 def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: int, again: int) -> list[Node]:
-    """`nodes`, then `new` streets that lead back to an earlier one, then `again` streets for the second time.
+    """`nodes`, then `new` streets back to an earlier crossing, then `again` streets for the second time.
 
-    Returns an empty list where the walk ran into a dead end.
+    The result is an empty list if the walk reaches a dead end.
     """
     wandering = int(rng.integers(new // 2, max(new - 1, 1) + 1))
     walk = _wandered(rng, role, nodes, wandering)
@@ -168,7 +179,7 @@ def _with_loop(rng: np.random.Generator, role: Role, nodes: list[Node], *, new: 
 
 
 def _wandered(rng: np.random.Generator, role: Role, nodes: list[Node], steps: int) -> list[Node]:
-    """`nodes` and `steps` more that were never visited, or an empty list in a dead end."""
+    """`nodes` and `steps` unvisited crossings, or an empty list at a dead end."""
     walk, visited = list(nodes), set(nodes)
     for _ in range(steps):
         ahead = _moved(walk[-1], walk[-1], walk[-2]) if len(walk) > 1 else (1, 0)
@@ -182,7 +193,7 @@ def _wandered(rng: np.random.Generator, role: Role, nodes: list[Node], steps: in
 
 
 def _ways_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
-    """The shortest ways of up to `longest` streets from the end of `walk`, over unvisited crossings to visited ones."""
+    """Shortest paths of up to `longest` streets from the end of `walk`, over unvisited crossings to visited ones."""
     visited, reached = set(walk), set(walk)
     frontier: dict[Node, list[Node]] = {walk[-1]: []}
     found: dict[Node, list[Node]] = {}
@@ -200,7 +211,7 @@ def _ways_back(walk: list[Node], longest: int) -> dict[Node, list[Node]]:
 
 
 def _streets(walk: list[Node]) -> list[tuple[Node, Node]]:
-    """The streets of a walk, the same for both directions."""
+    """Streets of a walk, equal for both directions."""
     return [(min(a, b), max(a, b)) for a, b in pairwise(walk)]
 
 
@@ -210,7 +221,7 @@ def _moved(node: Node, step: Node, origin: Node = (0, 0)) -> Node:
 
 
 class _Streets:
-    """The streets around a walk: where their crossings lie and how they are bent."""
+    """Streets around a walk, with the positions of their crossings and their bends."""
 
     def __init__(self, rng: np.random.Generator, role: Role, walk: np.ndarray):
         low, high = walk.min(axis=0), walk.max(axis=0)
@@ -222,10 +233,10 @@ class _Streets:
         self.is_round = rng.random((columns, rows)) < role.roundabouts
         self.walk: list[Node] = [(int(column), int(row)) for column, row in walk - low]
         for before, node, after in zip(self.walk[:-2], self.walk[1:-1], self.walk[2:], strict=True):
-            self.is_round[node] |= before == after  # the vehicle turns round there
+            self.is_round[node] |= before == after  # the vehicle makes a U-turn here
 
     def line(self) -> Float[np.ndarray, "n 2"]:
-        """The way along the walk, with sharp corners; roundabouts are taken counter-clockwise."""
+        """Line along the walk with sharp corners. Roundabouts are driven counter-clockwise."""
         streets = [self._street(a, b) for a, b in pairwise(self.walk)]
         parts = [streets[0]]
         for node, street in zip(self.walk[1:-1], streets[1:], strict=True):
@@ -235,7 +246,7 @@ class _Streets:
         return np.concatenate(parts)
 
     def _street(self, a: Node, b: Node) -> Float[np.ndarray, "n 2"]:
-        """From crossing `a` to its neighbour `b`: a parabola, without what lies in a roundabout."""
+        """Parabola from crossing `a` to its neighbour `b`, without the parts inside roundabouts."""
         if a > b:
             return self._street(b, a)[::-1]
         start, end = self.crossing[a], self.crossing[b]

@@ -1,4 +1,4 @@
-"""What kind of land a town lies in: which neighbourhoods it has, how alike its streets are, how steep its hills."""
+"""Sceneries of towns: types of neighbourhoods, uniformity of the streets, and hills."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,18 +9,18 @@ from sglpr_jax.sim.things import Range
 
 @dataclasses.dataclass(frozen=True)
 class Scenery:
-    """What a town is drawn from; pairs are ranges."""
+    """Parameters of a random town. Pairs are ranges."""
 
     styles: Mapping[str, float]
-    """How often each of `STYLES` begins a new neighbourhood; a highway is where the vehicle drives fast."""
+    """Relative frequencies of `STYLES` in new neighbourhoods. Where the vehicle drives fast, there is a highway."""
     look_alike: float = 0.12
-    """Share of the stretches that are long and all alike."""
+    """Fraction of the stretches that are long and uniform."""
     crossing_every_m: Range = (60.0, 150.0)
-    """From one side street to the next."""
+    """Distance from one side street to the next, in metres."""
     wavelength_m: Range = (150.0, 600.0)
-    """Of the hills."""
+    """Wavelength of the hills, in metres."""
     steepest: float = 0.05
-    """No hill has a greater slope."""
+    """Maximum slope of the hills. A value of 0.05 is 5 %."""
 
     def __post_init__(self):
         unknown = [name for name in self.styles if name not in STYLES]
@@ -46,7 +46,7 @@ OUTSKIRTS = Scenery(
     wavelength_m=(60.0, 400.0),
     steepest=0.09,
 )
-"""Hilly land with long roads between walls, hedges and slopes, where one place looks like the next."""
+"""Hilly land with long roads between walls, hedges and slopes, where neighbouring places look alike."""
 LANES = Scenery(
     {"hedged": 0.45, "hillside": 0.2, "country": 0.1, "suburb": 0.15, "walled": 0.1},
     look_alike=0.3,
@@ -54,8 +54,8 @@ LANES = Scenery(
     wavelength_m=(80.0, 500.0),
     steepest=0.07,
 )
-"""Roads between overgrown hedges, whose face is seen from one lane and whose depth from the other."""
+"""Roads between overgrown hedges. One lane sees the face of a hedge, the other lane its depth."""
 GARDENS = Scenery({"gardens": 0.6, "centre": 0.15, "suburb": 0.1, "estate": 0.05, "park": 0.05, "country": 0.05})
-"""Streets of houses with front gardens: low fences that one sees through, hedges cut like walls, old trees."""
+"""Streets of houses with front gardens: low see-through fences, hedges cut like walls, and old trees."""
 SCENERIES = {"town": TOWN, "outskirts": OUTSKIRTS, "lanes": LANES, "gardens": GARDENS}
-"""By the names that the command line knows."""
+"""Sceneries by their names on the command line."""

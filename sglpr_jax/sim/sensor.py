@@ -1,4 +1,4 @@
-"""A spinning LiDAR: one turn of its lasers over a world."""
+"""Simulation of a spinning LiDAR: one revolution of its lasers in a world."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from sglpr_jax.sim.shapes import AnyArray, Vectors
 from sglpr_jax.sim.world import World
 
 HDL64E_DEG = (*np.linspace(2.0, -8.33, 32).tolist(), *np.linspace(-8.83, -24.8, 32).tolist())
-"""The elevations of the HDL-64E: two blocks of 32 lasers, the upper one finer."""
+"""Elevations of the HDL-64E in degrees: two blocks of 32 lasers, with a smaller spacing in the upper block."""
 HDL32E_DEG = tuple(np.linspace(10.67, -30.67, 32).tolist())
 NCLT_DEG = tuple(-elevation for elevation in HDL32E_DEG)
 NCLT_HEIGHT_M = 1.03
@@ -27,31 +27,34 @@ XT32_DEG = tuple(np.linspace(15.0, -16.0, 32).tolist())
 OS1_64_DEG = tuple(np.linspace(22.5, -22.5, 64).tolist())
 TURN_S = 0.1
 LASERS_AT_A_TIME = 16
-"""At most; must divide their number, else the largest common divisor is taken."""
+"""Maximum number of lasers in a block. The block size is its greatest common divisor with the number of lasers."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR; the default is KITTI's Velodyne HDL-64E, less the vehicle below it."""
+    """Spinning LiDAR. The default is KITTI's Velodyne HDL-64E without occlusion by the vehicle."""
 
     elevations_deg: tuple[float, ...] = HDL64E_DEG
     azimuth_steps: int = 1800
     height_m: float = 1.73
-    """Above the road."""
+    """Height above the road, in metres."""
     min_range_m: float = 2.5
     max_range_m: float = 80.0
     range_noise_m: float = 0.015
-    """Standard deviation along the ray."""
+    """Standard deviation of the range, in metres."""
     dropout: float = 0.02
-    """Share of the returns that are lost whatever they come from."""
+    """Fraction of the returns that are lost, whatever the surface."""
     faintest_echo: float = 6e-6
-    """Strength of an echo that is seen in 63 % of the cases; see `returns.echo_returns`."""
+    """Strength of an echo that is detected with a probability of 63 %, see `returns.echo_returns`."""
     edge_share: float = 0.3
-    """Share of the returns at an edge that come from between its two sides."""
+    """Fraction of the returns at an edge with a range between those of its two sides."""
     shadows_deg: tuple[tuple[float, float, float], ...] = ()
-    """What the vehicle hides: between two azimuths, counter-clockwise, nothing returns from below an elevation."""
+    """Occlusions by the vehicle: first azimuth, last azimuth (counter-clockwise) and elevation, in degrees.
+
+    Between these azimuths, rays below this elevation do not return.
+    """
     motion_distortion: bool = False
-    """Whether points are given relative to where the sensor was when it measured them, not to the scan's pose."""
+    """Whether points are relative to the sensor's position when they were measured, instead of the scan's pose."""
 
     def __post_init__(self):
         if not self.elevations_deg or self.azimuth_steps < 1:
@@ -70,35 +73,38 @@ KITTI_SHADOWS_DEG = (
     (231.0, 239.0, -20.5),
     (284.0, 302.0, -15.8),
 )
-"""As measured in KITTI's scans: bonnet, roof and what else is on it."""
+"""Occlusions measured in KITTI's scans: bonnet, roof and other parts on the roof."""
 HDL64E = Sensor(shadows_deg=KITTI_SHADOWS_DEG)
 SENSORS = {
     "hdl64e": HDL64E,
     "hdl32e": Sensor(HDL32E_DEG, azimuth_steps=2160, min_range_m=1.0, height_m=1.9),
-    # Upside down on a Segway: elevations and height are those that fit a real scan of NCLT.
+    # Mounted upside down on a Segway. Elevations and height fit a real scan of NCLT.
     "hdl32e-nclt": Sensor(NCLT_DEG, azimuth_steps=2160, min_range_m=1.9, height_m=NCLT_HEIGHT_M),
     "vlp16": Sensor(VLP16_DEG, min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
     "xt32": Sensor(XT32_DEG, azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
     "os1-64": Sensor(OS1_64_DEG, azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
 }
-"""Real sensors, by the names that the command line knows."""
+"""Real sensors by their names on the command line."""
 
 
 class View(NamedTuple):
-    """What a sensor may see from one pose: arrays of the same size for every pose, so that views can be stacked."""
+    """Shapes and ground that a sensor may hit from one pose.
+
+    Array shapes are the same for every pose, so views can be stacked.
+    """
 
     candidates: tuple[Candidates, ...]
     ground: GroundView
-    rotation: AnyArray  # (3, 3) world_from_lidar's
-    velocity: AnyArray  # (3,) of the sensor, in its own frame, m/s
+    rotation: AnyArray  # (3, 3) rotation of world_from_lidar
+    velocity: AnyArray  # (3,) velocity of the sensor in its own frame, m/s
 
 
 class Turn(NamedTuple):
-    """What came back of one turn; arrays begin (lasers, azimuths)."""
+    """Returns of one revolution. The first axes of the arrays are (lasers, azimuths)."""
 
     points: AnyArray  # (..., 4) x, y, z in metres in the LiDAR frame, intensity 0 to 1
     labels: AnyArray  # int32 raw SemanticKITTI ids
-    returned: AnyArray  # bool; where false, point and label mean nothing
+    returned: AnyArray  # bool; where false, point and label are invalid
 
 
 def scan(
@@ -110,12 +116,24 @@ def scan(
     time: float = 0.0,
     velocity: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
-    """Return one scan of `world` at `time`: points (x, y, z in metres in the LiDAR frame, intensity) and raw labels.
+    """Simulates one scan of a world.
 
-    Points come as in KITTI's files: laser by laser from the top, each laser counter-clockwise from straight ahead.
-    `velocity` (m/s, LiDAR frame) is used by sensors with `motion_distortion`.
+    The order of the points is that of KITTI's files: laser by laser in the order of `elevations_deg`, each laser
+    counter-clockwise from straight ahead.
 
-    Raises ValueError where the pose is not rigid, or a velocity is needed and missing.
+    Arguments:
+      key: Random key of the measurements.
+      world: World to scan.
+      world_from_lidar: Pose of the LiDAR.
+      sensor: LiDAR.
+      time: Time in the world, in seconds.
+      velocity: Velocity of the sensor in the LiDAR frame, in m/s. Sensors with `motion_distortion` need it.
+
+    Returns:
+      Points (x, y, z in metres in the LiDAR frame, intensity from 0 to 1) and their raw labels.
+
+    Raises:
+      ValueError: The pose is not rigid, or a needed velocity is missing.
     """
     view = view_of(world, world_from_lidar, sensor=sensor, time=time, velocity=velocity)
     return returned_points(cast_turn(key, view, sensor=sensor))
@@ -129,7 +147,7 @@ def view_of(
     time: float = 0.0,
     velocity: Float[np.ndarray, "3"] | None = None,
 ) -> View:
-    """Choose what the sensor may meet from a pose; raises as `scan` does."""
+    """Selects the shapes and the ground that the sensor may hit from a pose. Raises the errors of `scan`."""
     rotation = world_from_lidar[:3, :3]
     if not (np.isfinite(world_from_lidar).all() and are_rotations(rotation)):
         raise ValueError(f"expected a pose of rotation and translation, found {world_from_lidar.tolist()}")
@@ -145,7 +163,10 @@ def view_of(
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
-    """Cast the rays of one turn. A pure function of arrays: `jax.vmap` over keys and views gives many turns."""
+    """Casts the rays of one revolution.
+
+    This is a pure function of arrays, so `jax.vmap` over keys and views simulates many revolutions.
+    """
     key_surface, key_echoes = jax.random.split(key)
     surface = first_surface(key_surface, view, sensor=sensor)
     reach, returned = _echoes(key_echoes, surface, sensor)
@@ -159,7 +180,7 @@ def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
 
 
 def returned_points(turn: Turn) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarray, " n"]]:
-    """Points and labels of what came back of one turn, on the host."""
+    """Points and labels of the returns of one revolution, on the host."""
     points, labels, returned = (np.asarray(part) for part in turn)
     rows = np.flatnonzero(returned)
     return points.reshape(-1, 4).take(rows, axis=0), labels.take(rows)
@@ -167,9 +188,9 @@ def returned_points(turn: Turn) -> tuple[Float[np.ndarray, "n 4"], Int[np.ndarra
 
 @functools.partial(jax.jit, static_argnames="sensor")
 def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
-    """What every ray (lasers, azimuths) meets first, ground or shape, within the sensor's range.
+    """Finds the ground or shape that each ray (lasers, azimuths) hits first within the sensor's range.
 
-    A few lasers are cast at a time: low ones see the ground in front of most shapes, so that they are soon through.
+    Lasers are processed in blocks. Low lasers hit the ground in front of most shapes, so their blocks finish early.
     """
     rays = _rays(sensor)
     lasers, azimuths = rays.x.shape
@@ -191,7 +212,7 @@ def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
 
 
 def _rays(sensor: Sensor) -> Vectors:
-    """One ray of length 1 per laser and azimuth of whole sectors, in the LiDAR frame: arrays (lasers, azimuths)."""
+    """Unit vectors of the rays in the LiDAR frame, as arrays (lasers, azimuths). The azimuths fill whole sectors."""
     columns = sector_count(sensor.azimuth_steps) * COLUMNS
     azimuth = (np.arange(columns) * (2 * np.pi / sensor.azimuth_steps))[None, :]
     elevation = np.radians(sensor.elevations_deg)[:, None]
@@ -205,7 +226,7 @@ def _rays(sensor: Sensor) -> Vectors:
 
 
 def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:
-    """The measured range of every ray, and whether there is one."""
+    """Measured range of each ray, and whether the ray returns."""
     key_noise, key_seen, key_edge = jax.random.split(key, 3)
     shape = surface.distance.shape
     returned = (surface.distance < sensor.max_range_m) & echo_returns(
@@ -218,7 +239,7 @@ def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]
 
 
 def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
-    """Which rays the vehicle hides."""
+    """Whether the vehicle occludes each ray."""
     azimuth = np.arange(sensor.azimuth_steps) * (360 / sensor.azimuth_steps)
     elevation = np.array(sensor.elevations_deg)[:, None]
     hidden = np.zeros((len(elevation), len(azimuth)), bool)

@@ -1,7 +1,7 @@
-"""One town on several days: the same streets, houses and trees, but other parked cars, other traffic, another way.
+"""One town on several days: the same streets, houses and trees, with different parked cars, traffic and paths.
 
-The days are equal parts of one long drive with a pause between every two. So a place that is seen on two days is one
-place, and all that comes and goes has come and gone.
+The days are equal parts of one long drive, with a pause between consecutive days. Places are therefore the same on all
+days, while temporary things have changed.
 """
 
 import datetime
@@ -21,13 +21,13 @@ from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.world import World, build_world
 
 PAUSE_S = 1800.0
-"""Between two days, on the town's clock: three times as long as a car stays parked on average."""
+"""Pause between two days in the town's time, in seconds. It is three times the mean stay of a parked car."""
 START_H = 12
-"""Every session starts at noon, UTC."""
+"""Hour (UTC) at which each session starts."""
 
 
 class Session(NamedTuple):
-    """One day: the scans it will have, and the way to make them."""
+    """One day: names of its scans, and the function that simulates them."""
 
     date: str
     ids: tuple[str, ...]
@@ -44,13 +44,23 @@ def plan_sessions(
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
 ) -> tuple[Session, ...]:
-    """Return a session of `scans` scans for each of `dates`; the town is built when the first of them is simulated.
+    """Plans one session for each date. The town is built when the first session is simulated.
 
-    The first session drives `route`, the others the same streets in another order, partly in the opposite direction.
-    Times are seconds since 1970, ids the same in microseconds, as in NCLT.
+    The first session drives `route`. The others drive the same streets in another order, partly in the opposite
+    direction. As in NCLT, times are seconds since 1970, and ids are these times in microseconds.
 
-    Raises ValueError for an unknown route, a rate not above 0, a seed below 0, and for what is no date or is named
-    twice.
+    Arguments:
+      dates: Dates of the sessions, such as "2012-01-15".
+      route: Route of the first session, from `ROLES`.
+      scans: Number of scans of each session.
+      sensor: LiDAR.
+      seed: Seed of the town, at least 0.
+      rate_hz: Scans per second.
+      scenery: Scenery of the town.
+
+    Raises:
+      ValueError: The route is unknown, a date is invalid or repeated, or there are no dates. Or `scans` is below 2,
+        `rate_hz` is not positive, or `seed` is negative.
     """
     check_drawing(rate_hz, seed)
     starts = [_start_of(date) for date in dates]
@@ -89,13 +99,13 @@ def _session(
 
 
 def _with_pauses(path: PlanarPath, days: int) -> PlanarPath:
-    """The same way with PAUSE_S between every two of `days` equal parts."""
+    """`path` with a pause of PAUSE_S between each two of its `days` equal parts."""
     day = np.arange(len(path.times)) * days // len(path.times)
     return path._replace(times=path.times + PAUSE_S * day)
 
 
 def _start_of(date: str) -> float:
-    """Return when a session starts, in seconds since 1970; ValueError for what is no date."""
+    """Start of a session, in seconds since 1970. Raises ValueError if the date is invalid."""
     try:
         day = datetime.datetime.strptime(date, "%Y-%m-%d")
     except ValueError as error:

@@ -1,9 +1,9 @@
-"""What stands and moves in a world: upright boxes, cylinders and ellipsoids, each turned about z only.
+"""Standing and moving shapes of a world: boxes, cylinders and ellipsoids, rotated only about z.
 
-A shape is a unit solid (cube, cylinder, ball) that is scaled by its half sizes, turned by its yaw and moved to its
-centre. All three solids are convex, so a ray is inside one of them during one interval of its length, and the hit is
-where that interval begins. Every interval comes from one or two simpler ones: a cube is the meeting of three slabs, a
-cylinder that of a disc and a slab.
+A shape is a unit solid (cube, cylinder or ball), scaled by its half sizes, rotated by its yaw and moved to its centre.
+All solids are convex, so the part of a ray inside a solid is one interval. The hit is the start of this interval. The
+interval of a cube is the intersection of three slab intervals. The interval of a cylinder is the intersection of a disc
+interval and a slab interval.
 """
 
 from collections.abc import Callable
@@ -15,26 +15,26 @@ from jaxtyping import Array, Float
 
 AnyArray = Array | np.ndarray
 Interval = tuple[AnyArray, AnyArray]
-"""Where a ray enters and where it leaves a solid; enter > leave where it misses."""
+"""Distances at which a ray enters and leaves a solid. If the ray misses the solid, enter > leave."""
 
 
 class Shapes(NamedTuple):
-    """Shapes of one kind in the world frame; every array has the leading axis n."""
+    """Shapes of one kind in the world frame. The first axis of every array has length n."""
 
-    centre: AnyArray  # (n, 3) metres, at time 0: a mover's centre at time t is centre[:, :2] + velocity * t
+    centre: AnyArray  # (n, 3) metres, at time 0; at time t, x and y are centre[:, :2] + velocity * t
     half: AnyArray  # (n, 3) half sizes along the shape's own axes, metres
     yaw: AnyArray  # (n,) rotation about z, radians
     label: AnyArray  # (n,) int32 raw SemanticKITTI ids
-    roughness: AnyArray  # (n,) metres: mean depth that a ray goes into it before it returns; leaves are no wall
-    porosity: AnyArray  # (n,) share 0..1 of the rays that pass as if it were not there: crowns, fences of mesh
-    glass: AnyArray  # (n,) share 0..1 of a facade that is window; a window returns nothing most of the time
-    velocity: AnyArray  # (n, 2) m/s, zero for all that stands
-    since: AnyArray  # (n,) seconds: the shape is there for since <= time < until; -inf and inf: always
-    until: AnyArray  # (n,)
+    roughness: AnyArray  # (n,) mean depth inside the shape at which a ray returns, metres; for example leaves
+    porosity: AnyArray  # (n,) fraction of the rays that pass through the shape, 0 to 1: crowns, mesh fences
+    glass: AnyArray  # (n,) fraction of a facade that is window, 0 to 1; most rays into a window do not return
+    velocity: AnyArray  # (n, 2) m/s, zero for standing shapes
+    since: AnyArray  # (n,) seconds; the shape is present for since <= time < until, -inf to inf means always
+    until: AnyArray  # (n,) seconds
 
 
 class Scene(NamedTuple):
-    """Everything on the ground. The ground itself is no shape."""
+    """All shapes of a world, without the ground."""
 
     boxes: Shapes
     cylinders: Shapes
@@ -42,9 +42,9 @@ class Scene(NamedTuple):
 
 
 class Vectors(NamedTuple):
-    """Vectors as three arrays, one per axis, that broadcast against each other.
+    """Vectors as one array per axis. The arrays broadcast against each other.
 
-    This is several times faster than one (n, 3) array: no axis of length 3 takes part in the arithmetic.
+    This is several times faster than one (n, 3) array, because no operation has an axis of length 3.
     """
 
     x: AnyArray
@@ -53,11 +53,11 @@ class Vectors(NamedTuple):
 
 
 Solid = Callable[[Vectors, Vectors], Interval]
-"""Of origins and directions in a solid's unit frame: the interval of every ray inside the solid."""
+"""Function of origins and directions in a solid's unit frame that returns the interval of each ray in the solid."""
 
 
 def at_time(shapes: Shapes, time: float, near: Float[np.ndarray, "3"], *, reach_m: float) -> Shapes:
-    """Return the shapes that are there at `time` and less than `reach_m` from `near`, where they are then."""
+    """Returns the shapes present at `time` less than `reach_m` from `near`, at their positions at that time."""
     velocity = np.asarray(shapes.velocity)
     centre = np.concatenate([shapes.centre[:, :2] + velocity * time, shapes.centre[:, 2:]], axis=1)
     present = (shapes.since <= time) & (time < shapes.until)
@@ -67,41 +67,41 @@ def at_time(shapes: Shapes, time: float, near: Float[np.ndarray, "3"], *, reach_
 
 
 def _slab(origin: AnyArray, direction: AnyArray) -> Interval:
-    """The part of a ray with |origin + t direction| <= 1, along one axis."""
+    """Interval of a ray with |origin + t direction| <= 1 along one axis."""
     inverse = 1 / jnp.where(jnp.abs(direction) < 1e-9, 1e-9, direction)
     return -origin * inverse - jnp.abs(inverse), -origin * inverse + jnp.abs(inverse)
 
 
 def _round(square: AnyArray, towards: AnyArray, discriminant: AnyArray) -> Interval:
-    """The part of a ray with |o + t d| <= 1, from |d|^2, o.d and (o.d)^2 - |d|^2 (|o|^2 - 1)."""
+    """Interval of a ray with |o + t d| <= 1, from |d|^2, o.d and (o.d)^2 - |d|^2 (|o|^2 - 1)."""
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     enter = jnp.where(discriminant < 0, jnp.inf, (-towards - root) / square)
     return enter, (root - towards) / square
 
 
 def _both(a: Interval, b: Interval) -> Interval:
-    """The part that two intervals share."""
+    """Intersection of two intervals."""
     return jnp.maximum(a[0], b[0]), jnp.minimum(a[1], b[1])
 
 
 def cube(o: Vectors, d: Vectors) -> Interval:
-    """Where rays are in |x|, |y|, |z| <= 1."""
+    """Intervals of rays inside |x|, |y|, |z| <= 1."""
     return _both(_both(_slab(o.x, d.x), _slab(o.y, d.y)), _slab(o.z, d.z))
 
 
 def cylinder(o: Vectors, d: Vectors) -> Interval:
-    """Where rays are in x^2 + y^2 <= 1, |z| <= 1."""
+    """Intervals of rays inside x^2 + y^2 <= 1, |z| <= 1."""
     square = jnp.maximum(d.x**2 + d.y**2, 1e-12)
-    # The same discriminant, but float32 keeps this form for a thin pole far away too.
+    # Equal to the usual discriminant, but accurate in float32 even for a thin pole far away.
     discriminant = square - (o.x * d.y - o.y * d.x) ** 2
     return _both(_round(square, o.x * d.x + o.y * d.y, discriminant), _slab(o.z, d.z))
 
 
 def ball(o: Vectors, d: Vectors) -> Interval:
-    """Where rays are in x^2 + y^2 + z^2 <= 1."""
+    """Intervals of rays inside x^2 + y^2 + z^2 <= 1."""
     square, towards = d.x**2 + d.y**2 + d.z**2, o.x * d.x + o.y * d.y + o.z * d.z
     return _round(square, towards, towards**2 - square * (o.x**2 + o.y**2 + o.z**2 - 1))
 
 
 SOLIDS: tuple[Solid, Solid, Solid] = (cube, cylinder, ball)
-"""The solids of boxes, cylinders and ellipsoids, in this order."""
+"""Solids of boxes, cylinders and ellipsoids, in this order."""

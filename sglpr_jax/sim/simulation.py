@@ -1,4 +1,4 @@
-"""Simulated datasets in one call: several towns, one town on several days, and the two that stand in for real ones."""
+"""Writing of simulated datasets in one call: several towns, one town on several days, and two default datasets."""
 
 import dataclasses
 import functools
@@ -13,37 +13,40 @@ from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 
 ROUTES = ("00", "05", "08")
-"""The routes that are driven where none is named."""
+"""Default routes."""
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 AZIMUTH_STEPS = 900
-"""Firings per turn of the datasets that stand in for real ones."""
+"""Firings per revolution in the default datasets."""
 BYTES_PER_RAY = {"scans": 16, "nclt": 5}
-"""Of a scan and its labels: 20 for every return, and most rays return; of NCLT's 8, but many rays go into the sky."""
+"""Approximate size of a scan with its labels, in bytes per ray, by layout.
+
+Layout "scans" stores 20 bytes per return, and most rays return. NCLT stores 8, but many rays go into the sky.
+"""
 BYTES_PER_IMAGE = 3500
-"""With its label image."""
+"""Approximate size of an image with its label image, in bytes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulated:
-    """A dataset to be written, or written: what it will hold and how large it is."""
+    """Description of a simulated dataset, before or after it is written."""
 
     root: Path
     names: tuple[str, ...]
-    """Of its recordings."""
+    """Names of the recordings."""
     scans: int
-    """Of each of them, at most."""
+    """Maximum number of scans in each recording."""
     layout: str
-    """See `LAYOUTS`."""
+    """Name of the layout, from `LAYOUTS`."""
     sensor: Sensor
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """The recordings that are not finished."""
+        """Recordings that are not complete."""
         return tuple(name for name in self.names if not LAYOUTS[self.layout].is_finished(self.root, name))
 
     @property
     def missing_bytes(self) -> int:
-        """About how much there is to write."""
+        """Approximate size of the missing recordings, in bytes."""
         rays = len(self.sensor.elevations_deg) * self.sensor.azimuth_steps
         each = BYTES_PER_IMAGE if self.layout in ("images", "varied") else BYTES_PER_RAY[self.layout] * rays
         return each * self.scans * len(self.missing)
@@ -69,19 +72,35 @@ def simulate(
     on_start: Callable[[Simulated], None] = lambda dataset: None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Simulated:
-    """Drive a simulated LiDAR through simulated towns; write scans, labels and poses into the folder `out`.
+    """Drives a simulated LiDAR through simulated towns and writes scans, labels and poses.
 
-    `routes` are of 00 to 10 (None: 00, 05 and 08, or none with `along`), each through a town of its own; `along` are
-    KITTI pose files to drive along. With `sessions`, dates, one town is driven through on so many days, along one
-    route, in NCLT's layout. `sensor` is one of `SENSORS` (None: hdl64e, or hdl32e-nclt for sessions), `azimuth_steps`
-    its firings per turn. `rate_hz` is scans per second of a route, `scenery` one of `SCENERIES`. `images` writes
-    density images with label images in place of scans; with `vary` these are of scans rotated about z, some of them
-    with points lost (`sim/variety.py`). An interrupted dataset is completed, to the same bytes, and recordings can be
-    added.
+    The same call completes an interrupted dataset and gives the same bytes. Recordings can be added to a dataset, but
+    not sessions.
 
-    `on_start` is told what there is to write, once it is known that it can be, `on_progress` how many of its scans are
-    done, counting `scans` a recording. Raises ValueError for an unknown route or sensor, a malformed pose file, and
-    where `out` holds another dataset; OSError where something cannot be written.
+    Arguments:
+      out: Output folder.
+      routes: Routes "00" to "10", each with its own town. None drives 00, 05 and 08, or no route if there is `along`.
+      along: KITTI pose files to drive along.
+      sessions: Dates such as "2012-01-15". One town is driven on each of these days, in NCLT's layout. `routes` may
+        then hold one route; None is 00.
+      scans: Number of scans of each recording. Along a pose file it is the maximum.
+      sensor: Name from `SENSORS`. None is hdl64e, or hdl32e-nclt with `sessions`.
+      azimuth_steps: Firings per revolution. None is the sensor's own number.
+      seed: Seed of the towns, at least 0.
+      rate_hz: Scans per second of a route.
+      scenery: Name from `SCENERIES`.
+      images: Whether to write density images with label images instead of scans.
+      vary: Whether the images show scans that are rotated about z, some of them with lost points. See `sim.variety`.
+      on_start: Function that is called with the dataset's description after all arguments are checked.
+      on_progress: Function that is called with the number of completed scans, counting `scans` for each recording.
+
+    Returns:
+      Description of the dataset.
+
+    Raises:
+      ValueError: A route, the sensor or the scenery is unknown, a pose file is malformed, or arguments contradict each
+        other. Or `out` holds another dataset.
+      OSError: A file cannot be read or written.
 
     Example:
       print(sglpr_jax.simulate("towns", routes=["08"], scans=400))
@@ -89,20 +108,20 @@ def simulate(
     lidar = _lidar(sensor or ("hdl32e-nclt" if sessions else "hdl64e"), azimuth_steps)
     if sessions and (along or images or len(routes or ()) > 1):
         found = f"{len(routes or ())} routes, {len(along)} pose files, images {images}"
-        raise ValueError(f"expected at most one route beside sessions, no pose files and no images, found {found}")
+        raise ValueError(f"with sessions, expected at most one route, no pose files and no images, found {found}")
     if scenery not in SCENERIES:
         raise ValueError(f"expected a scenery among {', '.join(SCENERIES)}, found {scenery!r}")
     chosen = routes if routes is not None else () if along or sessions else ROUTES
     names = tuple(sessions) or (*chosen, *map(name_of_path, along))
     if vary and not images:
-        raise ValueError("vary changes scans before they become images: expected images with it, found scans")
+        raise ValueError("vary: expected images, found scans; vary changes scans before they are converted to images")
     layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
     out = Path(out)
     dataset = Simulated(out, names, scans, layout, lidar)
     start = functools.cache(lambda: on_start(dataset))
 
     def progress(name: str, done: int, count: int) -> None:
-        start()  # not before: by the first progress all that was asked for has been checked
+        start()  # here, because all arguments are checked before the first progress
         on_progress(names.index(name) * scans + done * scans // count)
 
     options = {"scans": scans, "sensor": lidar, "seed": seed, "rate_hz": rate_hz, "scenery": SCENERIES[scenery]}
@@ -114,12 +133,12 @@ def simulate(
 
 
 def default_dataset(cache: Path) -> tuple[Path, dict]:
-    """The folder below `cache`, and the options of `simulate`, of the dataset used where none is named."""
+    """Folder below `cache`, and options of `simulate`, for the dataset that is used by default."""
     return _below(cache, "simulated"), {"scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
 
 
 def default_sessions(cache: Path) -> tuple[Path, dict]:
-    """As `default_dataset`: one town on three days."""
+    """Like `default_dataset`, for one town on three days."""
     return _below(cache, "sessions"), {"sessions": DAYS, "scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
 
 

@@ -1,4 +1,4 @@
-"""The network of streets around a drive: those it drives along, each once, and side streets that branch off."""
+"""Network of streets around a drive: the driven streets, each once, and side streets."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -12,31 +12,31 @@ from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.styles import STYLES, Side, draw_side
 
 MIDDLE_M = 1.2
-"""How far left of the first pass the middle of the street is: one drives on the right."""
+"""Distance from the first pass to the middle of the street on its left, in metres. Traffic drives on the right."""
 SAME_STREET_M = 7.0
-"""Within this distance, and nearly parallel, another pass is along the same street."""
+"""Maximum distance between two passes along the same street, in metres. The passes are nearly parallel."""
 HIGHWAY_MPS = 17.0
 ROUNDABOUT_M = (5.5, 16.0)
-"""Radii that the way around a roundabout may have."""
+"""Minimum and maximum radius of the path around a roundabout, in metres."""
 
-_LOOK_BACK_M = 30  # along the path: what is nearer is the same pass
+_LOOK_BACK_M = 30  # distance along the path within which points belong to the same pass
 _SIDE_STREET_M = (30.0, 60.0)
 _STRETCH_M = (40.0, 150.0)
 _LOOK_ALIKE_M = (300.0, 600.0)
 
 
 class Stretch(NamedTuple):
-    """Part of a street with one style on either side; metres from the street's beginning."""
+    """Part of a street with one style on each side, from `start` to `stop` metres along the street."""
 
     start: int
     stop: int
-    half_width: float  # of the carriageway
+    half_width: float  # half width of the carriageway, metres
     left: Side
     right: Side
 
 
 class Street(NamedTuple):
-    """A line with one point a metre and what runs along it."""
+    """Line with one point per metre, and its stretches."""
 
     middle: np.ndarray  # (n, 2) metres
     heading: np.ndarray  # (n,) radians, unwrapped
@@ -44,29 +44,31 @@ class Street(NamedTuple):
 
 
 class Path(NamedTuple):
-    """The driven way with one point a metre."""
+    """Path of the vehicle with one point per metre."""
 
     xy: np.ndarray  # (n, 2) metres
     heading: np.ndarray  # (n,) radians, unwrapped
     times: np.ndarray  # (n,) seconds
-    speed: np.ndarray  # (n,) metres per second, over some 20 m
+    speed: np.ndarray  # (n,) metres per second, averaged over about 20 m
 
     @property
     def left(self) -> Float[np.ndarray, "n 2"]:
+        """Unit vectors to the left of the path."""
         return np.stack([-np.sin(self.heading), np.cos(self.heading)], axis=1)
 
 
 class Island(NamedTuple):
-    """The middle of a roundabout."""
+    """Central island of a roundabout."""
 
     centre: np.ndarray  # (2,) metres
-    radius: float
+    radius: float  # metres
 
 
 def resample(trajectory: Float[np.ndarray, "n 2"], times: Float[np.ndarray, " n"]) -> Path:
-    """One point a metre along `trajectory`; where the vehicle stood is one point.
+    """Resamples `trajectory` to one point per metre. A standstill becomes one point.
 
-    Raises ValueError where the trajectory is shorter than 2 m or not finite, or `times` do not increase.
+    Raises:
+      ValueError: The trajectory is shorter than 2 m or not finite, or `times` do not increase.
     """
     if len(trajectory) < 2 or not (np.isfinite(trajectory).all() and np.all(np.diff(times) > 0)):
         raise ValueError("a trajectory needs two or more finite points at increasing times")
@@ -84,19 +86,19 @@ def resample(trajectory: Float[np.ndarray, "n 2"], times: Float[np.ndarray, " n"
 
 
 def revisits(path: Path) -> Bool[np.ndarray, " n"]:
-    """Which points of the path lie on a street that was driven before, in either direction."""
+    """Whether each point of the path is on a street that was driven before, in either direction."""
     pairs = KDTree(path.xy).query_pairs(SAME_STREET_M, output_type="ndarray")
     parallel = np.abs(np.cos(path.heading[pairs[:, 0]] - path.heading[pairs[:, 1]])) > 0.75
     pairs = pairs[parallel & (pairs[:, 1] - pairs[:, 0] > _LOOK_BACK_M)]
     again = np.zeros(len(path.xy), bool)
-    # In order of the later point, so that a pass is compared only with first passes.
+    # Sorted by the later point, so that a pass is compared only with first passes.
     for older, later in pairs[np.lexsort(pairs.T)].tolist():
         again[later] |= not again[older]
     return again
 
 
 def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
-    """Yield first and one past the last index of every run of True; gaps shorter than `gap` are closed."""
+    """Yields the first index of each run of True, and one past the last. Gaps shorter than `gap` are closed."""
     indices = np.flatnonzero(keep)
     breaks = np.flatnonzero(np.diff(indices) > gap)
     firsts, lasts = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(indices) - 1]])
@@ -105,12 +107,15 @@ def runs(keep: Bool[np.ndarray, " n"], gap: int) -> Iterator[tuple[int, int]]:
 
 
 def draw_streets(rng: np.random.Generator, path: Path, scenery: Scenery = TOWN) -> tuple[Street, ...]:
-    """The streets along `path`, and side streets that branch off; same arguments and state of `rng`, same streets."""
+    """Draws the streets along `path` and their side streets.
+
+    Equal arguments and an equal state of `rng` give equal streets.
+    """
     middle = gaussian_filter1d(path.xy + MIDDLE_M * path.left, 1.5, axis=0, mode="nearest")
     style = _new_style(rng, scenery)
     streets, lines = [], [middle]
     for first, last in runs(~revisits(path), gap=12):
-        # A run begins and ends on a street that is already there: it reaches 4 m into it.
+        # A run begins and ends on an existing street and extends 4 m into it.
         line = slice(max(first - 4, 0), min(last + 4, len(middle)))
         fast = path.speed[line] > HIGHWAY_MPS
         street = Street(middle[line], path.heading[line], tuple(_draw_stretches(rng, fast, style, scenery)))
@@ -138,7 +143,7 @@ def _new_style(rng: np.random.Generator, scenery: Scenery) -> str:
 def _draw_stretches(
     rng: np.random.Generator, fast: Bool[np.ndarray, " n"], name: str, scenery: Scenery
 ) -> Iterator[Stretch]:
-    """Cut a street into stretches; a style lasts for some of them, and some are long and all alike."""
+    """Divides a street into stretches. A style lasts for several stretches. Some stretches are long and uniform."""
     start, changes = 0, np.flatnonzero(np.diff(fast.astype(int))) + 1
     town_width = rng.uniform(-0.2, 0.2)
     while start < len(fast):
@@ -149,7 +154,7 @@ def _draw_stretches(
         here = STYLES["highway" if fast[start] else name]
         half_width = sum(here.road) / 2 + town_width
         median = rng.random() < here.median
-        # Every fourth street looks different across the road.
+        # One stretch in four has another style on its right side.
         other = here if fast[start] or rng.random() < 0.75 else STYLES[_new_style(rng, scenery)]
         left = draw_side(rng, here, median=median, look_alike=look_alike)
         right = draw_side(rng, other, median=False, look_alike=look_alike)
@@ -160,7 +165,10 @@ def _draw_stretches(
 def _branch_starts(
     rng: np.random.Generator, street: Street, scenery: Scenery
 ) -> list[tuple[Float[np.ndarray, "2"], float]]:
-    """Where side streets may begin and lead: straight on where the street turns off, and by chance elsewhere."""
+    """Start points and headings of possible side streets.
+
+    They lead straight ahead at sharp bends of the street, and sideways at random points.
+    """
     starts = []
     for turn in _sharp_turns(street.heading):
         before, after = max(turn - 10, 0), min(turn + 10, len(street.heading) - 1)
@@ -179,7 +187,7 @@ def _branch_starts(
 
 
 def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
-    """Yield the middles of turns by 50 to 120 degrees within 20 m."""
+    """Yields the middle of each bend of 50 to 120 degrees within 20 m."""
     if len(heading) <= 60:
         return
     turned = np.abs(heading[20:] - heading[:-20])
@@ -192,7 +200,7 @@ def _sharp_turns(heading: Float[np.ndarray, " n"]) -> Iterator[int]:
 def _free_line(
     start: Float[np.ndarray, "2"], heading: float, length: float, bend: float, others: KDTree
 ) -> Float[np.ndarray, "m 2"]:
-    """A gentle curve from `start` that ends where it meets another street; empty where it would run along one."""
+    """Gentle curve from `start` to the next street that it meets. Where it runs along a street, it is cut or empty."""
     along = np.arange(int(length))
     bearing = heading + bend * along
     line = start + np.cumsum(np.stack([np.cos(bearing), np.sin(bearing)], axis=1), axis=0)
@@ -206,7 +214,7 @@ def _free_line(
 
 
 def roundabouts(path: Path) -> tuple[Island, ...]:
-    """The islands that the path goes around: a left-hand bend of 150 degrees or more within a small radius."""
+    """Islands of the roundabouts on the path, which are left-hand bends of at least 150 degrees with a small radius."""
     turning = gaussian_filter1d(np.gradient(path.heading), 2.0)
     round_it = (turning > 1 / ROUNDABOUT_M[1]) & (turning < 1 / ROUNDABOUT_M[0])
     islands = []
@@ -221,7 +229,7 @@ def roundabouts(path: Path) -> tuple[Island, ...]:
 
 
 class Network:
-    """The points of all streets as one table, and which of them is nearest to a place."""
+    """Table of the points of all streets, with queries for the nearest point."""
 
     def __init__(self, streets: tuple[Street, ...]):
         self.streets = streets
@@ -236,13 +244,13 @@ class Network:
         self._tree = KDTree(self.middle)
 
     def nearest(self, xy: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, " m"]:
-        """Index of the nearest point of any street."""
+        """Index of the street point nearest to each position."""
         return np.asarray(self._tree.query(xy)[1])
 
     def offset(self, xy: Float[np.ndarray, "m 2"], index: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """How far left of the street at its point `index` each place lies; negative on the right.
+        """Distance of each position to the left of the street at point `index`, negative to the right.
 
-        Beyond the end of a street its distance counts, so that a dead end is round.
+        Beyond the end of a street it is the distance from the end, so that a dead end is round.
         """
         away, cos, sin = xy - self.middle[index], np.cos(self.heading[index]), np.sin(self.heading[index])
         left, ahead = cos * away[:, 1] - sin * away[:, 0], np.abs(cos * away[:, 0] + sin * away[:, 1])

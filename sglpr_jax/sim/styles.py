@@ -1,4 +1,4 @@
-"""The kinds of neighbourhood: how wide the street is, what runs along it, and how the plots beside it are built."""
+"""Styles of neighbourhoods: widths of streets, strips along them, and buildings on the plots."""
 
 import dataclasses
 from typing import NamedTuple
@@ -10,40 +10,40 @@ from sglpr_jax.sim.raw_ids import OTHER_GROUND, PARKING, ROAD, SIDEWALK, TERRAIN
 from sglpr_jax.sim.things import Range
 
 BAY_M = 2.3
-"""Depth of a row of parked cars."""
+"""Depth of a row of parked cars, in metres."""
 CARRIAGEWAY_M = 7.0
-"""Width of the other carriageway of a street with a median."""
+"""Width of the second carriageway of a street with a median, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """How one kind of neighbourhood is built; pairs are ranges in metres, shares are probabilities."""
+    """Style of a neighbourhood. Pairs are ranges in metres, except for `glass`. Fractions are probabilities."""
 
     road: Range  # half width of the carriageway
-    walk: Range  # width of the sidewalk; 0 where there is none
+    walk: Range  # width of the sidewalk; 0 without a sidewalk
     garden: int  # label of the ground around the houses
-    houses: float = 0.0  # share of the plots that are built on
+    houses: float = 0.0  # fraction of the plots with a house
     width: Range = (8.0, 14.0)
     depth: Range = (7.0, 11.0)
     height: Range = (4.0, 8.0)
     gap: Range = (3.0, 11.0)
     set_back: Range = (3.0, 8.0)
-    glass: Range = (0.1, 0.35)
-    border: tuple[str, ...] = ("none",)  # what may close off the plots; one is drawn per side
-    closed: Range = (6.0, 30.0)  # metres of it between two entrances
-    bays: float = 0.0  # share of the sides with parked cars along the road
-    verge: float = 0.0  # share of the sides with a strip between road and sidewalk
-    median: float = 0.0  # share of the streets with a planted median and a carriageway beyond it
-    street_trees: float = 0.0  # share of the sides with a row of trees
-    trees: float = 0.0  # trees and bushes per metre of side, on the plots
-    wood: float = 0.0  # share of the sides where a wood comes down to the road
-    banks: float = 0.0  # share of the sides where the ground rises beside the road
-    posts: float = 0.0  # share of the sides with a row of posts along the road
-    slopes: float = 0.0  # share of the sides that are the foot of a hill
-    old_trees: bool = False  # whether trees show thick trunks and bare limbs under their crowns
-    groups: bool = False  # whether people stand together
-    bystanders: float = 0.0  # people, bicycles, bins and the like per metre of side
-    signs: float = 0.02  # per metre of side
+    glass: Range = (0.1, 0.35)  # fraction of a facade that is window
+    border: tuple[str, ...] = ("none",)  # possible borders of the plots; one is drawn per side
+    closed: Range = (6.0, 30.0)  # length of the border between two entrances
+    bays: float = 0.0  # fraction of the sides with parked cars along the road
+    verge: float = 0.0  # fraction of the sides with a strip between road and sidewalk
+    median: float = 0.0  # fraction of the streets with a planted median and a second carriageway
+    street_trees: float = 0.0  # fraction of the sides with a row of trees
+    trees: float = 0.0  # trees and bushes on the plots, per metre of side
+    wood: float = 0.0  # fraction of the sides with a wood along the road
+    banks: float = 0.0  # fraction of the sides with banks beside the road
+    posts: float = 0.0  # fraction of the sides with a row of posts along the road
+    slopes: float = 0.0  # fraction of the sides at the foot of a hill
+    old_trees: bool = False  # whether trees have thick trunks and bare limbs under their crowns
+    groups: bool = False  # whether people stand in groups
+    bystanders: float = 0.0  # people, bicycles, bins and similar things, per metre of side
+    signs: float = 0.02  # traffic signs per metre of side
     lamps: bool = True
 
 
@@ -256,38 +256,38 @@ STYLES = {
 
 
 class Strip(NamedTuple):
-    """Ground along the road."""
+    """Strip of ground along the road."""
 
-    width: float
+    width: float  # metres
     label: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """One side of a stretch of street: strips from the kerb outwards, then the plots."""
+    """One side of a stretch: strips from the kerb outwards, then the plots."""
 
     style: Style
     strips: tuple[Strip, ...]
-    median: float  # width of the median; 0 where there is none
+    median: float  # width of the median, metres; 0 without a median
     bays: bool  # whether cars park along the first strip
-    occupied: float  # share of the bays that are taken
-    set_back: float  # the common building line, metres behind the last strip
+    occupied: float  # fraction of the bays that are occupied
+    set_back: float  # distance of the common building line behind the last strip, metres
     border: str
     wood: bool
     bank: bool
     slope: bool
-    tree_spacing: float  # of the row of street trees; 0 where there is none
-    post_spacing: float  # of the row of posts; 0 where there is none
-    row: House | None  # the house that stands again and again along a look-alike street
+    tree_spacing: float  # distance between street trees, metres; 0 without street trees
+    post_spacing: float  # distance between posts, metres; 0 without posts
+    row: House | None  # house that repeats along a uniform stretch
 
     @property
     def verge(self) -> float:
-        """Depth of all strips."""
+        """Total width of the strips, in metres."""
         return sum((strip.width for strip in self.strips), start=0.0)
 
 
 def draw_side(rng: np.random.Generator, style: Style, *, median: bool, look_alike: bool) -> Side:
-    """Draw how one side of a stretch is built."""
+    """Draws one side of a stretch in the given style."""
     width = rng.uniform(2.5, 9.0) if median else 0.0
     bays = not median and rng.random() < style.bays
     strips = []
@@ -321,5 +321,5 @@ def _planted(rng: np.random.Generator) -> int:
 
 
 def draw_house(rng: np.random.Generator, style: Style) -> House:
-    """Draw the size of a house of this style."""
+    """Draws the size of a house of this style."""
     return House(*(rng.uniform(*span) for span in (style.width, style.depth, style.height, style.glass)))

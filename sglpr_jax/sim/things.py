@@ -1,22 +1,22 @@
-"""How the things of a town are put together from boxes, cylinders and ellipsoids."""
+"""Things of a town, composed of boxes, cylinders and ellipsoids."""
 
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 Range = tuple[float, float]
-"""Lowest and highest value of a uniform distribution."""
+"""Minimum and maximum of a uniform distribution."""
 Kind = Literal["box", "cylinder", "ellipsoid"]
 KINDS: tuple[Kind, ...] = ("box", "cylinder", "ellipsoid")
-"""In the order of shapes.Scene."""
+"""Kinds in the order of `shapes.Scene`."""
 
 
 Zone = Literal["bay", "verge", "plot"]
-"""Where a thing belongs: parked along its own street, on the strips beside the road, or behind them."""
+"""Place of a thing: parked along its street, on the strips beside the road, or behind the strips."""
 
 
 class Part(NamedTuple):
-    """One shape of a thing, in the thing's own frame: x forward, y left, z = 0 on the ground; metres and radians."""
+    """One shape of a thing, in metres and radians in the thing's frame: x forward, y left, z = 0 on the ground."""
 
     kind: Kind
     label: int
@@ -31,16 +31,16 @@ class Part(NamedTuple):
 
 
 Thing = tuple[Part, ...]
-"""What stands, comes and goes as one."""
+"""Parts that stand, appear and disappear together."""
 
 
 class Placed(NamedTuple):
-    """A thing beside a street: s metres along it, d metres outwards from the kerb."""
+    """Thing beside a street, s metres along the street and d metres outwards from the kerb."""
 
     thing: Thing
     s: float
     d: float
-    yaw: float = 0.0  # of the thing's x axis against the street, turning outwards
+    yaw: float = 0.0  # of the thing's x axis relative to the street, positive outwards, radians
     zone: Zone = "plot"
     since: float = -np.inf  # seconds
-    until: float = np.inf
+    until: float = np.inf  # seconds

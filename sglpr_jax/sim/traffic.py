@@ -1,4 +1,4 @@
-"""What moves: oncoming and other traffic, riders and walkers, as short pieces of straight motion."""
+"""Moving things: oncoming and other traffic, riders and pedestrians, as short pieces of straight motion."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -16,23 +16,23 @@ from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
 from sglpr_jax.sim.things import Part, Range, Thing
 
 KEPT_M = 8.0
-"""What drives ahead of the vehicle or behind it keeps this far away."""
+"""Minimum distance of traffic ahead of the vehicle or behind it, in metres."""
 
 _VIEW_M = 85.0
 _PIECE_M, _PIECE_S = 7.0, (0.4, 1.0)
-"""A piece of straight motion is about this long, and takes so long."""
+"""Approximate length of a piece of straight motion in metres, and range of its duration in seconds."""
 
 LaneName = Literal["oncoming", "own", "left walk", "right walk"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Flow:
-    """One kind of traffic; the vehicle meets one each `every_m` metres."""
+    """One kind of traffic. The vehicle meets one such thing per `every_m` metres."""
 
     make: Callable[[np.random.Generator], Thing]
     every_m: float
     lanes: tuple[LaneName, ...]
-    speed: Range  # m/s, against the ground; of the vehicle's own lane: not used
+    speed: Range  # m/s relative to the ground; not used in the vehicle's own lane
 
 
 _DRIVING, _RIDING, _WALKING = (5.0, 12.0), (3.0, 5.5), (0.9, 1.6)
@@ -50,14 +50,14 @@ FLOWS = (
 
 
 class Lane(NamedTuple):
-    """A line beside the vehicle's way, one point per point of the path."""
+    """Line beside the vehicle's path, with one point per point of the path."""
 
     xy: np.ndarray  # (n, 2) metres
-    usable: np.ndarray  # (n,) whether anybody goes there
+    usable: np.ndarray  # (n,) whether the lane can be used at this point
 
 
 def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
-    """Where traffic goes, seen from the vehicle: the oncoming lane, its own, and the sidewalks."""
+    """Lanes of the traffic relative to the vehicle: the oncoming lane, its own lane, and the sidewalks."""
     nearest = network.nearest(path.xy)
     same_way = np.cos(path.heading - network.heading[nearest])
     to_middle = -network.offset(path.xy, nearest) * np.sign(same_way)
@@ -81,7 +81,7 @@ def lanes(network: Network, path: Path) -> dict[LaneName, Lane]:
 
 
 class Pieces(NamedTuple):
-    """Straight motions of one thing: from the place `begin` at `since` to `end` at `until`."""
+    """Straight motions of one thing, from position `begin` at time `since` to `end` at `until`."""
 
     thing: Thing
     begin: np.ndarray  # (k, 2) metres
@@ -92,7 +92,7 @@ class Pieces(NamedTuple):
 
 
 def traffic(rng: np.random.Generator, network: Network, path: Path, ground: Ground) -> tuple[Shapes, list[Part]]:
-    """All that moves around the vehicle while it drives, clear of it, and the part of every row."""
+    """Draws the traffic around the vehicle, clear of it. Returns the shapes, and the part of each row."""
     lines = lanes(network, path)
     pieces = [piece for flow in FLOWS for piece in _movers(rng, flow, lines, path)]
     rows = [_rows(piece, path, ground) for piece in pieces]
@@ -101,7 +101,7 @@ def traffic(rng: np.random.Generator, network: Network, path: Path, ground: Grou
 
 
 def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Pieces]:
-    """Yield the movers of one flow, each met at a place of its own on the path."""
+    """Yields the movers of one flow. The vehicle meets each at another point of the path."""
     for block in np.arange(rng.uniform(-0.5, 0) * flow.every_m, len(path.xy), flow.every_m):
         met, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
         thing, speed = vehicles.moving(flow.make(rng)), rng.uniform(*flow.speed)
@@ -132,7 +132,7 @@ def _pieces(
     along: Float[np.ndarray, " k"],
     direction: int,
 ) -> Pieces:
-    """The motion of a thing that is at place `along` of the lane at each of `times`, where the lane goes on."""
+    """Motion of a thing that is `along` metres along the path at `times`, without parts beyond the lane's ends."""
     inside = (along[:-1] >= 0) & (along[1:] >= 0) & (np.maximum(along[:-1], along[1:]) <= len(path.xy) - 1)
     index = np.arange(len(path.xy))
     xy = np.stack([np.interp(along, index, axis) for axis in lane.xy.T], axis=1)
@@ -142,7 +142,7 @@ def _pieces(
 
 
 def _rows(pieces: Pieces, path: Path, ground: Ground) -> tuple[Shapes, list[Part]]:
-    """The pieces that keep clear of the vehicle, as shapes."""
+    """Shapes of the pieces that stay clear of the vehicle, and the part of each row."""
     keep = _clear(pieces, path)
     begin, end, heading, since, until = (leaf[keep] for leaf in pieces[1:])
     count, size = len(heading), len(pieces.thing)
@@ -152,12 +152,12 @@ def _rows(pieces: Pieces, path: Path, ground: Ground) -> tuple[Shapes, list[Part
     parts = [*pieces.thing] * count
     shapes = place(parts, anchors, ground)
     centre = shapes.centre.copy()
-    centre[:, :2] -= velocity[row] * middle[row, None]  # back to time 0
+    centre[:, :2] -= velocity[row] * middle[row, None]  # position at time 0
     return shapes._replace(centre=centre, velocity=velocity[row]), parts
 
 
 def _clear(pieces: Pieces, path: Path) -> Bool[np.ndarray, " k"]:
-    """Which pieces keep clear of the vehicle all the time: CLEARANCE_M beside it, KEPT_M ahead and behind."""
+    """Whether each piece stays clear of the vehicle: CLEARANCE_M beside it, KEPT_M ahead of it and behind."""
     half = np.max([(abs(part.x) + part.size[0] / 2, part.size[1] / 2, 0.0) for part in pieces.thing], axis=0)
     half = np.tile(half, (len(pieces.heading), 1))
     clear = np.ones(len(pieces.heading), bool)

@@ -1,6 +1,7 @@
-"""Scans as other sensors, weather and headings would have them, for training: rotated, and some with points lost.
+"""Varied scans for training: rotated about z, some with lost points, as with other sensors, weather and headings.
 
-A scan alone decides what happens to it, so that whoever writes a dataset, and in how many goes, writes the same bytes.
+The variation of a scan depends only on its points. A dataset therefore has the same bytes, even if its writing was
+interrupted.
 """
 
 import zlib
@@ -13,19 +14,28 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.views import rotated
 
 THINNED, FEWER_BEAMS = 0.4, 0.3
-"""The share of the scans that lose points at random, and of those that lose whole rings; the rest stays whole."""
+"""Fraction of the scans that lose random points, and fraction that loses whole rings. Other scans keep all points."""
 MOST_LOST = 0.95
-"""Of the points of a scan; every share up to it is as likely."""
+"""Maximum fraction of the points of a scan that are lost. The fraction is uniformly distributed."""
 BEAMS = (32.0, 16.0)
-"""How many may be left."""
+"""Possible numbers of remaining beams."""
 
 
 def vary(
     points: Float32[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], mounting: Mounting | None
 ) -> tuple[Float32[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
-    """What is left of a scan (metres, LiDAR frame) and its labels, levelled and rotated about z by any angle.
+    """Removes points of some scans, levels the scan, and rotates it about z by a random angle.
 
-    The rotation comes before any image is made: one of an image would blur its cells.
+    The random seed is a hash of the points. The points are rotated because a rotation of the image would blur its
+    cells.
+
+    Arguments:
+      points: Points in the LiDAR frame, in metres.
+      labels: Labels of the points.
+      mounting: Mounting of the LiDAR. None is the mounting that the models expect.
+
+    Returns:
+      Remaining points and their labels.
     """
     seed = zlib.crc32(points.tobytes())
     left = _left(points, np.random.default_rng(seed))

@@ -1,4 +1,4 @@
-"""Vehicles, riders and people: the things that can move."""
+"""Things that can move: vehicles, riders and people."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from sglpr_jax.sim.things import Part, Thing
 
 
 def car(rng: np.random.Generator) -> Thing:
-    """A body of the car's full length and a shorter, narrower cabin on it."""
+    """Car: a body of full length, with a shorter and narrower cabin on top."""
     length, width, height = rng.uniform(3.7, 4.8), rng.uniform(1.65, 1.85), rng.uniform(1.4, 1.65)
     cabin, estate = rng.uniform(0.45, 0.7) * length, rng.uniform(0, 0.12) * length
     return (
@@ -36,7 +36,7 @@ def van(rng: np.random.Generator) -> Thing:
 
 
 def truck(rng: np.random.Generator) -> Thing:
-    """A cab and, behind a gap, the load."""
+    """Truck: a cab and, behind a gap, the load."""
     length, height = rng.uniform(6, 9), rng.uniform(2.7, 3.6)
     return (
         Part("box", TRUCK, (1.9, 2.2, 2.3), x=length / 2 - 0.95, bottom=0.45),
@@ -74,7 +74,7 @@ def person(rng: np.random.Generator) -> Thing:
 
 
 def people(rng: np.random.Generator) -> Thing:
-    """One to three people side by side, their arms and bags included."""
+    """One to three people side by side, including their arms and bags."""
     parts = []
     for place in range(int(rng.integers(1, 4))):
         deep, wide, height = rng.uniform((0.35, 0.5, 1.5), (0.6, 0.8, 1.9)).tolist()
@@ -84,11 +84,11 @@ def people(rng: np.random.Generator) -> Thing:
 
 
 def moving(thing: Thing) -> Thing:
-    """The same with the labels of things that move."""
+    """`thing` with the labels of the moving classes."""
     return tuple(part._replace(label=MOVING[part.label]) for part in thing)
 
 
 def parked(rng: np.random.Generator) -> Thing:
-    """What stands at the kerb: mostly cars."""
+    """Parked vehicle, mostly a car."""
     make = (car, van, truck)[rng.choice(3, p=[0.955, 0.03, 0.015])]
     return make(rng)

@@ -1,4 +1,4 @@
-"""The town around a drive: streets, what stands along them, and the traffic."""
+"""Town around a drive: streets, things along them, and traffic."""
 
 from typing import NamedTuple
 
@@ -15,11 +15,11 @@ from sglpr_jax.sim.streets import Network, Path, draw_streets, resample, roundab
 from sglpr_jax.sim.traffic import traffic
 
 VIEW_M = 110.0
-"""What is never nearer to the vehicle than this while it is there is left out."""
+"""Maximum distance of things from the vehicle, in metres. Standing things that never come closer are omitted."""
 
 
 class World(NamedTuple):
-    """A town: all shapes in the world frame, and the ground."""
+    """Town: all shapes in the world frame, and the ground."""
 
     scene: Scene
     ground: Ground
@@ -32,12 +32,19 @@ def build_world(
     *,
     scenery: Scenery = TOWN,
 ) -> World:
-    """Return the town of `seed` around a drive, built only where the vehicle goes.
+    """Builds a town around a drive.
 
-    `trajectory` holds x and y of the LiDAR in metres at `times` in seconds; points may lie 0.2 to 3 m apart, and the
-    vehicle may stand still. Nothing comes nearer to the trajectory than 1.6 m. Same arguments, same town.
+    The town exists only along the path of the vehicle. Nothing is closer to the trajectory than 1.6 m. Equal arguments
+    give equal towns.
 
-    Raises ValueError where the trajectory is shorter than 2 m or not finite, or `times` do not increase.
+    Arguments:
+      seed: Seed of the town.
+      trajectory: x and y of the LiDAR, in metres. Points may be 0.2 to 3 m apart, and the vehicle may stand still.
+      times: Times of these positions, in seconds.
+      scenery: Scenery of the town.
+
+    Raises:
+      ValueError: The trajectory is shorter than 2 m or not finite, or `times` do not increase.
     """
     rng = np.random.default_rng(seed)
     path = resample(trajectory, times)
@@ -56,7 +63,7 @@ def build_world(
 
 
 def _in_view(shapes: Shapes, path: Path) -> Bool[np.ndarray, " n"]:
-    """Which shapes the vehicle comes near to while they are there."""
+    """Whether each shape moves, or is within VIEW_M of the vehicle while it is present."""
     keep = np.any(shapes.velocity != 0, axis=1)
     for i in range(0, len(path.xy), 10):
         near = np.sum((shapes.centre[:, :2] - path.xy[i]) ** 2, axis=1) < VIEW_M**2

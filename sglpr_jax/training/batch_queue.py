@@ -1,4 +1,4 @@
-"""The batches of a run in order, read ahead, but never past a refresh of what negatives are mined by."""
+"""Batches of a run in order. They are prefetched, but only up to the next refresh of the mined negatives."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
@@ -9,28 +9,30 @@ from sglpr_jax.models.params import Params
 
 
 class BatchSource(ABC):
-    """Where the batches of a run come from."""
+    """Source of the batches of a run."""
 
     refresh_steps: int = 0
-    """Every so many steps `refresh` has to be called, before any batch from there on is asked for; 0: never."""
+    """Number of steps between calls of `refresh`, or 0 for no refresh. No batch at or after a refresh step may be
+    requested before that call."""
 
     @abstractmethod
     def batch(self, step: int) -> Batch:
-        """Return this host's part of the batch of a step, the same each time it is asked."""
+        """Return this host's part of the batch of a step. Repeated calls return the same batch."""
 
     def refresh(self, step: int, params: Params) -> None:
-        """Take note of the weights before `step`: the batches from that step on may depend on them."""
-        return None  # most sources have nothing to refresh
+        """Update the source with the weights before `step`. The batches from that step on may depend on them."""
+        return None  # default: the batches do not depend on the weights
 
     def places(self, step: int) -> str:
-        """Name the places of a step's batch, for an error."""
+        """Describe the places in the batch of a step, for error messages."""
         return ""
 
 
 class BatchQueue:
-    """An iterator over the batches of the steps from `start` to `stop`; `prepare` must be called before each of them.
+    """Iterator over the batches of the steps from `start` to `stop - 1`.
 
-    `place` puts a batch where the step wants it, on the devices say; it runs in the thread that reads ahead.
+    `prepare` must be called before each `next`. `place` moves a batch to where the step needs it, for example to the
+    devices. It runs in the prefetching thread.
     """
 
     def __init__(
@@ -41,7 +43,7 @@ class BatchQueue:
         self._ahead = self._read(start if source.refresh_steps else stop)
 
     def prepare(self, params: Params) -> None:
-        """Refresh what the coming batches are made by, where that is due; `params` are the present weights."""
+        """Refresh the source if the next step requires it. `params` are the current weights."""
         every = self._source.refresh_steps
         if not every or self._next < self._end:
             return
@@ -55,7 +57,7 @@ class BatchQueue:
         return batch
 
     def close(self) -> None:
-        """End the thread that reads."""
+        """Stop the prefetching thread."""
         self._ahead.close()
 
     def _read(self, end: int) -> Generator[Batch, None, None]:

@@ -1,4 +1,4 @@
-"""The batches of a training: tuples of places of recordings, of one dataset or of two."""
+"""Training batches: tuples of places from one or two datasets."""
 
 import functools
 from collections.abc import Sequence
@@ -20,21 +20,22 @@ from sglpr_jax.training.mining import Mining
 def tuple_pool(
     recordings: Sequence[Recording], config: TrainConfig, *, frames: Sequence[Int[np.ndarray, "_"]] | None = None
 ) -> TuplePool:
-    """The tuples of the places of recordings, or of their `frames`. Raises ValueError where there are none."""
+    """Collect the tuples of the recordings, or of their `frames`. Raises ValueError if there are no tuples."""
     return TuplePool([positions_of(recording) for recording in recordings], config.sampling, frames=frames)
 
 
 def positions_of(recording: Recording) -> Float[np.ndarray, "n 3"]:
-    """The positions of a recording, metres. Raises ValueError where it has none."""
+    """Return the positions of a recording, in metres. Raises ValueError if it has none."""
     if recording.positions is None:
         raise ValueError(f"sequence {recording.name} has no poses; training and testing need them")
     return recording.positions
 
 
 class TupleBatches(BatchSource):
-    """Batches of tuples of `pool`, read from `recordings`; the recordings of `also` have `also_tuples` of a step's.
+    """Batches of tuples from `pool`, read from `recordings`.
 
-    With `mining` the negatives are those that look alike to the network as it was at the last refresh.
+    With `also`, `config.also_tuples` tuples of each step come from these recordings of a second dataset. With `mining`,
+    the negatives are places whose descriptors were similar at the last refresh.
     """
 
     def __init__(
@@ -61,12 +62,12 @@ class TupleBatches(BatchSource):
         return mix(main, second, triplets=config.also_triplets, share_negatives=config.share_negatives)
 
     def refresh(self, step: int, params: Params) -> None:
-        """Find out anew which places look alike."""
+        """Recompute the descriptors that mining compares, if negatives are mined."""
         if self._mining is not None:
             self._mining.refresh(step, params)
 
     def places(self, step: int) -> str:
-        """Name the places of a step's batch, of both datasets: their recordings, and the scans there."""
+        """Describe the places in the batch of a step: recordings and scans of both datasets."""
         named = _named(self._recordings, self._pool, self._frames(step))
         if self._also_pool is not None:
             named += _named(self._also, self._also_pool, self._also_frames(self._also_pool, step))
@@ -92,7 +93,7 @@ class TupleBatches(BatchSource):
 
 
 def _named(recordings: Sequence[Recording], pool: TuplePool, frames: Int[np.ndarray, "t k"]) -> list[str]:
-    """In words the recordings that some frames of a pool are of, and the scans there."""
+    """Describe frames of a pool: their recordings and the ids of their scans."""
     places, named = np.unique(frames), []
     for number, recording in enumerate(recordings):
         ids = [recording.ids[pool.frame[f]] for f in places[pool.recording[places] == number]]

@@ -1,13 +1,13 @@
-"""What can be done while a training runs, beside training: show how far it is, write measurements, draw curves."""
+"""Hooks that run during training: progress display, logs of measurements, curves."""
 
 import contextlib
 from collections.abc import Mapping
 
 
 class Callback:
-    """Follows a training. Its methods are called as the training goes on, and do nothing unless they are overridden.
+    """Follows a training run. Subclasses override the methods they need; the defaults do nothing.
 
-    Where several hosts train together, only the first one calls them.
+    If several hosts train together, only the first host calls them.
 
     Example:
       class PrintScores(Callback):
@@ -16,29 +16,30 @@ class Callback:
     """
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
-        """A recording is being packed (`train`'s `cache`): `done` of its `scans` are."""
+        """Called while `train` packs a recording (`cache`): `done` of its `scans` are packed."""
 
     def on_start(self, step: int, steps: int) -> None:
-        """The loop begins: `step` of `steps` steps are made already."""
+        """Called before the first step: `step` of `steps` steps are already done."""
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Every `log_every` steps: the means since the last time of the loss, its terms, norms and the speed."""
+        """Called every `log_every` steps with means since the last call: the loss, its terms, norms and speed."""
 
     def on_score(self, step: int, scores: Mapping[str, float]) -> None:
-        """Every `score_every` steps: the scores of the weights; "score" tells the best checkpoint."""
+        """Called every `score_every` steps with the scores of the weights. The entry "score" selects the best
+        checkpoint."""
 
     def on_checkpoint(self, step: int) -> None:
-        """The weights after this step are being written as a checkpoint."""
+        """Called when a checkpoint of the weights after this step is being written."""
 
     def on_end(self, step: int) -> None:
-        """All steps are made, or the run was asked to stop after this one; its weights are saved."""
+        """Called after the last step, or after this step if the run was asked to stop. The weights are saved."""
 
     def close(self) -> None:
-        """Close what is open: the last call, after an error too."""
+        """Close open files. This is the last call, also after an error."""
 
 
 class Callbacks(Callback):
-    """Several callbacks as one; each method calls theirs, in their order."""
+    """Combines several callbacks. Each method calls them in order."""
 
     def __init__(self, *callbacks: Callback):
         self._callbacks = callbacks
@@ -68,7 +69,7 @@ class Callbacks(Callback):
             callback.on_end(step)
 
     def close(self) -> None:
-        """Close all, the first one first, even where one of them raises."""
+        """Close all callbacks in order, even if one of them raises an error."""
         with contextlib.ExitStack() as closing:
             for callback in reversed(self._callbacks):
                 closing.callback(callback.close)

@@ -1,7 +1,9 @@
-"""Checkpoints of a training run: atomic, with checksums, the newest and the best kept. The one file that knows orbax.
+"""Checkpoints of a training run. They are written atomically with checksums; the newest ones and the best are kept.
 
-17/               one checkpoint: weights, optimizer, metrics, what was measured and not logged yet, checksums.json
-damaged-17/       one that is not as it was written; it was set aside
+This is the only file that imports orbax.
+
+17/               one checkpoint: weights, optimizer, metrics, measurements that are not logged yet, checksums.json
+damaged-17/       renamed checkpoint whose files do not match their checksums
 """
 
 import asyncio
@@ -30,30 +32,31 @@ _KEPT_LATEST = 2
 _INTACT = "the last checkpoint is intact"
 _UNLOGGED = "unlogged"
 _OUTDATED = "outdated"
-"""Checkpoints are moved here whole before they are deleted: one deleted in part would look like a checkpoint."""
+"""Folder to which a checkpoint is moved before it is deleted. A partly deleted checkpoint would look like a valid
+one."""
 
 
 class _WithChecksums(atomicity.AtomicRenameTemporaryPath):
-    """A checkpoint under its temporary name, which gets its checksums before its own name."""
+    """Temporary checkpoint folder that gets its checksums before it is renamed to its final name."""
 
     async def finalize(self) -> None:
-        """Called once for each item, and once for all of them."""
+        """Called once for each item, and once for the whole checkpoint."""
         if self.get_final().name.isdecimal():
             await asyncio.to_thread(write_checksums, Path(self.get()))
         await super().finalize()
 
 
 class Checkpoints:
-    """The checkpoints in one folder; weights and optimiser are separate items, so that either can be read alone."""
+    """Checkpoints in one folder. Weights and optimiser state are separate items, so that each can be read alone."""
 
     def __init__(self, folder: Path):
-        """Damaged checkpoints are named on stderr and set aside. Raises ValueError where no other one is there."""
+        """Rename damaged checkpoints and report them on stderr. Raises ValueError if all checkpoints are damaged."""
         self._folder = folder.resolve()
         self._sweep()
         on_all_hosts(lambda: is_first_host() and set_damaged_aside(self._folder))
         policy = AnyPreservationPolicy([LatestN(_KEPT_LATEST), BestN(get_metric_fn=_score, n=1)])
         options = ocp.CheckpointManagerOptions(
-            best_fn=_score,  # without it scores are not written, and a resumed run keeps all it finds
+            best_fn=_score,  # without it no scores are written, and a resumed run keeps all checkpoints
             preservation_policy=policy,
             cleanup_tmp_directories=True,
             todelete_subdir=_OUTDATED,
@@ -66,10 +69,15 @@ class Checkpoints:
     def save(
         self, state: TrainState, *, score: float | None = None, unlogged: Sequence[Mapping[str, float]] = ()
     ) -> None:
-        """Write the state under its step, with its score if it has one. A step already there is left as it is.
+        """Write the state under its step. An existing checkpoint of that step stays unchanged.
 
-        `unlogged` are the measurements of the steps since the last line of the log. Raises OSError where this
-        checkpoint or the one before it, written meanwhile, cannot be written.
+        Arguments:
+          state: State to save.
+          score: Score of the weights, if it was measured.
+          unlogged: Measurements of the steps since the last line of the log.
+
+        Raises:
+          OSError: This checkpoint, or the previous one that is still being written, cannot be written.
         """
         step = int(state.step)
         if step in self._manager.all_steps():
@@ -90,26 +98,26 @@ class Checkpoints:
             )
 
     def latest_step(self) -> int | None:
-        """The newest whole checkpoint's step, or None."""
+        """Return the step of the newest complete checkpoint, or None."""
         return self._manager.latest_step()
 
     def restore(self, config: TrainConfig) -> TrainState:
-        """The newest state, in host memory: the devices it was saved from may be others than those it goes to.
+        """Return the newest state, in host memory because the devices may differ from those of the saved run.
 
-        Raises ValueError when there is none or it belongs to another model.
+        Raises ValueError if there is no checkpoint, or if it belongs to another model.
         """
         self._wait()
         step = self.latest_step()
         if step is None:
             raise ValueError(f"{self._manager.directory}: expected a checkpoint to resume from, found none")
         like = jax.eval_shape(lambda: new_state(config))
-        # Before any array is read: where reading one fails, orbax drops the others half-way.
+        # Check before any array is read: if reading one fails, orbax abandons the others half-way.
         there, expected = _shapes(self._manager.item_metadata(step).weights), _shapes(like.params.weights)
         if there != expected:
             name = min(dict(set(there.items()) ^ set(expected.items())))
             raise ValueError(
                 f"{self._manager.directory}/{step}: not a checkpoint of this configuration: expected {name} of shape "
-                f"{expected.get(name, 'none (no such weight)')}, found {there.get(name, 'none (missing)')}"
+                f"{expected.get(name, 'none (unknown weight)')}, found {there.get(name, 'none (missing)')}"
             )
         weights, moments = (
             jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), tree)
@@ -122,13 +130,16 @@ class Checkpoints:
         return TrainState(np.int32(step), Params(found.weights, config.model), found.optimizer)
 
     def unlogged(self) -> list[dict[str, float]]:
-        """The measurements that the newest state was saved with."""
+        """Return the measurements that were saved with the newest state."""
         self._wait()
         found: Any = self._manager.restore(self.latest_step(), args=ocp.args.Composite(unlogged=ocp.args.JsonRestore()))
         return found.unlogged[_UNLOGGED]
 
     def best_params(self, config: TrainConfig) -> Params:
-        """The weights of the best score among the checkpoints kept, the later of equal ones. ValueError without one."""
+        """Return the weights with the best score among the kept checkpoints; of equal scores, the latest.
+
+        Raises ValueError if there is no checkpoint.
+        """
         self._manager.wait_until_finished()
         scores = {step: (self._manager.metrics(step) or {}).get("score", -1.0) for step in self._manager.all_steps()}
         if not scores:
@@ -140,7 +151,7 @@ class Checkpoints:
         return Params(found.weights, config.model)
 
     def close(self) -> None:
-        """Wait until everything is written. Raises OSError where it cannot be."""
+        """Wait until everything is written. Raises OSError if writing fails."""
         with self._writing():
             self._manager.close()
         self._sweep()
@@ -154,7 +165,7 @@ class Checkpoints:
         shutil.rmtree(self._folder / _OUTDATED, ignore_errors=True)
 
     def _require_room(self, state: TrainState) -> None:
-        """Raise OSError where the disk is too full for a checkpoint, before a part of one is written."""
+        """Raises OSError before writing if the disk has too little space for a checkpoint."""
         needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state.params.weights, state.optimizer)))
         free = shutil.disk_usage(self._folder).free
         if free < needed:
@@ -162,7 +173,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Say in one line, with the folder's name, what orbax and the writers below it say in many."""
+        """Replace the long errors of orbax by one line with the name of the folder."""
         try:
             yield
         except (OSError, ValueError) as error:
@@ -172,9 +183,9 @@ class Checkpoints:
 
 
 def set_damaged_aside(folder: Path) -> None:
-    """Rename the checkpoints in `folder` whose files are not as they were written, and say so on stderr.
+    """Rename the checkpoints in `folder` whose files do not match their checksums, and report them on stderr.
 
-    Raises ValueError, and renames none, where all of them are damaged.
+    If all checkpoints are damaged, the function renames none and raises ValueError.
     """
     steps = [path for path in folder.glob("*") if path.name.isdecimal()]
     damaged = {path: found for path in steps if (found := damage(path)) is not None}
@@ -193,6 +204,6 @@ def _score(metrics: Any) -> float:
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    """The shape of every array by its path."""
+    """Return the shape of every array by its path."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(leaf.shape) for path, leaf in leaves}

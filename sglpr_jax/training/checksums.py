@@ -1,4 +1,4 @@
-"""Checksums of a checkpoint's files: without them one flipped bit would be trained on."""
+"""Checksums of a checkpoint's files. They detect damaged weights before training continues with them."""
 
 import hashlib
 from collections.abc import Iterator
@@ -7,18 +7,19 @@ from pathlib import Path
 from sglpr_jax.files import read_json, write_json
 
 CHECKSUMS_FILE = "checksums.json"
-"""In a checkpoint's folder: the SHA-256 of every file by its path."""
+"""File in the checkpoint's folder with the SHA-256 of every file by its path."""
 NOT_COVERED = (CHECKSUMS_FILE, "_CHECKPOINT_METADATA", "commit_success.txt")
-"""Files at the top of the folder that hold nothing of ours; orbax writes the last two once all else is there."""
+"""Files at the top of the folder without data of this package. Orbax writes the last two when all others are
+complete."""
 
 
 def write_checksums(folder: Path) -> None:
-    """Write the checksums of all files in `folder`. Raises OSError where that cannot be."""
+    """Write the checksums of all files in `folder`. Raises OSError if they cannot be written."""
     write_json(folder / CHECKSUMS_FILE, {name: _sha256(folder / name) for name in _covered(folder)})
 
 
 def damage(folder: Path) -> str | None:
-    """What is wrong with the files in `folder`, naming one, in words; None where all are as they were written."""
+    """Describe the first damaged file in `folder`, or return None if all files match their checksums."""
     try:
         checksums = read_json(folder / CHECKSUMS_FILE)
         read_json(folder / "_CHECKPOINT_METADATA")

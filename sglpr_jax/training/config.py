@@ -1,4 +1,4 @@
-"""The settings of a training run, as plain values: no JAX is needed to read them. Presets in configs/ fill it in."""
+"""Settings of a training run as plain values, readable without JAX. The presets in configs/ set them."""
 
 import dataclasses
 from typing import Literal
@@ -10,56 +10,70 @@ from sglpr_jax.models.config import ModelConfig
 
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
-    """Equations 5 and 8. The paper gives no margin and no distance: docs/decisions/paper.md has ours."""
+    """Weights and variants of the loss (equations 5 and 8).
+
+    The paper gives no margin and no distance; docs/decisions/paper.md explains the values used here.
+    """
 
     margin: NotNegative = 0.3
+    """Margin of the triplet loss."""
     squared: bool = False
-    """Square the descriptor distances of equation 5."""
+    """Use squared descriptor distances in equation 5."""
     closest_positive: bool = True
+    """Compare the anchor with its closest positive; otherwise with its farthest."""
     reduction: Literal["max", "sum"] = "max"
-    """`max` is the lazy triplet loss; `sum` counts every negative inside the margin."""
+    """`max` is the lazy triplet loss. `sum` adds up all negatives inside the margin."""
     temperature: NotNegative = 0.0
-    """Above 0: the smooth form of the lazy loss, which hard negatives cannot collapse."""
+    """If above 0, use the smooth form of the lazy loss, which hard negatives cannot collapse."""
     one_threshold: Share = 0.0
-    """Share of the triplet loss in which every anchor has the negatives of all anchors (`losses.one_threshold`). It is
-    for one threshold on distances that all places share. 0 in the paper."""
+    """Fraction of the triplet loss in which every anchor has the negatives of all anchors (`losses.one_threshold`). It
+    trains for one distance threshold that all places share. 0 in the paper."""
     ce_weight: NotNegative = 0.4
+    """Weight of the cross-entropy."""
     dice_weight: NotNegative = 0.6
+    """Weight of the Dice loss."""
     segment_every: Count = 1
-    """Take the segmentation losses on every n-th image of a step only; all are segmented in the paper."""
+    """Compute the segmentation losses on every n-th image of a step only. 1 in the paper."""
     class_balance: NotNegative = 0.0
-    """Exponent a of the cross-entropy's class weights n^-a, n being the class's pixels in the image; 0 in the paper."""
+    """Exponent a of the class weights n^-a in the cross-entropy, where n is the number of pixels of the class in the
+    image. 0 in the paper."""
     ignore_unlabelled: bool = False
-    """Leave cells of class 0 (empty or unlabelled) out of the segmentation losses, as the scores do."""
+    """Exclude cells of class 0 (empty or unlabelled) from the segmentation losses, as the scores do."""
     segmentation_alone: bool = False
-    """Teach nothing but the layers that make the semantic map: descriptors stay as they are, bit for bit. Not in the
-    paper, where both are learnt at once."""
+    """Train only the layers of the semantic map. Descriptors stay bit-identical. The paper trains both together."""
 
     def __post_init__(self):
         check_fields(self)
         if self.segmentation_alone and not self.segments:
-            raise ValueError("loss.segmentation_alone leaves no loss where ce_weight and dice_weight are 0")
+            raise ValueError(
+                "loss.segmentation_alone leaves no loss: expected ce_weight or dice_weight above 0, found 0"
+            )
 
     @property
     def segments(self) -> bool:
-        """Whether any term reads the segmentation head. One whose weight is 0 is not computed (table 7).
+        """Whether any term uses the segmentation head. A term with weight 0 is not computed (table 7).
 
-        A new term of the class logits joins with its weight, for the table in `training/loss.py` needs JAX.
+        A new term of the class logits must be added here too, because the table in `training/loss.py` needs JAX.
         """
         return self.ce_weight != 0 or self.dice_weight != 0
 
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam with an exponential decay of the learning rate."""
+    """Adam with exponential decay of the learning rate."""
 
     learning_rate: NotNegative = 1e-5
+    """Learning rate after the warm-up."""
     warmup_steps: CountOrNone = 0
+    """Steps in which the learning rate rises linearly from 0."""
     decay_rate: Positive = 0.99
+    """Factor of the learning rate after each `decay_steps` steps."""
     decay_steps: Count = 1000
-    """Steps in which the learning rate falls by `decay_rate`."""
+    """Steps in which the learning rate falls by the factor `decay_rate`."""
     staircase: bool = False
+    """Let the learning rate fall in jumps instead of continuously."""
     clip_norm: Positive | None = None
+    """Maximum global norm of the gradient. None: no clipping."""
     weight_decay: NotNegative = 0.0
 
     def __post_init__(self):
@@ -68,12 +82,12 @@ class OptimizerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionConfig:
-    """Sectors without points, hidden from images in training; none in the paper."""
+    """Random sectors hidden from images in training. The paper has no occlusion."""
 
     share: Share = 0.0
-    """Of the images of a step."""
+    """Fraction of the images of a step that are occluded."""
     widest_deg: Degrees = 180.0
-    """How wide the widest sector may be; all widths up to it are as likely."""
+    """Maximum width of the hidden sector, in degrees. Widths are drawn uniformly from 0 to this value."""
 
     def __post_init__(self):
         check_fields(self)
@@ -81,7 +95,7 @@ class OcclusionConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """One training run."""
+    """Settings of one training run."""
 
     model: ModelConfig = ModelConfig()
     sampling: TupleConfig = TupleConfig()
@@ -89,28 +103,33 @@ class TrainConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     validation: ValidationConfig = ValidationConfig()
     select: Literal["last", "best"] = "last"
-    """Which weights a finished run hands out: its last ones, or those of the best score on what is held out."""
+    """Weights that a finished run returns: the last ones, or those with the best score on the held-out places."""
     steps: Count = 40_000
+    """Number of training steps."""
     tuples: Count = 1
-    """Tuples a step."""
+    """Tuples per step."""
     share_negatives: bool = False
-    """Let every other tuple's places that are far enough away be negatives too."""
+    """Use the places of all tuples of a step as negatives, if they are far enough away."""
     also_tuples: CountOrNone = 0
-    """How many of a step's tuples come from the second dataset."""
+    """Tuples per step from the second dataset; they are part of `tuples`."""
     also_triplets: bool = False
-    """Let these count in the triplet loss. Without it they are places at random, for the segmentation alone."""
+    """Include the tuples of the second dataset in the triplet loss. Otherwise they are random places for the
+    segmentation losses alone."""
     chunk: CountOrNone = 0
-    """Images that go through the network at a time, on all devices together (0: all). It changes memory and speed; of
-    the results only which branches stochastic depth drops."""
+    """Images that pass through the network at a time, on all devices together (0: all). The size changes memory and
+    speed. It changes results only through the branches that stochastic depth drops."""
     rotate: bool = True
-    """Rotate every place about z by its own random angle at every step."""
+    """Rotate every place about z by a random angle at every step."""
     quarter_turns: Share = 0.0
-    """Of the places, this share is rotated by a multiple of 90 degrees, which blurs no cell; the rest by any angle."""
+    """Fraction of the places that are rotated by a multiple of 90 degrees, which blurs no cells. The others are rotated
+    by any angle."""
     occlusion: OcclusionConfig = OcclusionConfig()
     max_points: Count = 131072
-    """Clouds are padded to this many points; larger ones are thinned evenly."""
+    """Maximum number of points of a scan. Smaller scans are padded to this size; larger ones are thinned evenly."""
     seed: CountOrNone = 0
+    """Seed of the weights and of all random choices."""
     log_every: Count = 10
+    """Steps between lines of the log."""
     score_every: Count = 1000
     """Steps between scores and checkpoints."""
 
@@ -121,14 +140,16 @@ class TrainConfig:
                 f"also_tuples must be fewer than the {self.tuples} tuples of a step, found {self.also_tuples}"
             )
         if self.loss.segmentation_alone and not self.model.segments:
-            raise ValueError("loss.segmentation_alone expected a model with a segmentation head, found one without")
+            raise ValueError("loss.segmentation_alone: expected a model with a segmentation head, found one without")
         if self.loss.segmentation_alone and self.optimizer.weight_decay:
             raise ValueError(
-                "loss.segmentation_alone keeps all other weights as they are: expected optimizer.weight_decay 0, "
+                "loss.segmentation_alone freezes all other weights: expected optimizer.weight_decay 0, "
                 f"found {self.optimizer.weight_decay}"
             )
         if self.select == "best" and not self.validation.share:
-            raise ValueError("select best needs places held out to choose by: expected a validation.share, found 0")
+            raise ValueError(
+                "select best compares scores on held-out places: expected validation.share above 0, found 0"
+            )
         if self.chunk and self.images % self.chunk:
             raise ValueError(f"chunk must divide the {self.images} images of a step, found {self.chunk}")
         if self.images_at_once % self.loss.segment_every:
@@ -139,18 +160,20 @@ class TrainConfig:
 
     @property
     def images(self) -> int:
-        """Images a step."""
+        """Images per step."""
         return self.tuples * (1 + self.sampling.positives + self.sampling.negatives)
 
     @property
     def images_at_once(self) -> int:
-        """Images of a chunk."""
+        """Images per chunk."""
         return self.chunk or self.images
 
 
 def without_untrained_head(config: TrainConfig) -> TrainConfig:
-    """The same training without labels, and so without a segmentation head, where neither a loss nor the place head
-    reads them: weights that no loss reaches would be kept and handed out untrained."""
+    """Remove labels and segmentation head from a configuration if neither a loss nor the place head uses them.
+
+    Otherwise the run would save weights that no loss has trained.
+    """
     if config.model.head.reads_labels or (config.model.segments and config.loss.segments):
         return config
     return dataclasses.replace(config, model=dataclasses.replace(config.model, categories=0))

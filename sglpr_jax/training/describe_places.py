@@ -1,4 +1,4 @@
-"""Descriptors of many places of the training recordings, in batches of one shape."""
+"""Descriptors of places of the training recordings, computed in batches of one shape."""
 
 from collections.abc import Sequence
 
@@ -25,13 +25,21 @@ def describe_places(
     angles: Float[np.ndarray, "n"],
     config: TrainConfig,
 ) -> Float32[np.ndarray, "n d"]:
-    """Describe some places (frames of `pool`), each rotated about z by its angle in radians.
+    """Describe places of the training recordings.
 
-    Raises what reading raises.
+    Arguments:
+      params: Weights of the model.
+      recordings: Recordings of the pool.
+      pool: Pool of the places.
+      places: Frame numbers of the pool.
+      angles: Rotation of each place about z, in radians.
+      config: Settings of the run.
+
+    Raises the errors of reading a scan.
     """
     described = []
     for start in range(0, len(places), CHUNK):
-        rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)  # the last batch repeats its last place
+        rows = np.arange(start, start + CHUNK).clip(max=len(places) - 1)  # the last batch is padded with its last place
         batch = read_batch(
             recordings,
             pool,

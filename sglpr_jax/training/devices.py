@@ -1,8 +1,8 @@
-"""Data-parallel training: every device takes its share of a step's tuples, all hold the same weights.
+"""Data-parallel training: the tuples of a step are split over the devices, and all devices hold the same weights.
 
-The step is written as for one device. XLA sees where its arrays lie and adds what the devices must tell each other:
-descriptors for the triplet loss, sums for the others, and the gradient (GSPMD). So its results are those of one device,
-to float32 rounding.
+The step is written for one device. XLA derives the communication from the placement of the arrays (GSPMD): descriptors
+for the triplet loss, sums for the other losses, and the gradient. The results are those of one device, to float32
+rounding.
 """
 
 import sys
@@ -23,10 +23,10 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh:
-    """The devices of a run in one row, host after host (default: of all there are).
+    """Arrange the devices of a run (default: all) in one row, host after host.
 
-    They must divide the tuples of a step and the images of a chunk. Of each host as many are used as do, the rest is
-    left idle, which is said on stderr. Raises ValueError where not even one device of each host does.
+    Their number must divide the tuples of a step and the images of a chunk. Each host uses the largest possible number;
+    idle devices are reported on stderr. Raises ValueError if one device per host is already too many.
     """
     by_host: dict[int, list[Any]] = {}
     for device in jax.devices() if devices is None else devices:
@@ -35,7 +35,7 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
     shared = f"the {config.tuples} tuples of a step and the {config.images_at_once} images of a chunk"
     divisors = [n for n in range(1, there + 1) if _divides(n * len(by_host), config)]
     if not divisors:
-        raise ValueError(f"expected {shared} to be divided by the number of hosts, found {len(by_host)} hosts")
+        raise ValueError(f"expected {shared} to be divisible by the number of hosts, found {len(by_host)} hosts")
     used = divisors[-1]
     if used < there and is_first_host():
         print(f"using {used} of {there} devices of each host: their number must divide {shared}", file=sys.stderr)
@@ -44,24 +44,24 @@ def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh
 
 
 def split(batch: Batch, mesh: Mesh) -> Batch:
-    """This host's tuples, from host memory, on its devices of the mesh: its part of the batch of all hosts."""
+    """Place this host's tuples on its devices of the mesh, as its part of the batch of all hosts."""
     return _place(batch, NamedSharding(mesh, PartitionSpec(AXIS)))
 
 
 def replicate(tree: Tree, mesh: Mesh) -> Tree:
-    """The same arrays on every device of the mesh; every host must bring the same."""
+    """Copy the arrays to every device of the mesh. All hosts must pass the same arrays."""
     return _place(tree, NamedSharding(mesh, PartitionSpec()))
 
 
 def own_copy(tree: Tree) -> Tree:
-    """Replicated arrays as this host's first device has them, to be used without the others."""
+    """Return this host's copy of replicated arrays, from its first device. It can be used without the other hosts."""
     return jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
 def on_own_rows(function: Function) -> Function:
-    """Under jit: a function of rows that know nothing of each other, run by each device of the mesh on its own.
+    """Under jit: let each device of the mesh apply a row-wise function to its own rows.
 
-    For what XLA would bring together to do, as it does for scatters.
+    Use it for operations for which XLA would gather all rows, such as scatters.
     """
     if not _several_devices():
         return function
@@ -69,17 +69,17 @@ def on_own_rows(function: Function) -> Function:
 
 
 def keep_split(tree: Tree, *, axis: int) -> Tree:
-    """Under jit: have `axis` of the arrays split over the devices of the mesh in force, if it has several."""
+    """Under jit: keep `axis` of the arrays split over the devices of the current mesh, if it has several."""
     return _constrain(tree, PartitionSpec(*[None] * axis, AXIS))
 
 
 def keep_replicated(tree: Tree) -> Tree:
-    """Under jit: have all of the arrays on every device of the mesh in force, if it has several."""
+    """Under jit: keep the arrays replicated on every device of the current mesh, if it has several."""
     return _constrain(tree, PartitionSpec())
 
 
 def _constrain(tree: Tree, spec: PartitionSpec) -> Tree:
-    """One device needs no constraint, so that its program is the one without a mesh."""
+    """Constrain the sharding on several devices. On one device the program stays the one without a mesh."""
     return jax.lax.with_sharding_constraint(tree, spec) if _several_devices() else tree
 
 
@@ -93,7 +93,7 @@ def _place(tree: Tree, sharding: NamedSharding) -> Tree:
 
 
 def _divides(devices: int, config: TrainConfig) -> bool:
-    """A batch of two sources is not split: its places are in an order of their own."""
+    """Whether a step can be split over this many devices. Mixed batches of two datasets are never split."""
     if config.also_tuples:
         return devices == 1
     return config.tuples % devices == 0 and config.images_at_once % devices == 0

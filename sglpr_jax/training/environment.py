@@ -1,4 +1,4 @@
-"""environment.json: with what, where and by which command a run was made."""
+"""Record of the software, the machine and the command of a run (environment.json)."""
 
 import datetime
 import importlib.metadata
@@ -20,9 +20,9 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def note_environment(folder: Path, *, seed: int) -> None:
-    """Write the environment of a run into its folder; that of a resumed one is added under `resumes`.
+    """Write the environment of a run into its folder. A resumed run appends its environment under `resumes`.
 
-    Raises ValueError where the file that is there is damaged.
+    Raises ValueError if the existing file is damaged.
     """
     path = folder / ENVIRONMENT_FILE
     now = environment() | {"seed": seed}
@@ -37,7 +37,7 @@ def note_environment(folder: Path, *, seed: int) -> None:
 
 
 def environment() -> dict[str, Any]:
-    """The versions, the machine, the commit and the command line of this process."""
+    """Return the versions, the machine, the commit and the command line of this process."""
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),
@@ -55,12 +55,15 @@ def environment() -> dict[str, Any]:
 def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # run from a checkout that is not installed
+    except importlib.metadata.PackageNotFoundError:  # the package runs from a checkout without installation
         return None
 
 
 def git_commit(checkout: Path) -> dict[str, Any] | None:
-    """The commit of a checkout and whether files differ from it; None where there is no checkout or no git."""
+    """Return the commit of a checkout and whether its files differ from it.
+
+    Returns None without a checkout or without git.
+    """
     if not (checkout / ".git").exists():
         return None
     try:

@@ -1,6 +1,6 @@
-"""Several hosts that train together: one process each, started with the same command and its own index.
+"""Training on several hosts, with one process each. Every host runs the same command with its own index.
 
-The first host (index 0) alone writes what people read: metrics, weights, pictures. Each reads its own part of a batch.
+Only the first host (index 0) writes metrics, weights and pictures. Each host reads its own part of a batch.
 """
 
 import contextlib
@@ -12,16 +12,24 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 SHUTDOWN_SECONDS = 60
-"""How long a host that ends waits for the others before it brings them down."""
+"""Time that a host waits at the end for the others, in seconds. After it, the host terminates them."""
 T = TypeVar("T")
 
 
 @contextlib.contextmanager
 def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterator[None]:
-    """Make one machine of `hosts` processes that meet at the first one's address (HOST:PORT); with one, do nothing.
+    """Connect the processes of `hosts` hosts to one JAX cluster. With one host, do nothing.
 
-    To be entered before JAX is used for anything. All hosts must leave it. Raises ValueError for an index or address
-    that cannot be, ConnectionError where the hosts do not find each other or one of the others ends.
+    Enter the context before any other use of JAX. All hosts must leave it.
+
+    Arguments:
+      hosts: Number of hosts.
+      host_index: Index of this host, from 0.
+      coordinator: Address of the first host, as HOST:PORT.
+
+    Raises:
+      ValueError: The index or the address is invalid.
+      ConnectionError: The hosts do not find each other, or another host ends.
     """
     if not 0 <= host_index < hosts:
         raise ValueError(f"expected a host index from 0 to {hosts - 1}, found {host_index}")
@@ -29,7 +37,7 @@ def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterat
         yield
         return
     if coordinator is None or not coordinator.rpartition(":")[2].isdigit():
-        raise ValueError(f"{hosts} hosts need the first one's address, HOST:PORT, found {coordinator}")
+        raise ValueError(f"{hosts} hosts need a coordinator: expected the first host's HOST:PORT, found {coordinator}")
     try:
         jax.distributed.initialize(
             coordinator,
@@ -42,31 +50,31 @@ def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterat
         jax.distributed.shutdown()
     except jax.errors.JaxRuntimeError as error:
         raise ConnectionError(
-            f"host {host_index} of {hosts} (they meet at {coordinator}) cannot go on, most likely because another host "
-            f"ended; it has printed why ({error})"
+            f"host {host_index} of {hosts} (coordinator {coordinator}) cannot continue; probably another host "
+            f"ended; see the error that it printed ({error})"
         ) from error
 
 
 def is_first_host() -> bool:
-    """Whether this process is the one that writes."""
+    """Whether this process is the host that writes."""
     return jax.process_index() == 0
 
 
 def own_part(tuples: int) -> slice:
-    """Which of a step's tuples this host reads: an equal share, in the order of the hosts."""
+    """Return the slice of a step's tuples that this host reads: equal parts, in the order of the hosts."""
     each = tuples // jax.process_count()
     return slice(jax.process_index() * each, (jax.process_index() + 1) * each)
 
 
 def on_any_host(flag: bool) -> bool:
-    """Whether `flag` is set on some host. All must ask."""
+    """Whether `flag` is set on any host. All hosts must call this function."""
     return flag if jax.process_count() == 1 else bool(multihost_utils.process_allgather(np.array(flag)).any())
 
 
 def on_all_hosts(work: Callable[[], T]) -> T:
-    """What `work` returns, once it is done on every host. All must ask.
+    """Run `work` on this host, wait for the other hosts, and return its result. All hosts must call this function.
 
-    Where it raises on one, that one raises its error and the others ConnectionError, instead of waiting for it.
+    If `work` fails on a host, that host raises its error and the others raise ConnectionError.
     """
     done: Any = None
     error: Exception | None = None
@@ -75,10 +83,10 @@ def on_all_hosts(work: Callable[[], T]) -> T:
     except Exception as raised:
         error = raised
     if on_any_host(error is not None):
-        raise error or ConnectionError("another host ended with an error; it has printed which")
+        raise error or ConnectionError("another host ended with an error; see the message that it printed")
     return done
 
 
 def of_first_host(value: float) -> float:
-    """The first host's number. All must ask."""
+    """Return the first host's value on every host. All hosts must call this function."""
     return value if jax.process_count() == 1 else float(multihost_utils.broadcast_one_to_all(np.float32(value)))

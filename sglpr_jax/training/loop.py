@@ -1,4 +1,4 @@
-"""The training loop: steps, measurements, scores, checkpoints; it can be interrupted and resumed."""
+"""The training loop: steps, measurements, scores and checkpoints. It can be interrupted and resumed."""
 
 import contextlib
 import math
@@ -25,7 +25,7 @@ CHECKPOINTS = "checkpoints"
 METRICS_FILE = "metrics.jsonl"
 
 ScoreFn = Callable[[Params], dict[str, float]]
-"""Measures how good weights are; its "score" tells the best checkpoint."""
+"""Scores weights. The entry "score" selects the best checkpoint."""
 
 
 def run_steps(
@@ -39,18 +39,21 @@ def run_steps(
     callback: Callback | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> TrainState:
-    """Make steps until there are `config.steps`, or until `stopped()`, which is asked after each; return the state.
+    """Train until `config.steps` steps are done or `stopped()` returns true, and return the state.
 
     Args:
-        source: gives this host's part of each step's batch; all devices share a step.
-        folder: gets the metrics and checkpoints.
-        score: measures the weights, every `config.score_every` steps.
-        start_from: the weights that a new run begins with. None: fresh ones.
-        resume: go on from the newest checkpoint, if there is one yet.
-        callback: gets what is measured.
+        source: Source of this host's part of each batch. All devices share a step.
+        folder: Folder for metrics and checkpoints.
+        score: Scores the weights every `config.score_every` steps.
+        start_from: Initial weights of a new run. None: random weights.
+        resume: Continue from the newest checkpoint, if there is one.
+        callback: Receives the measurements.
+        stopped: Called after every step.
 
-    Raises FloatingPointError, naming the step and the places of its batch, when the loss is no longer finite; OSError
-    when metrics or a checkpoint cannot be written; ValueError where the devices cannot share a step (`data_mesh`).
+    Raises:
+        FloatingPointError: The loss is not finite. The message names the step and the places of its batch.
+        OSError: Metrics or a checkpoint cannot be written.
+        ValueError: The devices cannot share a step (`data_mesh`).
     """
     mesh = data_mesh(config)
     callback = callback if callback is not None and is_first_host() else Callback()
@@ -85,12 +88,12 @@ def run_steps(
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
-    """The steps after which the run in `folder` has a whole checkpoint to go on from, in order."""
+    """Return the steps of all complete checkpoints of the run in `folder`, in order."""
     return sorted(int(path.name) for path in (folder / CHECKPOINTS).glob("*") if path.name.isdecimal())
 
 
 def best_params(folder: Path, config: TrainConfig) -> Params:
-    """The weights with the best score of the run in `folder`."""
+    """Return the weights with the best score of the run in `folder`."""
     checkpoints = Checkpoints(folder / CHECKPOINTS)
     try:
         return checkpoints.best_params(config)
@@ -107,11 +110,12 @@ def _steps(
     stopped: Callable[[], bool],
     unlogged: list[dict[str, float]],
 ) -> Iterator[tuple[TrainState, dict[str, float]]]:
-    """Make steps; yield the state with the mean measurements since the last time, every `log_every` steps.
+    """Train; every `log_every` steps and before every score, yield the state and the mean measurements since the last
+    yield.
 
-    `unlogged` holds the measurements of the steps since then. A stop in between yields the state and no measurements,
-    so that the lines are those of a run that was not stopped. The first measurements say nothing of time: every
-    process compiles the step anew.
+    `unlogged` holds the measurements of the steps since then. A stop in between yields the state without measurements,
+    so that the log lines are those of an uninterrupted run. The first measurements have no speed, because every process
+    compiles the step first.
     """
     since, waited, made, stop, compiled = time.perf_counter(), 0.0, 0, False, False
     while int(state.step) < config.steps and not stop:
@@ -136,12 +140,12 @@ def _steps(
 
 
 def _scored(config: TrainConfig, step: int) -> bool:
-    """Whether a step is followed by a score and a checkpoint."""
+    """Whether a score and a checkpoint follow a step."""
     return step % config.score_every == 0 or step == config.steps
 
 
 def _score_once(score: ScoreFn, params: Params) -> dict[str, float]:
-    """The scores, taken by the first host; the others learn the one that tells checkpoints apart."""
+    """Compute the scores on the first host. The other hosts receive the entry "score", which selects checkpoints."""
     own = on_all_hosts(lambda: score(own_copy(params)) if is_first_host() else {"score": 0.0})
     return own | {"score": of_first_host(own["score"])}
 

@@ -1,4 +1,7 @@
-"""The training loss: a table of terms, each with its weight. A new term is one entry, its functions and its field."""
+"""The training loss: a table of terms with their weights.
+
+A new term needs an entry in the table, its functions, and a field for its weight.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,31 +20,31 @@ Metrics = dict[str, Float[Array, ""]]
 
 @dataclasses.dataclass(frozen=True)
 class DescriptorTerm:
-    """A term of the loss that is made of the descriptors of a whole batch."""
+    """Term of the loss that depends on the descriptors of a whole batch."""
 
     weight: Callable[[LossConfig], float]
     value: Callable[[Float[Array, "b d"], Batch, LossConfig], Float[Array, ""]]
-    """(descriptors, batch, config) -> the term"""
+    """`(descriptors, batch, config) -> value of the term`"""
 
 
 @dataclasses.dataclass(frozen=True)
 class SegmentationTerm:
-    """A term of the loss that is made of class logits. Images come in chunks, over which the sums are added up."""
+    """Term of the loss that depends on class logits. Images come in chunks, and the sums of the chunks are added."""
 
     weight: Callable[[LossConfig], float]
     sums: Callable[[Float[Array, "c h w k"], Int[Array, "c h w"], Bool[Array, "c h w"], LossConfig], Array]
-    """(logits, classes, which pixels count, config) -> what is added up over the chunks"""
+    """`(logits, classes, mask of the counted pixels, config) -> sums of one chunk`"""
     value: Callable[[Any, Int[Array, ""]], Float[Array, ""]]
-    """(the sums of the whole batch, how many of its segmented images have labels) -> the term"""
+    """`(sums of the batch, number of segmented images with labels) -> value of the term`"""
 
 
 class Summary(NamedTuple):
-    """What the loss needs of the images of a chunk, or of a whole batch."""
+    """Input of the loss from the images of a chunk or of a whole batch."""
 
     descriptors: Any
-    """(c, d)"""
+    """Descriptors (c, d)."""
     sums: dict[str, Any]
-    """By name, what each segmentation term adds up; empty without labels."""
+    """Sums of each segmentation term, by its name. Empty without labels."""
 
 
 def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
@@ -56,9 +59,9 @@ def triplet(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) 
 
 
 def violations(descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig) -> Float[Array, ""]:
-    """The share of the tuples that still violate the margin."""
+    """Return the fraction of tuples that violate the margin."""
     lazy = losses.lazy_triplet(*_tuple_distances(descriptors, batch, config), **_options(batch, config))
-    return (lazy > 0).mean()  # without a temperature: the smooth loss is never zero
+    return (lazy > 0).mean()  # without a temperature, because the smooth loss is never zero
 
 
 def _cross_entropy_sum(logits: Array, classes: Array, counted: Array, config: LossConfig) -> Float[Array, ""]:
@@ -75,7 +78,7 @@ def _dice_sums(logits: Array, classes: Array, counted: Array, config: LossConfig
 
 
 def _dice(sums: Float[Array, "3 k"], images: Int[Array, ""]) -> Float[Array, ""]:
-    """Equation 7 over the pixels of all labelled images; 0 where there is no such image."""
+    """Equation 7 over the pixels of all labelled images; 0 without labelled images."""
     return jnp.where(images > 0, losses.dice_from_sums(sums), 0.0)
 
 
@@ -84,22 +87,26 @@ SEGMENTATION_TERMS = {
     "cross_entropy": SegmentationTerm(lambda config: config.ce_weight, _cross_entropy_sum, _cross_entropy),
     "dice": SegmentationTerm(lambda config: config.dice_weight, _dice_sums, _dice),
 }
-"""Equation 8 is the sum of all terms, each times its weight. The names are those of the metrics and learning curves."""
+"""Equation 8 is the weighted sum of all terms. Metrics and learning curves use their names."""
 TERM_NAMES = (*DESCRIPTOR_TERMS, *SEGMENTATION_TERMS)
 MEASURES = {"violations": violations}
-"""What is measured beside the terms, of the same arguments as a `DescriptorTerm`."""
+"""Measurements beside the terms. They have the arguments of `DescriptorTerm.value`."""
 
 
 def segmentation_sums(
     logits: Float[Array, "c h w k"], classes: Int[Array, "c h w"], counted: Bool[Array, "c h w"], config: LossConfig
 ) -> dict[str, Array]:
-    """What the segmentation terms that have a weight need of a chunk; of `classes` the pixels that are `counted`."""
+    """Return the sums of a chunk, over the `counted` pixels, for all segmentation terms with a nonzero weight."""
     terms = _weighted(SEGMENTATION_TERMS, config)
     return {name: term.sums(logits, classes, counted, config) for name, term in terms.items()}
 
 
 def joint_loss(summary: Summary, batch: Batch, config: LossConfig) -> tuple[Float[Array, ""], Metrics]:
-    """Equation 8 of a whole batch; with it, by name, its terms, what is measured beside them, and itself."""
+    """Compute equation 8 for a whole batch.
+
+    Returns:
+      The loss, and the metrics by name: its terms, the `MEASURES` and the loss itself.
+    """
     descriptors = in_batch_order(summary.descriptors, batch, every=config.segment_every)
     labelled = in_network_order(jnp.asarray(batch.labelled), batch, every=config.segment_every)
     images = labelled[:: config.segment_every].sum()
@@ -120,7 +127,7 @@ def _weighted(terms: dict[str, Any], config: LossConfig) -> dict[str, Any]:
 def _tuple_distances(
     descriptors: Float[Array, "b d"], batch: Batch, config: LossConfig
 ) -> tuple[Float[Array, "t p"], Float[Array, "t places"]]:
-    """The distances of each anchor to its positives, and to all places of the tuples."""
+    """Return the distances of each anchor to its positives, and to all places of the tuples."""
     tuples, places = batch.negatives.shape
     descriptors = descriptors[:places]
     grouped = descriptors.reshape(tuples, -1, descriptors.shape[-1])

@@ -1,4 +1,4 @@
-"""A run's measurements: one JSON object a line, appended, so that an interrupted run loses nothing."""
+"""Measurements of a run as JSON lines. Lines are appended, so an interrupted run loses none."""
 
 import contextlib
 import itertools
@@ -13,10 +13,10 @@ from sglpr_jax.files import parse_json, write_text, writing
 
 
 class MetricsLog:
-    """Append-only JSON lines. After a resume, lines of steps that will be made again are dropped.
+    """Append-only file of JSON lines. After a resume, lines of steps that will be repeated are removed.
 
-    Without a path nothing is written: of several hosts one keeps the log. Raises OSError, naming the file, where a line
-    cannot be written.
+    Without a path nothing is written: of several hosts, only one keeps the log. Raises OSError, with the name of the
+    file, if a line cannot be written.
     """
 
     def __init__(self, path: Path | None, *, start_step: int = 0):
@@ -26,14 +26,14 @@ class MetricsLog:
         kept = [line for line in read_metrics(path) if line["step"] <= start_step] if path.exists() else []
         write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
         self._path = path
-        self._file = path.open("ab", buffering=0)  # nothing is left behind that closing would have to write
+        self._file = path.open("ab", buffering=0)  # unbuffered, so that closing has nothing left to write
 
     def append(self, step: int, values: Mapping[str, Any]) -> None:
-        """Write the measurements of one step; values that are not finite become null."""
+        """Write the measurements of one step. Values that are not finite become null."""
         self._write({"step": step, **{name: _plain(value) for name, value in values.items()}})
 
     def sync(self) -> None:
-        """Have the lines on the disk itself, before a checkpoint that is ahead of them is."""
+        """Flush the lines to disk. Called before a checkpoint, which must not be ahead of the log."""
         if self._file:
             with writing(self._path):
                 os.fsync(self._file.fileno())
@@ -48,14 +48,14 @@ class MetricsLog:
             return
         left = json.dumps(line).encode() + b"\n"
         with writing(self._path):
-            while left:  # a disk that is nearly full takes a part
+            while left:  # a nearly full disk may accept only a part
                 left = left[self._file.write(left) :]
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics file; a last line cut short by a crash is left out.
+    """Return the lines of a metrics file. A last line that was cut off by a crash is ignored.
 
-    Raises ValueError, naming the file and the line, where any other is not what `MetricsLog` writes.
+    Raises ValueError, with the file and the line, if any other line is invalid.
     """
     *whole, last = path.read_bytes().split(b"\n")
     lines = [_read_line(text, source=f"{path}, line {i}") for i, text in enumerate(whole, start=1)]

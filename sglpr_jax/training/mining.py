@@ -1,4 +1,4 @@
-"""Hard negatives: which places look alike to the network as it is now, found out anew every so many steps."""
+"""Hard negatives: places with similar descriptors, which are recomputed at regular steps."""
 
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -17,10 +17,10 @@ DescribeFn = Callable[[Params, Int[np.ndarray, "n"]], Float32[np.ndarray, "n d"]
 
 
 class Mining:
-    """The newest descriptor cache of a run, and those on disk that a resumed run may need again.
+    """Descriptor cache of a run, with the files on disk that a resumed run may need.
 
-    A refresh at step r, before it is made, writes `folder`/r.npz; steps r to r + refresh_steps - 1 use it. A run that
-    goes on from a checkpoint in between reads the same numbers, so that its batches are those of a run never stopped.
+    A refresh at step r runs before that step and writes `folder`/r.npz. Steps r to r + refresh_steps - 1 use it. A run
+    resumed in between reads the same file, so its batches are those of an uninterrupted run.
     """
 
     def __init__(
@@ -32,15 +32,23 @@ class Mining:
         *,
         checkpoints: Callable[[], Collection[int]],
     ):
-        """`places`: how many the pool has. `checkpoints`: the steps of the run's checkpoints that are whole."""
+        """Create a miner without a cache.
+
+        Arguments:
+          describe: Describes places of the pool.
+          places: Number of places of the pool.
+          config: Settings of the run.
+          folder: Folder of the caches.
+          checkpoints: Returns the steps of the complete checkpoints of the run.
+        """
         self._describe, self._places, self._config, self._folder = describe, places, config, folder
         self._checkpoints = checkpoints
         self.cache: DescriptorCache | None = None
 
     def refresh(self, step: int, params: Params) -> None:
-        """Make the cache that `step` uses the current one; `params` are the weights before that step.
+        """Load or compute the cache that `step` uses. `params` are the weights before that step.
 
-        Raises FileNotFoundError where the descriptors of an earlier step are needed and gone.
+        Raises FileNotFoundError if the cache of an earlier step is needed but missing.
         """
         every = self._config.sampling.refresh_steps
         path = self._folder / f"{step - step % every}.npz"
@@ -60,10 +68,10 @@ class Mining:
         return DescriptorCache(places, self._describe(params, places))
 
     def _drop_unneeded(self) -> None:
-        """Remove caches that no checkpoint kept asks for, be it the best one and old.
+        """Delete the caches that no kept checkpoint needs, including an old best one.
 
-        A run that goes on from a checkpoint reads the cache of its next step and makes those after it anew. A newer
-        checkpoint than those there may be on its way to the disk: all that it can ask for stays.
+        A run resumed from a checkpoint reads the cache of its next step and recomputes the later ones. A newer
+        checkpoint may still be in the process of being written, so caches from the newest needed one on are kept.
         """
         every = self._config.sampling.refresh_steps
         asked = {step - step % every for step in self._checkpoints()}

@@ -1,4 +1,4 @@
-"""Sectors without points: what a pole, a cabin or a rider beside the sensor hides, drawn anew for each image."""
+"""Random sectors without points, as behind a pole, a cabin or a rider beside the sensor."""
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,10 @@ from sglpr_jax.training.config import OcclusionConfig
 
 
 def visible(key: Array, images: int, grid: Grid, config: OcclusionConfig) -> Bool[Array, "b h w"]:
-    """Which cells of each image are left: of a share of the images a sector is hidden, at any bearing.
+    """Return the visible cells of each image. In a fraction of the images, a sector with random bearing is hidden.
 
-    Its width is drawn evenly between 0 and the widest one. The bearing of a cell is that of its centre as seen from the
-    middle of the grid.
+    The width of the sector is uniform between 0 and `config.widest_deg`. The bearing of a cell is that of its centre,
+    seen from the middle of the grid.
     """
     chosen_key, width_key, start_key = jax.random.split(key, 3)
     chosen = jax.random.bernoulli(chosen_key, config.share, (images,))

@@ -1,4 +1,4 @@
-"""The optimiser: Adam, its learning rate warmed up and then decayed."""
+"""The optimiser: Adam with warm-up and decay of the learning rate."""
 
 import optax
 
@@ -6,7 +6,7 @@ from sglpr_jax.training.config import OptimizerConfig
 
 
 def optimizer(config: OptimizerConfig) -> optax.GradientTransformation:
-    """Return Adam, its learning rate warmed up linearly and then decayed exponentially (section 5.1.2)."""
+    """Return Adam with linear warm-up and exponential decay of the learning rate (section 5.1.2)."""
     schedule = optax.warmup_exponential_decay_schedule(
         init_value=config.learning_rate if config.warmup_steps == 0 else 0.0,
         peak_value=config.learning_rate,

@@ -1,7 +1,7 @@
-"""In which order the places of a mixed batch go through the network.
+"""Order in which the places of a mixed batch pass through the network.
 
-The segmentation head looks at every n-th image. Where labels come from a second source, its places are put there, so
-that the head spends nothing on images without labels.
+The segmentation head sees every n-th image. If the labels come from a second dataset, its places are put there. The
+head then spends no time on images without labels.
 """
 
 import numpy as np
@@ -11,12 +11,12 @@ from sglpr_jax.data.sampling.batch import Batch
 
 
 def in_network_order(x: Shaped[Array, "b *_"], batch: Batch, *, every: int) -> Shaped[Array, "b *_"]:
-    """What belongs to the places of a batch, in the order of the network, whose head looks at `every` n-th image."""
+    """Reorder values of the places of a batch into network order. The segmentation head sees every `every`-th image."""
     return x if batch.also is None else x[_order(batch, every)]
 
 
 def in_batch_order(x: Shaped[Array, "b *_"], batch: Batch, *, every: int) -> Shaped[Array, "b *_"]:
-    """The inverse of `in_network_order`."""
+    """Inverse of `in_network_order`."""
     return x if batch.also is None else x[np.argsort(_order(batch, every))]
 
 

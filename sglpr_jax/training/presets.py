@@ -1,4 +1,4 @@
-"""Training presets: the Python files in configs/, each of which sets CONFIG."""
+"""Training presets: Python files in configs/ that define CONFIG."""
 
 import runpy
 from pathlib import Path
@@ -6,18 +6,18 @@ from pathlib import Path
 from sglpr_jax.training.config import TrainConfig
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-_FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")  # in a wheel; in a checkout
+_FOLDERS = (_PACKAGE / "configs", _PACKAGE.parent / "configs")  # the first in a wheel, the second in a checkout
 
 
 def preset_names() -> tuple[str, ...]:
-    """The presets there are."""
+    """Return the names of all presets."""
     return tuple(sorted(path.stem for folder in _FOLDERS for path in folder.glob("*.py")))
 
 
 def load_preset(name: str) -> TrainConfig:
-    """The configuration of a preset, or of a Python file of your own that sets CONFIG.
+    """Return the configuration of a preset, or of your own Python file that defines CONFIG.
 
-    Raises ValueError where there is none, or running the file fails.
+    Raises ValueError if the file does not exist or fails.
     """
     candidates = [Path(name)] if name.endswith(".py") else [folder / f"{name}.py" for folder in _FOLDERS]
     path = next((path for path in candidates if path.is_file()), None)
@@ -25,7 +25,7 @@ def load_preset(name: str) -> TrainConfig:
         raise ValueError(f"no preset {name!r}: expected a .py file or one of {', '.join(preset_names())}")
     try:
         config = runpy.run_path(str(path)).get("CONFIG")
-    except Exception as error:  # whatever a file of one's own raises
+    except Exception as error:  # a user's file may raise anything
         raise ValueError(f"{path}: expected a preset, found one that fails: {type(error).__name__}: {error}") from error
     if not isinstance(config, TrainConfig):
         raise ValueError(f"{path}: expected CONFIG, a TrainConfig, found {type(config).__name__}")

@@ -1,4 +1,4 @@
-"""How far a training is, as a bar on stderr."""
+"""Progress bar of a training run on stderr."""
 
 from collections.abc import Mapping
 
@@ -12,31 +12,31 @@ _SHOWN = ("loss", *TERM_NAMES, *MEASURES, "steps_per_second")
 
 
 class ProgressBar(Callback):
-    """Shows the steps made, the time left and the newest measurements; nothing where stderr is no terminal."""
+    """Shows finished steps, remaining time and the latest measurements. Without a terminal it shows nothing."""
 
     def __init__(self):
         self._progress: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
-        """Show how much of the recording is packed."""
+        """Show how many scans of the recording are packed."""
         self._show(f"pack {recording}", done, scans)
 
     def on_start(self, step: int, steps: int) -> None:
-        """Show the steps already made."""
+        """Show the number of finished steps."""
         self._show("train", step, steps)
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
-        """Show the step and what was measured."""
+        """Show the step and its measurements."""
         terms = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
         self._show("train", step, None, terms=terms)
 
     def close(self) -> None:
-        """Leave the bar as it stands."""
+        """Stop the bar and leave it on the screen."""
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
-            self._tasks.clear()  # another training gets bars of its own
+            self._tasks.clear()  # the next training run gets new bars
 
     def _show(self, title: str, done: int, total: int | None, *, terms: str = "") -> None:
         if self._progress is None:

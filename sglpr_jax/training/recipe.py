@@ -1,4 +1,4 @@
-"""A training from recordings to weights, as one call: what bin/train does before its final test."""
+"""A whole training run in one call, from recordings to weights. `bin/train` adds only the final test."""
 
 import contextlib
 import dataclasses
@@ -39,10 +39,10 @@ WEIGHTS = "weights"
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class TrainResult:
-    """What a training made. Prints itself: how far it came, where its weights are, how fast it was.
+    """Result of a training run. Printing it shows the finished steps, the folder of the weights and the speed.
 
-    `params` are the weights that are also in `folder`/weights: the last ones, or the best as `config.select` says.
-    `throughput` is None for a run too short to measure.
+    `params` are the weights that are also stored in `folder`/weights: the last ones, or the best ones, as set by
+    `config.select`. A run that was too short has no `throughput`.
     """
 
     params: Params
@@ -53,7 +53,7 @@ class TrainResult:
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are made; a run that was asked to stop can go on (`resume`)."""
+        """Whether all steps are done. A run that was stopped earlier can continue with `resume`."""
         return self.steps == self.config.steps
 
     def __str__(self) -> str:
@@ -83,27 +83,32 @@ def train(
     stopped: Callable[[], bool] = lambda: False,
     settings: Mapping[str, Any] | None = None,
 ) -> TrainResult:
-    """Train a model on recordings; all about the run is kept in the folder `out`, from where it can be resumed.
+    """Train a model on recordings. The folder `out` stores the run, which can be resumed from there.
 
     Args:
-        config: the model, the loss, the optimiser, the number of steps and all else; `preset("small")` is one.
-        recordings: what is trained on. They need positions, and labels where the model or the loss reads any.
-        out: the run's folder: settings, metrics, checkpoints, and the weights at the end.
-        test: the recording that will be tested on. It is not read; only that it is not trained on is made sure.
-        also: recordings of a second dataset, of which come `config.also_tuples` of a step's tuples.
-        weights: what a new run begins with: a name, a folder, or weights themselves. None: fresh ones.
-        resume: go on from the newest checkpoint of the run in `out`.
-        cache: a folder in which the recordings are packed, each once, to be read faster.
-        callback: follows the training: a `ProgressBar`, `EventFiles`, or one of your own.
-        stopped: is asked after every step whether to stop there; what is made is saved. While recordings are packed a
-            stop raises KeyboardInterrupt.
-        settings: what config.json says beside `config`, the same in a resumed run. None: names of the recordings.
+        config: Model, loss, optimiser, number of steps and all other settings, for example `preset("small")`.
+        recordings: Training recordings. They need positions, and labels if the model or the loss uses them.
+        out: Folder of the run: settings, metrics, checkpoints and the final weights.
+        test: Recording of the later test. It is not read; the function only checks that it is not trained on.
+        also: Recordings of a second dataset, which provide `config.also_tuples` tuples of each step.
+        weights: Initial weights of a new run: a name, a folder or `Params`. None: random weights.
+        resume: Continue from the newest checkpoint of the run in `out`.
+        cache: Folder in which each recording is packed on first use, for faster reading.
+        callback: Follows the run: a `ProgressBar`, `EventFiles` or your own.
+        stopped: Called after every step. If it returns true, the run saves its state and stops. While recordings are
+            packed, a stop raises KeyboardInterrupt.
+        settings: Entries of config.json beside `config`. They must be equal in a resumed run. None: the names of the
+            recordings.
 
-    Returns the weights, and how the run went.
+    Returns:
+        The weights and a summary of the run.
 
-    Raises ValueError where the recordings cannot be trained on as `config` says, or a resumed run has other settings or
-    has made more steps; FileExistsError where there is a run already, FileNotFoundError where there is none to resume;
-    FloatingPointError where the loss is no longer finite; OSError where something cannot be read or written.
+    Raises:
+        ValueError: The recordings do not fit `config`, or the run to resume has other settings or more steps done.
+        FileExistsError: The folder already has a run.
+        FileNotFoundError: The folder has no run to resume.
+        FloatingPointError: The loss is not finite.
+        OSError: A file cannot be read or written.
 
     Example:
       recordings = [open_recording("KITTI", name) for name in ("00", "05")]
@@ -114,9 +119,7 @@ def train(
     config = without_untrained_head(config)
     _require_usable(config, recordings, also, test)
     if config.loss.segmentation_alone and weights is None and not resume:
-        raise ValueError(
-            "loss.segmentation_alone keeps what describes places: expected weights to begin with, found none"
-        )
+        raise ValueError("loss.segmentation_alone trains no descriptors: expected weights to begin with, found none")
     settings = _names(recordings, also, test) if settings is None else settings
     with contextlib.ExitStack() as opened:
         followed = opened.enter_context(
@@ -147,7 +150,7 @@ def train(
 def _source_and_score(
     recordings: Sequence[Recording], also: Sequence[Recording], config: TrainConfig, folder: Path
 ) -> tuple[TupleBatches, ScoreFn]:
-    """The batches of the places that are trained on, and the score: on those held out, where any are."""
+    """Return the batches of the training places, and the score: on held-out places, if there are any."""
     splits = [hold_out(positions_of(recording), config.validation, config.sampling) for recording in recordings]
     pool = tuple_pool(recordings, config, frames=[split.training for split in splits])
     mining = _mining(recordings, pool, config, folder) if config.sampling.mining == "hardest" else None
@@ -159,7 +162,7 @@ def _source_and_score(
 
 
 def _finish(last: Params, steps: int, folder: Path, config: TrainConfig) -> TrainResult:
-    """Save the weights that the run hands out."""
+    """Save and return the final weights."""
     best = steps == config.steps and config.select == "best"
     params, measured = best_params(folder, config) if best else own_copy(last), None
     if is_first_host():
@@ -179,7 +182,7 @@ def _require_usable(
         )
     if bool(also) != bool(config.also_tuples):
         raise ValueError(
-            "also_tuples says how many tuples of a step are of the second dataset: expected both or neither, "
+            "also_tuples is the number of tuples per step from the second dataset: expected both or neither, "
             f"found {len(also)} of its recordings and {config.also_tuples} tuples"
         )
     tested = [] if test is None else [test]
@@ -187,7 +190,7 @@ def _require_usable(
         raise ValueError(f"expected recordings to train on other than the one tested, found {tested[0].name} in both")
     if config.loss.segmentation_alone and not any(any(recording.labelled) for recording in (*recordings, *also)):
         raise ValueError(
-            "loss.segmentation_alone learns from labels alone: expected labels beside some scans, "
+            "loss.segmentation_alone trains on labels alone: expected labels beside some scans, "
             f"found none in {len(recordings) + len(also)} recording(s)"
         )
     if config.model.categories_read:
@@ -214,7 +217,7 @@ def _names(
 def _packed(
     recordings: Sequence[Recording], *, cache: Path | None, callback: Callback, stopped: Callable[[], bool]
 ) -> Sequence[Recording]:
-    """The same recordings, read from their packs in the folder `cache`, which are made on first use."""
+    """Return the same recordings, read from packs in the folder `cache`. Missing packs are written first."""
     if cache is None:
         return recordings
 
@@ -235,11 +238,12 @@ def _mining(recordings: Sequence[Recording], pool: TuplePool, config: TrainConfi
 
 
 def _grafted(weights: Params | Path | str, config: TrainConfig) -> Params:
-    """These weights, with fresh ones where they have none, and without a whitening layer where the model has none."""
+    """Return the given weights with random values for missing ones, without the whitening layer if the model has
+    none."""
     given = weights if isinstance(weights, Params) else load(weights)
     if config.loss.segmentation_alone and given.config.head.whiten and not config.model.head.whiten:
         raise ValueError(
-            "loss.segmentation_alone keeps what describes places, found weights with a whitening layer: "
+            "loss.segmentation_alone trains no descriptors, found weights with a whitening layer: "
             "expected model.head.whiten True"
         )
     given = given if config.model.head.whiten else unwhitened(given)

@@ -1,4 +1,4 @@
-"""A run's folder: begun once, with its settings and environment, and resumed with the same settings only."""
+"""Folder of a run: its settings and environment. A run can only be resumed with the same settings."""
 
 import contextlib
 import dataclasses
@@ -18,12 +18,23 @@ CONFIG_FILE = "config.json"
 def claimed(
     folder: Path, config: TrainConfig, settings: Mapping[str, Any], *, resume: bool, made: int = 0
 ) -> Iterator[None]:
-    """Be the only process that trains in a run's folder, for as long as the block lasts.
+    """Lock a run's folder for this process while the block runs.
 
-    The configuration and further `settings` are written into it; what a killed process left is removed. `made` are the
-    steps that the run to `resume` has made. Raises FileExistsError where there is a run already and this one is not to
-    resume it, BlockingIOError where another process trains there, ValueError where fewer steps are asked for than are
-    made; otherwise as `require_same_settings`.
+    The block starts with the configuration and the `settings` written to the folder, and without incomplete files of
+    killed processes.
+
+    Arguments:
+      folder: Folder of the run.
+      config: Configuration of the run.
+      settings: Further entries of config.json.
+      resume: Continue the run in the folder.
+      made: Number of finished steps of that run.
+
+    Raises:
+      FileExistsError: The folder already has a run, and `resume` is false.
+      BlockingIOError: Another process trains in the folder.
+      ValueError: `config.steps` is less than `made`, or settings differ (see `require_same_settings`).
+      FileNotFoundError: There is no run to resume.
     """
     path = folder / CONFIG_FILE
     if resume:
@@ -33,7 +44,7 @@ def claimed(
     with alone_in(folder):
         if path.exists() and not resume:
             raise FileExistsError(
-                f"{folder}: there is a run already; go on with it (--resume), or choose another folder (--out)"
+                f"{folder}: there is a run already; resume it (--resume) or choose another folder (--out)"
             )
         remove_half_written(folder)
         write_json(path, _as_json(config, settings))
@@ -42,23 +53,21 @@ def claimed(
 
 
 def require_same_settings(folder: Path, config: TrainConfig, settings: Mapping[str, Any]) -> None:
-    """See that the run in `folder` was begun with this configuration and settings, the number of steps apart.
+    """Check that the run in `folder` has this configuration and these settings. The number of steps may differ.
 
-    Raises FileNotFoundError where there is no run, ValueError, naming them, where settings differ.
+    Raises FileNotFoundError if there is no run, and ValueError with the names of the settings that differ.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a run to resume, found none")
     different = sorted(_differences(read_json(path), _as_json(config, settings)) - {"config.steps"})
     if different:
-        raise ValueError(
-            f"{path}: expected the same settings as before to resume, found others: {', '.join(different)}"
-        )
+        raise ValueError(f"{path}: expected the settings of the run to resume, found others: {', '.join(different)}")
 
 
 def _require_steps(folder: Path, config: TrainConfig, made: int) -> None:
     if config.steps < made:
-        raise ValueError(f"{folder}: expected steps of at least the {made} made, found {config.steps}")
+        raise ValueError(f"{folder}: expected at least the {made} steps that are already done, found {config.steps}")
 
 
 def _as_json(config: TrainConfig, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What training carries from step to step."""
+"""State of a training run between steps."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from sglpr_jax.training.optimizer import optimizer
 
 @flax.struct.dataclass
 class TrainState:
-    """The step about to be made, the weights, and Adam's moments."""
+    """Number of finished steps, the weights, and the moments of Adam."""
 
     step: Any
     params: Params
@@ -23,7 +23,10 @@ class TrainState:
 
 
 def new_state(config: TrainConfig, *, key: Array | None = None, params: Params | None = None) -> TrainState:
-    """The state before the first step: fresh weights from `key` (default: the configured seed), or given ones."""
+    """Return the state before the first step, with the given weights or with random weights from `key`.
+
+    Without `key`, the seed of the configuration is used.
+    """
     if params is None:
         params = init(jax.random.key(config.seed) if key is None else key, config=config.model)
     return TrainState(jnp.zeros((), jnp.int32), params, optimizer(config.optimizer).init(params.weights))

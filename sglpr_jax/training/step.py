@@ -1,8 +1,9 @@
-"""One training step: a pure function of (state, batch).
+"""One training step: a pure function of state and batch.
 
-The triplet and Dice losses span the batch, so no chunk of it knows its gradient before all have been seen. A step in
-chunks therefore goes through the network twice: once forward for what the losses need (descriptors and a few sums per
-chunk), then, with the losses' gradients at those, forward and backward. Activations of one chunk are alive at a time.
+The triplet and Dice losses span the batch, so the gradient of a chunk depends on all other chunks. A step in chunks
+therefore has two passes. The first computes the inputs of the losses: descriptors and a few sums per chunk. The second
+runs each chunk forward and backward with the gradients of the losses at these inputs. Only the activations of one chunk
+are in memory at a time.
 """
 
 import dataclasses
@@ -30,7 +31,8 @@ from sglpr_jax.training.state import TrainState
 
 
 class Chunk(NamedTuple):
-    """Images (c, h, w) and, where there are labels, their maps (c, h, w), which of them count (c,), and a key ()."""
+    """Images (c, h, w), their label maps (c, h, w) if there are labels, a mask of labelled images (c,), and a key
+    ()."""
 
     images: Any
     maps: Any
@@ -53,7 +55,7 @@ def train_step(state: TrainState, batch: Batch, *, config: TrainConfig) -> tuple
 
 
 def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -> tuple[Any, Metrics]:
-    """The gradient of equation 8 at `params.weights`, chunk by chunk, and the loss terms.
+    """Return the gradient of equation 8 at `params.weights`, accumulated over the chunks, and the metrics of the loss.
 
     Arrays of `chunks` have a leading chunk axis.
     """
@@ -81,7 +83,7 @@ def gradients(params: Params, chunks: Chunk, batch: Batch, config: LossConfig) -
 
 
 def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
-    """One chunk through the network; the segmentation head only where there are labels, on every n-th image."""
+    """Run one chunk through the network. The segmentation head runs only if there are labels, on every n-th image."""
     params = learning_segmentation_alone(params) if config.segmentation_alone else params
     labels = chunk.maps if params.config.head.reads_labels else None
     if chunk.maps is None or not (params.config.segments and config.segments):
@@ -93,10 +95,12 @@ def summarize(params: Params, chunk: Chunk, config: LossConfig) -> Summary:
 
 
 def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfig) -> Chunk:
-    """The batch as the network will see it, cut into chunks along a new leading axis."""
+    """Return the batch as the network sees it, cut into chunks along a new leading axis."""
     angles = _angles(angle_key, config) if config.rotate else None
     see = functools.partial(views, grid=config.model.grid)
-    images, maps = (see if batch.also is not None else on_own_rows(see))(batch, angles)  # a mixed one is on one device
+    images, maps = (see if batch.also is not None else on_own_rows(see))(
+        batch, angles
+    )  # a mixed batch is on one device
     seen = field_of_view(config.model)
     if config.occlusion.share:
         key = jax.random.fold_in(angle_key, 1)
@@ -107,11 +111,11 @@ def _chunks(batch: Batch, angle_key: Array, model_key: Array, config: TrainConfi
     whole = (images, maps, jnp.asarray(batch.labelled))
     whole = jax.tree.map(lambda x: in_network_order(x, batch, every=config.loss.segment_every), whole)
     cut = jax.tree.map(lambda x: x.reshape(-1, config.images_at_once, *x.shape[1:]), whole)
-    return Chunk(*keep_split(cut, axis=1), key=keys)  # or each chunk would lie on one device
+    return Chunk(*keep_split(cut, axis=1), key=keys)  # otherwise each chunk would be on one device
 
 
 def _angles(key: Array, config: TrainConfig) -> Array:
-    """How far each place is rotated, radians."""
+    """Return the rotation of each place, in radians."""
     angles = jax.random.uniform(key, (config.images,), maxval=2 * jnp.pi)
     if not config.quarter_turns:
         return angles
@@ -120,6 +124,6 @@ def _angles(key: Array, config: TrainConfig) -> Array:
 
 
 def _merge(summaries: Summary) -> Summary:
-    """The summary of all chunks as if they had been one: descriptors side by side, sums added."""
+    """Merge the summaries of all chunks: concatenate descriptors, add sums."""
     descriptors, sums = summaries
     return Summary(descriptors.reshape(-1, descriptors.shape[-1]), jax.tree.map(lambda s: s.sum(0), sums))

@@ -1,4 +1,4 @@
-"""A run's measurements as TensorBoard's event files (extra `tensorboard`), beside its metrics."""
+"""Measurements of a run as TensorBoard event files (extra `tensorboard`)."""
 
 import time
 from collections.abc import Mapping
@@ -12,10 +12,10 @@ EVENTS = "tensorboard"
 
 
 class EventFiles(Callback):
-    """Writes all that is measured into event files under a folder, at once.
+    """Writes all measurements into event files in a folder, without delay.
 
-    The first step hides what an interrupted run wrote of that step and later ones. Raises ImportError where the extra
-    is not installed; writing raises OSError where the files cannot be written.
+    The first record hides what an interrupted run wrote for this step and later ones. Raises ImportError if the extra
+    is not installed. Writing raises OSError if the files cannot be written.
     """
 
     def __init__(self, folder: Path):
@@ -54,7 +54,7 @@ class EventFiles(Callback):
 
 
 def _new_writer(folder: Path, step: int) -> Any:
-    # Not tensorboardX's SummaryWriter: that one writes from a thread, where an error is lost.
+    # tensorboardX's SummaryWriter writes from a thread, where errors are lost.
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 

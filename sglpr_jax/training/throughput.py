@@ -1,4 +1,4 @@
-"""How fast a run was, from its metrics."""
+"""Speed of a run, computed from its metrics."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,17 +10,18 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Throughput:
-    """Steps a second, and the share of the time in which the device waited for data; scores and compilation apart."""
+    """Speed of a run without scores and compilation: steps per second, and fraction of the time spent waiting for
+    data."""
 
     steps_per_second: float
     data_wait: float
 
 
 def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
-    """The throughput over all lines that say how fast they were; None where none does.
+    """Return the throughput over all lines that contain a speed, or None without such lines.
 
-    The first line after each start does not: the step is compiled there. (Older logs say it; their first line is left
-    out, those after a resume are not.)
+    The first line after each start has no speed, because the step is compiled then. Older logs have a speed there:
+    their first line is skipped, but lines after a resume are counted.
     """
     timed = [(line["step"] - before["step"], line) for before, line in pairwise(lines) if "steps_per_second" in line]
     if not timed:

@@ -1,4 +1,4 @@
-"""The score of a training run: how well it tells the places of its own recordings apart."""
+"""Score of a training run without held-out places: Recall@1 among training places."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,7 +11,7 @@ from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.describe_places import describe_places
 
 PLACES = 192
-_SEED = 2**31 - 1  # no training run's, so that these are not the tuples of a step
+_SEED = 2**31 - 1  # not the seed of a training run, so that these are not the tuples of a step
 
 
 def training_recall(
@@ -19,10 +19,10 @@ def training_recall(
 ) -> Callable[[Params], dict[str, float]]:
     """Return a function that scores weights by Recall@1 among fixed places of the training recordings.
 
-    The places come in pairs of an anchor and a positive, each rotated at random. An anchor is found where the nearest
-    of all the positives' descriptors is of a place less than the positive distance away. The recording that is tested
-    has no part in it, so the score may choose checkpoints; but these places are trained on, so it says little about
-    new ones.
+    The places are pairs of an anchor and a positive, each rotated at random. A pair counts as found if the nearest of
+    all positive descriptors belongs to a place within the positive distance of the anchor. The test recording is not
+    used, so the score may select checkpoints. The places are training places, so the score says little about new
+    places.
     """
     frames = pool.draw(seed=_SEED, step=0, tuples=PLACES)[:, :2]
     offset = pool.positions[frames[:, :1], :2] - pool.positions[None, frames[:, 1], :2]

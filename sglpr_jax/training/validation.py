@@ -1,4 +1,4 @@
-"""The score of a training run on what is held out of its recordings: retrieval among places never trained on."""
+"""Score of a training run on held-out places: retrieval among places that were never trained on."""
 
 from collections.abc import Callable, Sequence
 
@@ -20,12 +20,13 @@ _SEED = 2**31 - 1
 def validation_score(
     recordings: Sequence[Recording], frames: Sequence[Int[np.ndarray, "_"]], config: TrainConfig
 ) -> Callable[[Params], dict[str, float]]:
-    """Return a function that scores weights by retrieval among held-out `frames` of each recording.
+    """Return a function that scores weights by retrieval among the held-out `frames` of each recording.
 
-    Every frame, rotated at random, looks for its nearest descriptor among all the others. `recall_neighbours` counts
-    any frame within the positive distance as found. Where there are revisits, a frame's own visit is left out for
-    `recall_revisits` and `f1max`, and "score" is the mean of these two; elsewhere it is `recall_neighbours`. Raises
-    ValueError where no two held-out frames lie within that distance.
+    Every frame is rotated at random and searches for its nearest descriptor among all others. `recall_neighbours`
+    counts any frame within the positive distance as found. If there are revisits, `recall_revisits` and `f1max` exclude
+    frames of the same visit, and "score" is their mean. Otherwise "score" is `recall_neighbours`.
+
+    Raises ValueError if no two held-out frames are within the positive distance.
     """
     try:
         pool = tuple_pool(recordings, config, frames=frames)
@@ -46,11 +47,11 @@ def validation_score(
 
 
 def retrieval(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: int) -> tuple[float, float]:
-    """Recall@1 and top-1 F1max where every frame looks among those of other recordings or more than `gap` frames away.
+    """Return Recall@1 and top-1 F1max. Every frame searches other recordings and frames more than `gap` frames away.
 
-    Recall@1 is the share found among the frames that have something to find (there must be one). For F1max a nearest
-    frame is accepted up to a distance of descriptors; it is right within the positive and wrong beyond the negative
-    distance of places.
+    Recall@1 is the fraction found among the frames with a match; there must be at least one. For F1max, the nearest
+    frame is accepted up to a threshold on the descriptor distance. It is right within the positive distance of places
+    and wrong beyond the negative one.
     """
     every = np.arange(len(pool))
     same_recording = pool.recording[:, None] == pool.recording[None]

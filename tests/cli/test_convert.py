@@ -65,7 +65,7 @@ def test_a_whole_swin_unet(command, preset, state, tmp_path):
     file = written(tmp_path / "unet.safetensors", state)
     ended = command("convert", file, "--network", "swin-unet", "--preset", preset, "--out", tmp_path / "start")
     assert ended.status == 0, ended.error
-    assert "million numbers" in ended.out and "of unet.safetensors, the rest fresh (seed 0)" in ended.out
+    assert "million numbers" in ended.out and "of unet.safetensors, the rest random (seed 0)" in ended.out
     values = by_name(sglpr_jax.load(tmp_path / "start").weights)
     for name, value in values.items():
         if not name.startswith("place_head/"):
@@ -77,7 +77,7 @@ def test_swin_t_fills_what_it_fits_and_says_what_it_does_not(command, preset, st
     file = written(tmp_path / "t.safetensors", {**encoder, "head.weight": np.zeros((10, 16), np.float32)})
     ended = command("convert", file, "--preset", preset, "--out", tmp_path / "start")
     assert ended.status == 0, ended.error
-    assert f"without a place in {preset}: head.weight" in ended.out
+    assert f"not used by {preset}: head.weight" in ended.out
     values = by_name(sglpr_jax.load(tmp_path / "start").weights)
     expected = state["layers.0.blocks.0.mlp.fc1.weight"].reshape(-1)[0]
     for place in ("encoder_0", "decoder_1"):
@@ -99,7 +99,7 @@ def test_what_cannot_be_converted_is_one_line(command, preset, state, tmp_path):
     file = written(tmp_path / "unet.safetensors", {**state, "more.weight": np.zeros(3, np.float32)})
     for given, message in (
         ((tmp_path / "swin.pth", "--preset", preset), "found a pickle of PyTorch's"),
-        ((tmp_path / "none.safetensors", "--preset", preset), "no such checkpoint"),
+        ((tmp_path / "none.safetensors", "--preset", preset), "expected a checkpoint, found no file"),
         ((file, "--network", "swin-unet", "--preset", preset), "not a weight of Swin-Unet: more.weight"),
         ((file, "--preset", "rings"), "expected a model with the backbone 'swin', found 'rings'"),
     ):

@@ -11,7 +11,7 @@ def test_all_drives_but_one_are_trained_on(town, capsys):
     assert [recording.name for recording in recordings] == ["00", "05"]
     assert test.name == "08"
     said = capsys.readouterr().err.splitlines()
-    assert said[0] == "training on 00, 05; testing on 08, never seen"
+    assert said[0] == "training on 00, 05; testing on 08, which is held out"
     assert [line.split(";")[:2] for line in said[1:]] == [
         [f"{name}: 40 scans", " format: kitti (16 bytes a point)"] for name in ("00", "05", "08")
     ]

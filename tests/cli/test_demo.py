@@ -54,7 +54,7 @@ def test_a_demo_that_is_stopped_says_what_it_does_next(command, tiny_demo, rando
 
     monkeypatch.setattr(recipe, "train", train)
     ended = command("demo", "--out", tmp_path / "demo", "--steps", 2)
-    assert "stopped at step 1 of 2; the demo begins its training anew" in ended.error
+    assert "stopped at step 1 of 2; the next demo restarts its training" in ended.error
     assert "--resume" not in ended.error
 
 

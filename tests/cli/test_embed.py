@@ -146,7 +146,7 @@ def test_a_batch_of_no_image_is_refused(embed, town, batch):
 
 def test_weights_beside_a_method_that_has_none_are_refused(embed, town):
     ended, _ = embed("--method", "solid", "--weights", "sglpr", "--data", town, "--seq", "08")
-    assert_one_line_error(ended, "sglpr: expected no --weights beside --method solid, found some")
+    assert_one_line_error(ended, "sglpr: expected --method sglpr with --weights, found solid")
 
 
 def test_without_weights_the_network_has_those_of_the_package(embed, town):
@@ -265,7 +265,7 @@ def test_scans_that_show_no_place_are_skipped_and_counted(embed, scans):
 
 def test_the_height_of_the_sensor_can_be_said(embed, scans):
     ended, out = embed("--method", "scan-context", "--data", scans, "--sensor-height", "0.6")
-    assert "sensor: 0.60 m above the ground, as said" in ended.error
+    assert "sensor: 0.60 m above the ground, as given" in ended.error
     assert load(out).config["sensor"] == "0.60 m above the ground"
     ended, _ = embed("--method", "thumbnail", "--data", scans, "--sensor-height", "1730")
     assert_one_line_error(ended, "expected the sensor's height over the ground in metres, found 1730")

@@ -154,7 +154,7 @@ def test_wrong_sessions_are_refused(embedded, command, tmp_path):
     assert_one_line_error(refused(tmp_path / "mine.npy", "--database", database), "mine.npy", "bin/embed (.npz)")
     assert_one_line_error(refused(database, "--database", database), "different sessions", MAP)
     ended = refused(embedded / f"{DAYS[0]}.npz", "--database", database, "--seq", "00")
-    assert_one_line_error(ended, "descriptor files alone", "--seq")
+    assert_one_line_error(ended, "only descriptor files with --database", "--seq")
     assert_one_line_error(refused(database, embedded / f"{DAYS[0]}.npz"), "--database", "--compare")
     ended = refused(database, "--protocol", "bevplace-nclt-recall")
     assert_one_line_error(ended, "expected --database", "bevplace-nclt-recall")

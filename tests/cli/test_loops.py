@@ -50,8 +50,8 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
     assert "trajectory corrected by " in ended.out and f" of {len(found)} loops" in ended.out
     assert read_tum(out / "trajectory-optimized.tum")[0].shape == (SCANS, 4, 4)
     page = (out / "index.html").read_text()
-    assert "<h2>Corrected</h2>" in page and "<h2>Sure of it?</h2>" in page
-    assert "<h2>Where</h2>" in page and page.count("data:image/png;base64,") >= 2
+    assert "<h2>Corrected</h2>" in page and "<h2>Reliability</h2>" in page
+    assert "<h2>Trajectory</h2>" in page and page.count("data:image/png;base64,") >= 2
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
     assert ended.status == 130
     assert ended.out.startswith("0 loops in 5 of 40 frames of 08")
     assert {path.name for path in (tmp_path / "found").iterdir()} == FILES | {"unfinished"}
-    assert "the same command goes on from here" in ended.error
+    assert "run the same command again to continue" in ended.error
 
 
 @pytest.mark.parametrize(("unregistered", "status"), [(0, 0), (2, 130)])
@@ -91,7 +91,7 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
     monkeypatch.setattr(find, "find_loops", ended_meanwhile)
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == status, ended.error
-    assert ("the same command goes on from here" in ended.error) == bool(status)
+    assert ("run the same command again to continue" in ended.error) == bool(status)
 
 
 def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):
@@ -156,7 +156,9 @@ def test_wrong_input_is_one_clear_error(command, town, odometry, tmp_path):
     assert_one_line_error(ended, "short.txt: expected 40 poses, one for each scan of 08, found 7")
     assert_one_line_error(command(*run, short, "--min-probability", "nan"), "min_probability from 0 to 1, found nan")
     assert_one_line_error(command(*run, short, "--drift-percent", "-1"), "metres_per_metre >= 0, found -0.01")
-    assert_one_line_error(command(*run, flat), "flat.txt", "12 numbers a line and their axes named, kitti")
+    assert_one_line_error(
+        command(*run, flat), "flat.txt", "found 12 numbers a line; for 12 numbers a line, name the axes"
+    )
     assert_one_line_error(command(*run, flat, "--odometry-format", "lidar"), "flat.txt: expected a rotation")
     assert_one_line_error(command(*run, tmp_path / "none.tum"), "none.tum", "expected odometry")
     assert_one_line_error(command("loops", tmp_path, "--out", tmp_path / "found"), tmp_path)
@@ -174,7 +176,7 @@ def test_two_processes_do_not_search_into_one_folder(command, town, tmp_path):
     out = tmp_path / "found"
     with alone(out / "unfinished"):
         ended = command("loops", town, "--seq", "08", "--out", out)
-    assert_one_line_error(ended, "unfinished: expected to be alone in it, found another process at work")
+    assert_one_line_error(ended, "unfinished: expected exclusive use, found another process at work")
     assert not out.exists()
 
 
@@ -183,7 +185,7 @@ def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_
     path = tmp_path / "found" / "trajectory-optimized.tum"
     write_tum(path, odometry, np.arange(float(SCANS)))
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", flag, path)
-    assert_one_line_error(ended, "trajectory-optimized.tum: expected a file that stays")
+    assert_one_line_error(ended, "trajectory-optimized.tum: expected an input that is no output file")
     assert path.exists()
 
 
@@ -196,7 +198,7 @@ def test_a_short_recording_without_times_is_told_why_it_has_no_loops(command, to
     times = open_recording(town, "08").times + 1.6e9
     write_tum(tmp_path / "odometry.tum", odometry, times)
     ended = command("loops", scans, "--out", tmp_path / "timed", "--odometry", tmp_path / "odometry.tum")
-    assert ended.status == 0 and "times: those of odometry.tum" in ended.error and "warning" not in ended.error
+    assert ended.status == 0 and "times: from odometry.tum" in ended.error and "warning" not in ended.error
     np.testing.assert_allclose(read_tum(tmp_path / "timed" / "trajectory.tum")[1], times, atol=1e-5)
 
 

@@ -102,12 +102,12 @@ def test_ctrl_c_keeps_what_was_found_and_the_same_command_goes_on(command, town,
     for stop_at, words in ((10, "10 places, 10 of them from 10 of 40"), (25, "25 places, 15 of them from 25 of 40")):
         ended = command(*run, *add_to, "--out", out)
         assert ended.status == 130 and ended.out == f"{out}: {words} scans of 08\n"
-        assert "the same command goes on from here" in ended.error
+        assert "run the same command again to continue" in ended.error
         add_to = ("--add-to", out)
         assert out.with_suffix(".unfinished").is_dir() and len(PlaceMap.load(out)) == stop_at
     stop_at, whole = 10, other.read_bytes()
     ended = command(*run, "--out", other)  # the whole map anew, stopped
-    assert ended.status == 130 and "stays as it is, with more places than the 10 of so few scans" in ended.out
+    assert ended.status == 130 and "unchanged, because it has more places than the 10 found until now" in ended.out
     assert other.read_bytes() == whole and other.with_suffix(".unfinished").is_dir()
     stop_at = 0
     ended = command(*run, *add_to, "--out", out)
@@ -147,7 +147,7 @@ def test_two_processes_do_not_make_one_map(command, town, poses, tmp_path):
     out = tmp_path / "town.safetensors"
     with alone(out.with_suffix(".unfinished")):
         ended = command("map", town, "--seq", "08", "--poses", poses, "--out", out)
-    assert_one_line_error(ended, "town.unfinished: expected to be alone in it, found another process at work")
+    assert_one_line_error(ended, "town.unfinished: expected exclusive use, found another process at work")
     assert [path.name for path in tmp_path.iterdir()] == ["poses.tum"]
 
 
@@ -173,7 +173,7 @@ def test_a_scan_without_ground_tells_no_height(command, places_file, tmp_path):
     scan = tmp_path / "sky.bin"
     np.random.default_rng(0).normal(scale=9, size=(200, 4)).astype(np.float32).tofile(scan)
     ended = command("relocalize", scan, "--map", places_file, "--sensor-height", "estimate")
-    assert_one_line_error(ended, "sky.bin", "expected ground that tells the sensor's height")
+    assert_one_line_error(ended, "sky.bin", "expected ground to estimate the sensor's height")
 
 
 @pytest.fixture
@@ -212,14 +212,14 @@ def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command,
     scan = tmp_path / "dot.bin"
     np.array([5, 0, 0, 1], np.float32).tofile(scan)
     run = ("relocalize", scan, "--map", places_file)
-    assert_one_line_error(
-        command(*run, "--out", tmp_path / "pose.json"), "dot.bin: expected a scan that shows something"
-    )
+    assert_one_line_error(command(*run, "--out", tmp_path / "pose.json"), "dot.bin: expected a scan that shows a place")
     assert not (tmp_path / "pose.json").exists()
     assert_one_line_error(command(*run, "--weights", "rings"), "one.safetensors: expected descriptors of the weights")
     content = places_file.read_bytes()
     places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
-    assert_one_line_error(command(*run), "one.safetensors: expected an index as it was written, found a damaged one")
+    assert_one_line_error(
+        command(*run), "one.safetensors: expected an index with a valid checksum, found a damaged one"
+    )
 
 
 @pytest.mark.slow
@@ -238,7 +238,7 @@ def test_a_full_disk_leaves_the_map_as_it_was_and_what_was_seen(
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
         ended = command(*run)
-    assert_one_line_error(ended, "one.safetensors: expected to write it, found: No space left on device")
+    assert_one_line_error(ended, "one.safetensors: cannot be written: No space left on device")
     assert places_file.read_bytes() == before
     assert {path.name for path in tmp_path.iterdir()} == {"one.safetensors", "one.unfinished", "poses.tum"}
     assert command(*run).status == 0

@@ -92,5 +92,5 @@ def test_a_matrix_is_compared_on_the_positions_and_times_of_the_file(command, to
     np.save(tmp_path / "own.npy", np.ones((39, 3)))
     ended = command("evaluate", tmp_path / "08.npz", "--compare", tmp_path / "own.npy", *PROTOCOL)
     assert_one_line_error(
-        ended, "own.npy: expected 40 descriptors, as many as sequences/08/poses.txt has poses, found 39"
+        ended, "own.npy: expected 40 descriptors, one for each pose of sequences/08/poses.txt, found 39"
     )

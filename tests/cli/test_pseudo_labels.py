@@ -61,7 +61,7 @@ def test_maps_that_a_model_made_teach_beside_those_of_a_second_dataset(
     options = ("--seq", "06", "--data", images, "--pseudo-labels", pseudo, "--preset", preset, "--out", out, *mixed)
     ended = command("train", *options, "--steps", 2)
     assert ended.status == 0, ended.error
-    assert f"15 of 30 images have labels, with those of {pseudo}" in ended.error
+    assert f"15 of 30 images have labels, including those of {pseudo}" in ended.error
     assert all(line["cross_entropy"] > 0 for line in steps_of(out))
     main, also = np.concatenate(labelled_places[::2]), np.concatenate(labelled_places[1::2])
     assert main.any() and not main.all() and also.all()
@@ -75,7 +75,7 @@ def test_pseudo_labels_that_cannot_be_used_are_refused_before_the_run(command, i
     off = ("--loss.ce-weight", 0, "--loss.dice-weight", 0)
     assert_one_line_error(command("train", *options, "--data", images, *off), "--pseudo-labels", "segmentation head")
     assert_one_line_error(
-        command("train", *options, "--seq", "08", "--data", town), tmp_path, "of which there are none"
+        command("train", *options, "--seq", "08", "--data", town), tmp_path, "no image recording without labels"
     )
     (tmp_path / "00").mkdir()
     for frame in range(30):

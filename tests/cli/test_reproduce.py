@@ -53,7 +53,7 @@ def test_a_scan_that_vanishes_on_the_way_is_missed(town, preset, tmp_path):
 @pytest.mark.slow
 def test_the_plan_says_what_is_trained_and_only_that_is(reproduced):
     folder, ended, _ = reproduced
-    assert "3 leave-one-out runs of 4 steps, 0 of them there already" in ended.error
+    assert "3 leave-one-out runs of 4 steps, 0 of them already trained" in ended.error
     assert "s a step" in ended.error and "run 3 of 3" in ended.error
     assert {path.parent.parent.name for path in folder.glob("*/08/trained.json")} == {
         "full",
@@ -114,7 +114,7 @@ def test_what_is_there_is_used_again(reproduced, command):
     folder, _, options = reproduced
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/*/weights/*")}
     again = command("reproduce", "table5", *options)
-    assert again.status == 0 and "2 leave-one-out runs of 4 steps, 2 of them there already" in again.error
+    assert again.status == 0 and "2 leave-one-out runs of 4 steps, 2 of them already trained" in again.error
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*/weights/*")} == before
 
 
@@ -125,7 +125,7 @@ def test_other_settings_are_refused_and_more_steps_go_on(reproduced, command):
     assert_one_line_error(other, "no-segmentation", "config.optimizer.learning_rate")
     assert_one_line_error(command("reproduce", "table5", *options, "--steps", 2), "up to 2 steps, found 4")
     more = command("reproduce", "table5", *options, "--steps", 6, "--plan")
-    assert more.status == 0 and "0 of them there already" in more.error
+    assert more.status == 0 and "0 of them already trained" in more.error
     assert read_metrics(folder / "full" / "08" / "metrics.jsonl")[-1]["step"] == 4  # only said, not done
 
 
@@ -135,7 +135,7 @@ def test_a_stopped_reproduction_says_how_it_goes_on(town, preset, random_params,
     monkeypatch.setattr(plan, "time_a_step", lambda *_: 1.0)
     monkeypatch.setattr(Runs, "train", lambda *_, **__: stopped)
     ended = command("reproduce", "table5", *OPTIONS, "--data", town, "--preset", preset, "--out", tmp_path / "out")
-    assert "stopped at step 1 of 4; the same command goes on" in ended.error
+    assert "stopped at step 1 of 4; run the same command again to continue" in ended.error
     assert "--resume" not in ended.error
 
 
@@ -220,6 +220,6 @@ def test_the_plan_tells_the_recordings_that_never_come_back(town, images, preset
 
     straight = plan(images, ["table1"], "00", "06")
     assert straight.without_revisits == ("00", "06")
-    assert straight.text(1.0).splitlines()[-2] == "no revisits in 00, 06: no scores there, and no means"
+    assert straight.text(1.0).splitlines()[-2] == "no revisits in 00, 06: no scores for them, and no means"
     assert plan(town, ["table1", "table3"], "08").without_revisits == ()
     assert plan(images, ["table3"], "00").without_revisits == ()

@@ -63,4 +63,4 @@ def test_wrong_input_is_refused_before_anything_is_written(command, tmp_path):
 def test_a_folder_that_cannot_be_written_is_named(command, tmp_path):
     (tmp_path / "file").write_text("")
     ended = command("simulate", "--out", tmp_path / "file" / "town", *THIN, "--seq", "08")
-    assert_one_line_error(ended, "simulation.json", "expected to write it")
+    assert_one_line_error(ended, "simulation.json", "cannot be written")

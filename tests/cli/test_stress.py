@@ -158,6 +158,6 @@ def test_a_corruption_that_needs_rings_is_left_out_of_scans_without(stress, tmp_
     options = ("--data", scans, "--method", "solid", "--format", "kitti", "--protocol", "top1-f1max")
     ended, out = stress(*options, "--corruption", "beams-16", "noise-0.05")
     assert ended.status == 0
-    assert "beams-16 left out: scan 0 of sequence my_scans: beams-16: expected a scan with rings" in ended.error
+    assert "skipped beams-16: scan 0 of sequence my_scans: beams-16: expected a scan with rings" in ended.error
     assert "noise-0.05" in ended.out and "beams-16" not in ended.out
     assert list(json.loads((out / "config.json").read_text())["left_out"]) == ["beams-16"]

@@ -151,7 +151,7 @@ def test_signals_and_a_full_disk_stop_a_run_that_then_goes_on(options, uninterru
         runs.wait_for_lines(process, 3)
         process.send_signal(number)
         assert process.wait(TIMEOUT_S) == status
-        assert "go on with --resume" in runs.errors.read_text()
+        assert "continue with --resume" in runs.errors.read_text()
         last = runs.last_step()
         assert f"stopped at step {last} of {STEPS}" in runs.errors.read_text()
 

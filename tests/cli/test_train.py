@@ -179,7 +179,7 @@ def test_ctrl_c_saves_and_resume_comes_to_the_same_weights(command, trained, tow
     handler = signal.getsignal(signal.SIGINT)
     ended = command("train", *options)
     assert ended.status == 130
-    assert "stopping after this step" in ended.error and "stopped at step 1 of 4; go on with --resume" in ended.error
+    assert "stopping after this step" in ended.error and "stopped at step 1 of 4; continue with --resume" in ended.error
     assert signal.getsignal(signal.SIGINT) is handler
 
     resumed = command("train", *options, "--resume")

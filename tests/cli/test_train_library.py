@@ -107,7 +107,7 @@ def test_a_run_is_not_resumed_with_fewer_steps_than_it_has_made(images, preset, 
     names = {"recordings": ["00"], "also": [], "test": None}
     before = json.dumps({**names, "config": dataclasses.asdict(config)}, default=str)
     (out / "config.json").write_text(before)
-    with pytest.raises(ValueError, match=rf"{out}: expected steps of at least the 3 made, found 2"):
+    with pytest.raises(ValueError, match=rf"{out}: expected at least the 3 steps that are already done, found 2"):
         train(dataclasses.replace(config, steps=2), recordings, out=out, resume=True)
     assert (out / "config.json").read_text() == before
     assert sorted(path.name for path in out.iterdir()) == ["checkpoints", "config.json"]

@@ -37,7 +37,7 @@ def test_bad_scans_are_left_out_before_the_training(damaged, preset, command, tm
     ended = command("train", *options, "--out", tmp_path / "run", "--skip-bad", "--sensor-height", "1.73")
     assert ended.status == 0, ended.error
     assert "skipped 000003: " in ended.error and "skipped 000005: scan 000005 of sequence 08" in ended.error
-    assert "as said" in ended.error
+    assert "as given" in ended.error
     assert json.loads((tmp_path / "run/config.json").read_text())["skip_bad"] is True
     with np.load(tmp_path / "run/test/thumbnail-raw.npz") as file:
         assert len(file["ids"]) == 39 and "000005" not in file["ids"]

@@ -91,7 +91,8 @@ def test_positions_are_interpolated_at_the_times_of_the_scans(tmp_path, kind, na
     np.testing.assert_allclose(recording.times, times)
     np.testing.assert_allclose(recording.positions, np.stack([10 * times, -2 * times, 0 * times + 0.5], 1), atol=1e-5)
     np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, np.eye(4)), atol=1e-5)
-    how = "interpolated" if name == POSE else "interpolated; taken as poses of lidar, since tf does not join the two"
+    untransformed = "interpolated; used as poses of lidar, since tf does not connect the two frames"
+    how = "interpolated" if name == POSE else untransformed
     assert recording.pose_source == f"/odom (9 poses of {frames}, {how})"
     assert f"poses: /odom (9 poses of {frames}, {how}), over 18 x 4 m and 0 m of height" in recording.description[-1]
 
@@ -102,8 +103,8 @@ def test_scans_without_a_pose_are_left_out_and_counted(tmp_path):
     assert recording.ids == tuple(f"{i:06d}" for i in range(3, 8)) and len(recording.paths) == 5
     np.testing.assert_allclose(recording.times, times[3:])
     assert recording.pose_source == (
-        "/odom (6 poses of base_link in odom, interpolated; taken as poses of lidar, since tf does not join the two; "
-        "3 of 8 scans left out, which have no pose)"
+        "/odom (6 poses of base_link in odom, interpolated; used as poses of lidar, since tf does not connect the two "
+        "frames; 3 of 8 scans left out, which have no pose)"
     )
     assert recording.points(4).shape == (4, 3)
     np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times[3:], np.eye(4)), atol=1e-5)
@@ -186,7 +187,7 @@ def test_rotations_that_nobody_measured_are_none(tmp_path, quaternion):
     track = poses("ros2", "/gps", times, turns=lambda t: quaternion)
     recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
     assert recording.world_from_lidar is None and len(recording.positions) == len(times)
-    assert recording.pose_source.endswith("interpolated; its rotations never change or are none)")
+    assert recording.pose_source.endswith("interpolated; its rotations are constant or missing)")
 
 
 def test_rotations_between_two_are_those_of_an_even_turn():

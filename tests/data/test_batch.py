@@ -239,9 +239,9 @@ def test_images_that_are_none_of_densities_are_refused_where_these_are_wanted(po
 
 def test_scans_and_images_do_not_mix(recordings, pool):
     pictures = of_images({Path("0.png"): np.zeros((20, 20))}, name="06")
-    with pytest.raises(ValueError, match="expected all recordings of a batch to be scans, found images in 06"):
+    with pytest.raises(ValueError, match="expected only scans in a batch, found images in recording 06"):
         read([recordings[0], pictures], pool)
-    with pytest.raises(ValueError, match="expected all recordings of a batch to be images, found scans in 05"):
+    with pytest.raises(ValueError, match="expected only images in a batch, found scans in recording 05"):
         read([pictures, recordings[1]], pool, np.array([[20, 21, 22, 23]]))
 
 
@@ -251,6 +251,6 @@ def test_images_of_two_sizes_are_refused(pool):
         of_images({Path(f"{name}-{i}.png"): np.zeros(size, np.float32) for i in range(len(SIZES))}, name=name)
         for name, size in sizes.items()
     ]
-    words = "recording 05, frame 05-1: expected an image of 16 x 16 pixels, as of 00, found 12 x 20"
+    words = "recording 05, frame 05-1: expected an image of 16 x 16 pixels, as in 00, found 12 x 20"
     with pytest.raises(ValueError, match=words):
         read(mixed, pool, np.array([[0, 1, 17, 2]]))

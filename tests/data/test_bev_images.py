@@ -59,7 +59,9 @@ def test_too_few_poses_name_the_frame(bev_root):
 
 def test_missing_poses_or_images_are_named(bev_root):
     (bev_root / "06/pose.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"06/pose\.txt: no such file"):
+    with pytest.raises(
+        FileNotFoundError, match=r"06/pose\.txt: expected a file with 12 numbers a line, one line per frame, found none"
+    ):
         open_recording(bev_root, "06")
     (bev_root / "07/imgs").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match=r"07/imgs: expected images \(\*\.png\), found none"):
@@ -78,7 +80,7 @@ def test_a_colour_image_is_refused(tmp_path):
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a.png")
     with pytest.raises(ValueError, match=r"a\.png: expected an 8-bit grey PNG \(mode L\), found mode RGB"):
         read_image(tmp_path / "a.png")
-    with pytest.raises(FileNotFoundError, match=r"b\.png: expected an image, found no such file"):
+    with pytest.raises(FileNotFoundError, match=r"b\.png: expected an image, found none"):
         read_image(tmp_path / "b.png")
 
 

@@ -167,7 +167,7 @@ def test_a_kind_stands_for_all_its_strengths():
     [("beams", 0.0), ("dropout", 1.5), ("occlusion", 361.0), ("noise", -0.1), ("offset", float("nan"))],
 )
 def test_a_strength_that_cannot_be_is_refused(kind, strength):
-    with pytest.raises(ValueError, match=f"expected {kind} of a strength from . to .*, found {strength:g}"):
+    with pytest.raises(ValueError, match=f"expected {kind} with a strength from . to .*, found {strength:g}"):
         Corruption(kind, strength)
 
 

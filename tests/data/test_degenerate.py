@@ -24,7 +24,7 @@ GOOD = np.random.default_rng(0).uniform(-15, 15, (400, 3)).astype(np.float32)
 BAD = {
     "NaN": (np.full_like(GOOD, np.nan), "expected finite points, found none among 400"),
     "infinite": (np.full_like(GOOD, np.inf), "expected finite points, found none among 400"),
-    "zeros": (np.zeros_like(GOOD), r"found all 400 of them at \(0, 0, 0\)"),
+    "zeros": (np.zeros_like(GOOD), r"found all 400 points at \(0, 0, 0\)"),
     "millimetres": (GOOD * 5000, "expected metres, .*found half of the points beyond .*millimetres"),
     "1e30": (np.full_like(GOOD, 1e30), "the farthest at 1e[+]30"),
     "random bytes": (
@@ -38,7 +38,7 @@ CONFIG = model_preset("tiny")
 
 
 def test_rows_of_a_file_are_no_points():
-    with pytest.raises(ValueError, match=r"scan 7: expected points of x, y and z alone.*shape \(400, 4\)"):
+    with pytest.raises(ValueError, match=r"scan 7: expected points \(n, 3\) with x, y and z only.*shape \(400, 4\)"):
         check_cloud(np.column_stack([GOOD, GOOD[:, 0]]), name="scan 7")
 
 

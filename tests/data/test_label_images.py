@@ -44,7 +44,7 @@ def test_class_ids_of_8_bits_are_refused(path):
 def test_a_map_of_another_size_is_refused(path):
     write(path, np.zeros((7, 5), np.uint16))
     with pytest.raises(
-        ValueError, match=r"000007\.png: expected 5 rows of 7 pixels, as the image has, found 7 rows of 5"
+        ValueError, match=r"000007\.png: expected 5 rows of 7 pixels, the size of the image, found 7 rows of 5"
     ):
         read_label_image(path, shape=(7, 5))
 
@@ -64,5 +64,5 @@ def test_a_cut_off_map_is_named(path, kept):
 
 
 def test_a_missing_map_is_named(path):
-    with pytest.raises(FileNotFoundError, match=r"000007\.png: expected an image, found no such file"):
+    with pytest.raises(FileNotFoundError, match=r"000007\.png: expected an image, found none"):
         read_label_image(path, shape=(7, 5))

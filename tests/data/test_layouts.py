@@ -43,7 +43,7 @@ def test_mulran(mulran_root):
         np.testing.assert_allclose(np.diff(recording.times), 0.1, atol=1e-6)
         np.testing.assert_array_equal(recording.points(0), POINTS * [-1, -1, 1])
         assert recording.pose_source == "global_pose.csv (1 of 3 scans left out: no pose within 0.1 s)"
-        assert recording.found[0] == "format: MulRan, kitti (16 bytes a point), turned to x forward"
+        assert recording.found[0] == "format: MulRan, kitti (16 bytes a point), rotated to x forward"
 
 
 PACKED = {
@@ -106,7 +106,7 @@ def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
     path.write_bytes(helipr_scan("Aeva", "fffffiB"))
     np.testing.assert_array_equal(helipr.read_points(path, sensor="Aeva").points, POINTS)
     path.write_bytes(bytes(29))
-    with pytest.raises(ValueError, match=r"expected 25 bytes a point \(Aeva\), found 29 bytes in all"):
+    with pytest.raises(ValueError, match=r"expected 25 bytes a point \(Aeva\), found 29 bytes in total"):
         helipr.read_points(path, sensor="Aeva")
 
 
@@ -167,7 +167,9 @@ def test_kitti_raw_without_gps_and_with_broken_times(raw_root):
     assert open_recording(raw_root).positions is None
     for text in ("2011-09-26 13:02:25.9\n", "noon\n" * 3):
         (drive / "velodyne_points" / "timestamps.txt").write_text(text)
-        with pytest.raises(ValueError, match=r"timestamps\.txt: expected a date and time, .* for each of 2 scans"):
+        with pytest.raises(
+            ValueError, match=r"timestamps\.txt: expected a date and time such as .* for each of 2 scans"
+        ):
             open_recording(raw_root)
 
 
@@ -177,7 +179,9 @@ def test_kitti_raw_leaves_the_line_of_a_missing_scan_blank(raw_root):
     file.write_text(f"{first}\n\n{last}\n\n")
     np.testing.assert_allclose(np.diff(open_recording(raw_root).times), 0.2, atol=1e-6)
     file.write_text(f"{first}\n{last}\n\n")
-    with pytest.raises(ValueError, match=r"timestamps\.txt: expected a date and time, .* \(a scan whose line is ''\)"):
+    with pytest.raises(
+        ValueError, match=r"timestamps\.txt: expected a date and time such as .* \(the line of a scan is ''\)"
+    ):
         open_recording(raw_root)
 
 

@@ -111,8 +111,8 @@ def test_scans_that_disagree_on_which_side_is_up_follow_the_majority():
     ("heights", "said"),
     [
         ((1.0, 1.0, -2.0, 1.0), "1.00 m above the ground, estimated from the ground in 3 of 4 scans"),
-        ((1.0, -2.0, -2.0, 1.0), "the ground is below it in 2 of 4 scans and above it in 2, taken to be 1.73 m"),
-        ((1.0, None, None, None), "ground found in 1 of 4 scans (is z up in these files?), taken to be 1.73 m"),
+        ((1.0, -2.0, -2.0, 1.0), "the ground is below the sensor in 2 of 4 scans and above it in 2, assumed 1.73 m"),
+        ((1.0, None, None, None), "ground found in 1 of 4 scans (is z up in these files?), assumed 1.73 m"),
     ],
 )
 def test_what_is_said_of_scans_that_disagree(heights, said, monkeypatch):
@@ -158,7 +158,7 @@ def test_a_plain_folder_is_levelled_before_a_model_sees_it(low_robot):
     assert "estimated from the ground in 4 of 4 scans" in recording.description[-2]
     np.testing.assert_array_equal(recording.points(0), street(0, height=0.5))  # what lies in the file
     said = open_recording(folder, sensor_height=0.5)
-    assert said.mounting == Mounting(0.5) and said.found[-1] == "sensor: 0.50 m above the ground, as said"
+    assert said.mounting == Mounting(0.5) and said.found[-1] == "sensor: 0.50 m above the ground, as given"
     grid = Grid(0.4, 128, 128)
     wanted = view(Record(points=expected[0]), grid, image="density").image
     seen = view(said.record(0), grid, image="density").image
@@ -205,7 +205,7 @@ def test_another_sensor_in_kittis_layout_is_told(height, kitti_root):
     if height == MODEL_HEIGHT_M:  # a warning is an error
         assert open_recording(kitti_root, "08").mounting is None
         return
-    words = "sequence 08: expected the sensor 1.73 m above the ground, as its layout has it, found it 0.5"
+    words = "sequence 08: expected the sensor 1.73 m above the ground, as its layout defines, found it 0.5"
     with pytest.warns(DataWarning, match=words):
         assert open_recording(kitti_root, "08").mounting is None
     assert open_recording(kitti_root, "08", sensor_height=height).mounting == Mounting(height)

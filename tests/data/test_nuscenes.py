@@ -63,8 +63,8 @@ def test_a_scene_is_a_recording(root):
     np.testing.assert_allclose(scene.positions, [[100 + 10 * t, 200.94, 1.84] for t in (0, 0.05, 0.5)], atol=1e-9)
     assert scene.pose_source == "v1.0-mini/ego_pose.json"
     assert scene.found[:2] == (
-        "format: nuscenes (20 bytes a point), turned to x forward",
-        "2 key frames and 1 sweeps, 1 more are listed but not there",
+        "format: nuscenes (20 bytes a point), rotated to x forward",
+        "2 key frames and 1 sweeps, 1 more are listed but missing",
     )
     record = scene.record(2, lasers=True)
     shifted = POINTS + np.float32(0.5)
@@ -119,7 +119,7 @@ def test_malformed_tables_are_named(root, table, row, values, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[{", "expected a table in JSON, found none that is whole"),
+        ("[{", "expected a table in JSON, found invalid JSON"),
         ("3", "expected a list of rows, each an object, found something else"),
         ('{"token": 1}', "expected a list of rows, each an object"),
         ("[3]", "expected a list of rows, each an object"),

@@ -43,7 +43,7 @@ def test_an_unknown_sequence_lists_those_that_exist(kitti_root, bev_root):
 
 
 def test_an_unknown_layout_says_what_was_expected(tmp_path):
-    expected = r"expected sequences/NN/velodyne.*NN/imgs.*nothing of the kind: "
+    expected = r"expected sequences/NN/velodyne.*NN/imgs.*no known layout: "
     with pytest.raises(FileNotFoundError, match=f"{expected}no files"):
         recording_names(tmp_path)
     (tmp_path / "scans").mkdir()

@@ -75,7 +75,7 @@ def test_a_scan_whose_bytes_have_changed_is_refused_and_the_others_are_not(recor
     file.write_bytes(content)
     found = packed(recording, tmp_path / "cache")
     np.testing.assert_array_equal(found.points(0), recording.points(0))
-    with pytest.raises(ValueError, match=rf"^{file}: expected array 2 with the checksum .* packed anew"):
+    with pytest.raises(ValueError, match=rf"^{file}: expected array 2 with the checksum .* pack the recording again"):
         found.points(2)
 
 
@@ -148,7 +148,7 @@ def test_an_interruption_leaves_nothing(recording, tmp_path):
 @pytest.mark.parametrize("size", [10, 400])
 def test_a_full_disk_is_one_error_that_names_the_file_and_leaves_nothing(recording, tmp_path, small_files, size):
     small_files(size)  # too small for the points; for the list of files
-    with pytest.raises(OSError, match=r"cache/.*08-.*: expected to write it, found: File too large"):
+    with pytest.raises(OSError, match=r"cache/.*08-.*: cannot be written: File too large"):
         packed(recording, tmp_path / "cache")
     small_files(10**6)
     assert packs(tmp_path / "cache") == []
@@ -192,7 +192,9 @@ def test_a_damaged_pack_is_refused(recording, tmp_path, file):
 
 
 def test_only_drives_as_they_lie_on_disk_are_packed(recording, tmp_path):
-    with pytest.raises(ValueError, match="sequence 08: expected a recording as it lies on disk, found one that is"):
+    with pytest.raises(
+        ValueError, match="sequence 08: expected a recording that is read from its files, found a packed"
+    ):
         packed(corrupted(recording, CORRUPTIONS[-1], seed=0), tmp_path)
-    with pytest.raises(ValueError, match="found one that is packed"):
+    with pytest.raises(ValueError, match="found a packed, corrupted or simulated one"):
         packed(packed(recording, tmp_path), tmp_path)

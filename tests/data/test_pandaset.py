@@ -94,7 +94,7 @@ def test_no_pickle_is_opened(root, monkeypatch, tmp_path):
     ):
         open_recording(root)
     np.save(root / "001" / "lidar" / "00.npy", np.array([Bomb()]), allow_pickle=True)
-    with pytest.raises(ValueError, match=r"00\.npy: expected an array of numpy's, found none"):
+    with pytest.raises(ValueError, match=r"00\.npy: expected a numpy array, found none"):
         open_recording(root, sensor_height=1.8).points(0)
     assert not Path("exploded").exists()
 

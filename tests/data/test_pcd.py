@@ -83,7 +83,7 @@ def test_a_file_without_a_header_is_named(tmp_path):
     path.write_bytes(CLOUD.tobytes())
     with pytest.raises(ValueError, match=r"a\.pcd: .*expected a header"):
         read_pcd(path)
-    with pytest.raises(FileNotFoundError, match=r"b\.pcd: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"b\.pcd: expected a \.pcd file, found none"):
         read_pcd(tmp_path / "b.pcd")
 
 
@@ -120,12 +120,12 @@ def test_binary_compressed_with_several_numbers_a_field(tmp_path):
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        (b"\x01", "expected two sizes in front of the points, found 1 bytes"),
+        (b"\x01", "expected two sizes before the points, found 1 bytes"),
         (compressed(CLOUD.tobytes(), size=64), "expected 3 points of 16 bytes in 50 bytes, found 64 in 50"),
         (compressed(CLOUD.tobytes())[:-4], "expected 3 points of 16 bytes in 50 bytes, found 48 in 46"),
-        (compressed(CLOUD.tobytes())[:8] + b"\xff" * 50, "expected LZF, found a copy from before the beginning"),
+        (compressed(CLOUD.tobytes())[:8] + b"\xff" * 50, "expected LZF, found a reference to before the start"),
     ],
 )
 def test_a_broken_compressed_file_is_named(tmp_path, body, message):
-    with pytest.raises(ValueError, match=rf"a\.pcd: expected a \.pcd file that can be read, found: {message}"):
+    with pytest.raises(ValueError, match=rf"a\.pcd: expected a readable \.pcd file, found an invalid one: {message}"):
         read_pcd(write(tmp_path / "a.pcd", body, data="binary_compressed"))

@@ -77,7 +77,7 @@ def test_carriage_returns(tmp_path):
 def test_what_is_no_ply_is_named(tmp_path, change, message):
     path = write(tmp_path / "a.ply")
     path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(ValueError, match=rf"a\.ply: not a readable \.ply file: .*{message}"):
+    with pytest.raises(ValueError, match=rf"a\.ply: expected a readable \.ply file, found an invalid one: .*{message}"):
         read_ply(path)
 
 
@@ -90,7 +90,7 @@ def test_a_cut_off_binary_and_a_list_among_the_coordinates(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"property float32 i", b"property list uchar int i"))
     with pytest.raises(ValueError, match=r"expected numbers for intensity of vertex, found a list"):
         read_ply(path)
-    with pytest.raises(FileNotFoundError, match=r"c\.ply: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"c\.ply: expected a \.ply file, found none"):
         read_ply(tmp_path / "c.ply")
 
 

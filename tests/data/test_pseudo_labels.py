@@ -30,7 +30,7 @@ def test_drives_with_labels_of_their_own_keep_them(bev_root, kitti_root, tmp_pat
         write_map(tmp_path / f"maps/{name}/000000.png", 50)
     recordings = [open_recording(bev_root, "06"), open_recording(kitti_root, "08")]
     with pytest.raises(
-        FileNotFoundError, match=r"maps: expected label images NN/<id>\.png .* \(of which there are none\)"
+        FileNotFoundError, match=r"maps: expected label images NN/<id>\.png .* \(the data has no image .*\)"
     ):
         with_pseudo_labels(recordings, tmp_path / "maps")
 

@@ -124,14 +124,16 @@ def test_a_file_that_fails_while_it_is_read_does_not_hide_it(tmp_path, monkeypat
         (np.full((2880, 3), 1e30), "100% of the points beyond 300 m"),
         (np.full((2880, 3), np.nan), "all points NaN or 0"),
         (np.zeros((2880, 3)), "all points NaN or 0"),
-        (np.full((2880, 3), 4.0), "all points have one x"),
+        (np.full((2880, 3), 4.0), "all points with the same x"),
     ],
     ids=["millimetres", "1e30", "NaN", "zeros", "one point"],
 )
 def test_what_fits_nothing_is_refused_with_what_was_tried(tmp_path, points, why):
     for i in range(3):
         columns(points, "0").astype("<f4").tofile(tmp_path / f"{i}.bin")
-    with pytest.raises(ValueError, match=r"expected scans of which one reading fits, found 0; say --format") as error:
+    with pytest.raises(
+        ValueError, match=r"expected scans that fit exactly one format, found 0; pass --format"
+    ) as error:
         open_recording(tmp_path)
     assert why in str(error.value) and "kitti (16 bytes a point)" in str(error.value) and "\n" not in str(error.value)
 
@@ -139,14 +141,14 @@ def test_what_fits_nothing_is_refused_with_what_was_tried(tmp_path, points, why)
 def test_random_bytes_are_refused(tmp_path):
     for i in range(3):
         (tmp_path / f"{i}.bin").write_bytes(np.random.default_rng(i).bytes(48000))
-    with pytest.raises(ValueError, match="found 0; say --format"):
+    with pytest.raises(ValueError, match="found 0; pass --format"):
         open_recording(tmp_path)
 
 
 def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
     noise = np.random.default_rng(0).normal(scale=10, size=(4000, 4)).astype("<f4")  # all columns alike
     noise.tofile(tmp_path / "0.bin")
-    with pytest.raises(ValueError, match=r"found 2; say --format kitti or float32x5, .*float32x8.*: fits"):
+    with pytest.raises(ValueError, match=r"found 2; pass --format kitti or float32x5, .*float32x8.*: fits"):
         open_recording(tmp_path)
     np.testing.assert_array_equal(open_recording(tmp_path, format="float32x4").points(0), noise[:, :3])
     assert open_recording(tmp_path, format="float32x5").points(0).shape == (3200, 3)
@@ -155,7 +157,7 @@ def test_what_fits_twice_is_refused_and_may_be_said(tmp_path):
 def test_a_wrong_format_that_was_said_is_told(tmp_path):
     for i in range(2):
         columns(scan(i), "irt").astype("<f4").tofile(tmp_path / f"{i}.bin")
-    with pytest.warns(DataWarning, match=r"expected scans of kitti \(16 bytes a point\), found that each .th point"):
+    with pytest.warns(DataWarning, match=r"expected scans of kitti \(16 bytes a point\), found every .th point"):
         open_recording(tmp_path, format="kitti")
 
 
@@ -177,7 +179,7 @@ def test_own_scans_in_the_layout_of_kitti(kitti_root):
         said = "" if layout == "kitti" else ", not KITTI's"
         assert recording.found == (f"format: {layout} ({size} bytes a point){said}",)
         np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
-    assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as said",)
+    assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as given",)
 
 
 def test_the_share_that_differs_from_turn_to_turn():

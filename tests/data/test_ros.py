@@ -203,7 +203,7 @@ def test_a_topic_without_messages(tmp_path, kind):
 @pytest.mark.parametrize("content", [b"", b"no bag at all", b"#ROSBAG V2.0\n" + bytes(90)])
 def test_broken_bags_are_named(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rf"{name}: expected a whole recording of ROS, found a broken one"):
+    with pytest.raises(ValueError, match=rf"{name}: expected an intact ROS bag, found a broken one"):
         recording_names(tmp_path / name)
 
 

@@ -79,7 +79,7 @@ def test_an_empty_or_cut_off_scan_names_file_sizes_and_formats(tmp_path, format,
 
 
 def test_a_missing_scan_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"000009\.bin: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"000009\.bin: expected a scan, found none"):
         read_scan(tmp_path / "000009.bin")
 
 

@@ -115,7 +115,7 @@ def test_poses_of_other_times_are_interpolated_or_name_the_scans_without(tmp_pat
     (folder / "times.txt").write_text("1.5\n2\n2.5\n")
     np.testing.assert_array_equal(open_recording(folder).positions[:, 0], [1, 2.5, 4])
     (folder / "times.txt").write_text("1.5\n2\n9\n")
-    message = r"poses\.tum: expected poses about the times of all 3 scans, found none for 1, the first at 9\.0 s"
+    message = r"poses\.tum: expected poses at the times of all 3 scans, found none for 1, the first at 9\.0 s"
     with pytest.raises(ValueError, match=message):
         open_recording(folder)
     (folder / "times.txt").unlink()
@@ -140,7 +140,7 @@ def test_poses_that_do_not_fit_are_refused(tmp_path):
     images = tmp_path / "06"
     (images / "imgs").mkdir(parents=True)
     with pytest.raises(
-        ValueError, match=r"a\.txt: expected poses named for a plain folder of scans, found .*BEV images"
+        ValueError, match=r"a\.txt: expected poses or times for a plain folder of scans, found .*BEV images"
     ):
         readers.open_recording(tmp_path, "06", poses="a.txt")
 
@@ -175,7 +175,7 @@ def test_what_is_left_aside_is_said(tmp_path):
     found = open_recording(folder).found
     assert found == ("format: pcd", "left aside: 1 .bak, 1 .jpg, 1 .xyz, 1 folder (more)")
     assert open_recording(write_scans(tmp_path / "mixed", "0.pcd", "1.bin")).found == (
-        "format: 1 pcd, 1 kitti (16 bytes a point), too few points to find out",
+        "format: 1 pcd, 1 kitti (16 bytes a point), too few points to detect it",
     )
 
 
@@ -213,7 +213,7 @@ def test_consecutive_poses_far_apart_are_told(tmp_path, recwarn):
     open_recording(folder)
     assert not recwarn.list
     write_poses(folder / "poses.txt", way[np.random.default_rng(0).permutation(30)])
-    with pytest.warns(DataWarning, match=r"poses\.txt: expected scans near the ones before them, found full\d+ and"):
+    with pytest.warns(DataWarning, match=r"poses\.txt: expected consecutive scans near each other, found full\d+ and"):
         open_recording(folder)
     way[20:] += 300
     write_poses(folder / "poses.txt", way)

@@ -75,7 +75,7 @@ def test_what_is_no_rotation_is_refused(write, row, format):
 def test_a_file_of_times_replaces_those_of_the_poses(write):
     path, times = write("a.csv", "x,y,z,t\n1,2,3,0\n4,5,6,1\n"), write("times.txt", "7\n9\n")
     np.testing.assert_array_equal(read_trajectory(path, times=times).times, [7, 9])
-    with pytest.raises(ValueError, match=r"short\.txt: expected 2 times, as many as poses, found 1"):
+    with pytest.raises(ValueError, match=r"short\.txt: expected 2 times, one per pose, found 1"):
         read_trajectory(path, times=write("short.txt", "7\n"))
 
 

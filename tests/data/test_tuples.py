@@ -224,7 +224,7 @@ def test_where_only_some_places_are_described_the_anchors_and_negatives_are_amon
 
 
 def test_mining_without_anything_to_choose_is_refused():
-    with pytest.raises(ValueError, match=r"sampling\.negatives or sampling\.cluster"):
+    with pytest.raises(ValueError, match=r"sampling\.negatives above 0 or sampling\.cluster"):
         TupleConfig(negatives=0, mining="hardest")
     with pytest.raises(ValueError, match=r"refresh_steps of 1 or more, found 10 and 0"):
         TupleConfig(mining="hardest", refresh_steps=0)

@@ -30,7 +30,7 @@ def test_the_same_frames_agree_whatever_describes_them(file):
             {"positions": np.zeros((3, 3))},
             r"positions of the first file, \[6.0, 7.0, 8.0\] in row 2, found \[0.0, 0.0, 0.0\]",
         ),
-        ({"times": None}, "times of the first file, times, found none"),
+        ({"times": None}, "expected times in both files or in neither, found times in the first and none in this one"),
         ({"times": np.array([0.0, 1.0, 2.5])}, "times of the first file, 2.0 in row 2, found 2.5"),
     ],
 )
@@ -49,5 +49,5 @@ def test_a_scan_that_one_method_skipped_is_named(make_file, file):
     with pytest.raises(ValueError, match="3 with '000000', found 2 with '000001'"):
         check_agreement(file, fewer)
     shorter = TopK("town", file.positions[:2], None, None, np.arange(1), np.zeros((1, 1), int))
-    with pytest.raises(ValueError, match="expected 3 positions, as the first file has, found 2"):
+    with pytest.raises(ValueError, match="expected 3 positions, as in the first file, found 2"):
         check_agreement(file, shorter)

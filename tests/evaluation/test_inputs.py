@@ -105,7 +105,9 @@ def test_methods_beside_an_own_file_take_its_positions_and_times(tmp_path, make_
         np.testing.assert_array_equal(found[name].times, found["own"].times)
         assert found[name].pose_source == "made up"
     np.save(tmp_path / "mine.npy", two_laps[:700])
-    with pytest.raises(ValueError, match=r"mine\.npy: expected 800 descriptors, as many as made up has.*, found 700"):
+    with pytest.raises(
+        ValueError, match=r"mine\.npy: expected 800 descriptors, one for each pose of made up.*, found 700"
+    ):
         read_methods([tmp_path / name for name in ("own.npz", "mine.npy")])
 
 
@@ -151,16 +153,16 @@ NAN[17, 2] = np.nan
 @pytest.mark.parametrize(
     ("name", "content", "error"),
     [
-        ("few.npy", np.ones((700, 4)), "expected 800 descriptors, as many as laps.csv .csv. has poses, found 700"),
-        ("nan.npy", NAN, "expected finite descriptors, found others in 1 rows, the first in row 17"),
+        ("few.npy", np.ones((700, 4)), "expected 800 descriptors, one for each pose of laps.csv .csv., found 700"),
+        ("nan.npy", NAN, "expected finite descriptors, found NaN or infinity in 1 rows, first in row 17"),
         ("large.npy", np.full((800, 4), 1e300), "expected finite descriptors"),
         ("flat.npy", np.ones(800), r"expected descriptors \(n, d\) as numbers, found float64 \(800,\)"),
         ("cube.npy", np.ones((800, 2, 2)), r"found float64 \(800, 2, 2\)"),
         ("none.npy", np.ones((0, 4)), r"found float64 \(0, 4\)"),
         ("words.npy", np.full((800, 2), "x"), r"found <U1 \(800, 2\)"),
-        ("pickle.npy", np.full((800, 2), None), "found no such .npy .*allow_pickle=False"),
-        ("empty.npy", b"", "found no such .npy"),
-        ("text.npy", b"1 2 3\n", "found no such .npy"),
+        ("pickle.npy", np.full((800, 2), None), "found no valid .npy file .*allow_pickle=False"),
+        ("empty.npy", b"", "found no valid .npy file"),
+        ("text.npy", b"1 2 3\n", "found no valid .npy file"),
         ("empty.txt", "", "expected lines `i j score .label.` or `query: frame frame ...`, found none"),
         ("pairs.txt", "5 0 .5\n5 800 .5\n", r"line 2: expected frames from 0 to 799 \(laps.csv .csv.\), found 800"),
         ("pairs.txt", "5 -1 .5\n", "line 1: expected a frame number, found '-1'"),

@@ -29,7 +29,7 @@ def found(tmp_path) -> FoundLoops:
 
 def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_path):
     page = Parsed(write_loops_page(found, tmp_path).read_text())
-    assert [headline for headline, _ in page.images] == ["Where", "Where", "Pairs"]
+    assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs"]
     assert all(address.startswith("data:") for address in page.addresses)
     table = page.texts["Loops"]
     assert "0.9950" in table and "000005" in table and "17.2" in table
@@ -41,7 +41,7 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert loops_page(none).count("No loops.") == 2
     assert "lasts 7 s: pairs less than 30 s apart" in Parsed(loops_page(none)).texts["Why no loops"]
     assert "Why no loops" not in Parsed(loops_page(found)).texts
-    assert "No scan was looked at." in loops_page(dataclasses.replace(none, frames=0))
+    assert "No scan was processed." in loops_page(dataclasses.replace(none, frames=0))
 
 
 def test_rejected_pairs_are_counted_by_reason(found):
@@ -51,23 +51,23 @@ def test_rejected_pairs_are_counted_by_reason(found):
     page = Parsed(loops_page(dataclasses.replace(found, rejected=rejected)))
     said = page.texts["Rejected"]
     assert said.index("repeats") < said.index("little overlap") and "Another place, or another pose" in said
-    assert "Rejected pairs are grey." in page.texts["Where"]
+    assert "Rejected pairs are grey." in page.texts["Trajectory"]
 
 
 def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found, known):
     page = Parsed(loops_page(known))
-    assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Where"]
+    assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Trajectory"]
     table = page.texts["Loops"]
     assert "true distance [m]" in table and "94.0" in table
     assert table.index("000007") < table.index("000005") < table.index("000006")
     unknown = Parsed(loops_page(found)).texts
-    assert "wrong (red)" not in unknown["Where"] and "true distance" not in unknown["Loops"]
+    assert "wrong (red)" not in unknown["Trajectory"] and "true distance" not in unknown["Loops"]
 
 
 def test_stopped_before_the_first_scan_there_is_nothing_corrected(found):
     none = dataclasses.replace(found, loops=(), frames=0)
     page = Parsed(loops_page(none, optimized=OptimizedTrajectory(np.zeros((0, 4, 4)), np.zeros(0, bool))))
-    assert "Corrected" not in page.texts and "No scan was looked at." in page.texts["Where"]
+    assert "Corrected" not in page.texts and "No scan was processed." in page.texts["Trajectory"]
 
 
 @pytest.fixture
@@ -84,13 +84,13 @@ def known(found) -> FoundLoops:
 
 def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known, monkeypatch):
     page = Parsed(loops_page(known))
-    assert [headline for headline, _ in page.images] == ["Where", "Where", "Pairs", "Sure of it?"]
-    said = page.texts["Sure of it?"]
+    assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs", "Reliability"]
+    said = page.texts["Reliability"]
     assert "0.99 to 1" in said and "1.000" in said and "0 to 0.01" in said and "by poses.txt" in said
-    assert "not known" in Parsed(loops_page(found)).texts["Sure of it?"]
-    assert "No pair was looked at." in loops_page(dataclasses.replace(known, candidates=()))
+    assert "not known" in Parsed(loops_page(found)).texts["Reliability"]
+    assert "No pair was compared." in loops_page(dataclasses.replace(known, candidates=()))
     monkeypatch.setattr(figures, "can_draw", lambda: False)
-    assert "0.99 to 1" in Parsed(loops_page(known)).texts["Sure of it?"]
+    assert "0.99 to 1" in Parsed(loops_page(known)).texts["Reliability"]
 
 
 def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):

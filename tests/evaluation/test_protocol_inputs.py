@@ -138,7 +138,7 @@ def test_a_list_must_fit(listed, change, error):
 def test_nan_descriptors_are_refused(make_file, two_laps):
     descriptors = np.ones((800, 4))
     descriptors[17, 2] = np.nan
-    with pytest.raises(ValueError, match="expected finite descriptors, found others in 1 rows, the first in row 17"):
+    with pytest.raises(ValueError, match="expected finite descriptors, found NaN or infinity in 1 rows, first in row"):
         make_file(two_laps, descriptors)
 
 

@@ -42,7 +42,7 @@ def pairs(*correlations: float) -> tuple[Candidate, ...]:
         (300, None, "300 frames without times: pairs less than 290 frames apart .* Only 9 of 300 frames"),
         (100, np.arange(100) / 10, "The recording lasts 9.9 s: pairs less than 30 s apart are not considered.$"),
         (400, np.arange(400) / 10, "The recording lasts 39.9 s: .* Only 100 of 400 frames"),
-        (100, np.full(100, 7.5), "The times stand still: all 100 frames have the time 7.5 s"),
+        (100, np.full(100, 7.5), "The times do not advance: all 100 frames have the time 7.5 s; give --times."),
         (100, np.minimum(np.arange(100.0), 20), r"lasts 20 s \(79 of 99 times do not advance\): pairs less"),
         (100, np.arange(100) / 1e4, "lasts 0.0099 s: .* Times are expected in seconds."),
     ],
@@ -59,7 +59,7 @@ def test_long_recordings_have_other_reasons():
     assert why_few_queries(found.recording, found.config.candidates) is None
     assert "moved less than 10 m" in why_none(found)[0]
     odometry = dataclasses.replace(found, odometry=np.tile(np.eye(4), (700, 1, 1)))
-    assert "no earlier frame is near by the odometry, with 4 sigmas" in why_none(odometry)[0]
+    assert "according to the odometry, no earlier frame is near enough (within 4 sigmas" in why_none(odometry)[0]
     (said,) = why_none(dataclasses.replace(found, candidates=pairs(-3.0, -4.0), model=MODEL))
     assert said == "2 pairs were compared, and none is similar enough: the highest probability is 0.0474."
     assert why_none(dataclasses.replace(found, candidates=pairs(-3.0)))[0].endswith("none is similar enough.")
@@ -69,7 +69,7 @@ def test_long_recordings_have_other_reasons():
 
 def test_empty_unreadable_and_unseen_scans_are_reasons():
     found = found_in(700, np.arange(700) / 10)
-    assert "690 of 700 scans show next to nothing (fewer than 20" in why_none(dataclasses.replace(found, empty=690))[0]
+    assert "690 of 700 scans are almost empty (fewer than 20" in why_none(dataclasses.replace(found, empty=690))[0]
     skipped = tuple(map(str, range(400)))
     assert why_none(dataclasses.replace(found, skipped=skipped)) == ["400 of 700 scans cannot be read."]
     assert why_none(dataclasses.replace(found, frames=0)) == ["The search was stopped before the first scan."]

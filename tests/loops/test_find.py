@@ -80,9 +80,7 @@ def test_odometry_in_the_lidars_axes_agrees_with_the_loops_drifting_as_it_may(fo
 
 def test_odometry_in_other_axes_is_told(found, there_and_back):
     forward_is_y = there_and_back @ transform(0.0, 0.0, np.pi / 2)
-    words = (
-        r"08: the odometry contradicts the loops of \d\d of \d\d frames; .* in other axes, check the file: x forward"
-    )
+    words = r"08: the odometry contradicts the loops of \d\d of \d\d frames; .* use these axes: x forward"
     with pytest.warns(DataWarning, match=words):
         assert len(found(forward_is_y).loops) < N / 2
 
@@ -91,7 +89,7 @@ def test_odometry_in_the_cameras_axes_is_told_by_its_way_too(there_and_back):
     check_level(there_and_back, None, name="08")
     camera = CAMERA_FROM_LIDAR @ there_and_back @ CAMERA_FROM_LIDAR.T
     check_level(camera[:5], None, name="08")
-    words = r"08: expected poses of a LiDAR that goes along the ground .*, found \d+ of \d+ m of way up or down"
+    words = r"08: expected poses of a LiDAR that moves along the ground .*, found \d+ of \d+ m of path up or down"
     with pytest.warns(DataWarning, match=words):
         check_level(camera, None, name="08")
     forward = Mounting(1.0, (1.0, 0.0, 0.0))

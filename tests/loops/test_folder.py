@@ -42,9 +42,11 @@ def test_other_trajectories_stay_which_is_told(found, tmp_path):
     out = tmp_path / "out"
     written = {path.name: path.read_bytes() for path in write_found(found, out, optimized=found.odometry[:5])}
     assert len(written) == 8
-    with pytest.warns(DataWarning, match=r"out: trajectory-optimized.tum, trajectory-optimized.kitti lay there before"):
+    with pytest.warns(
+        DataWarning, match=r"out: trajectory-optimized.tum, trajectory-optimized.kitti are from an earlier run"
+    ):
         assert len(write_found(found, out)) == 6
-    with pytest.warns(DataWarning, match=r"out: trajectory.tum, .* lay there before"):
+    with pytest.warns(DataWarning, match=r"out: trajectory.tum, .* are from an earlier run"):
         assert len(write_found(dataclasses.replace(found, odometry=None), out)) == 4
     for name in written.keys() - {"loops.g2o"}:
         assert (out / name).read_bytes() == written[name]

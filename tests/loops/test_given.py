@@ -52,18 +52,18 @@ def test_lists_are_taken_for_arrays():
     ("call", "kind", "message"),
     [
         (lambda: given_poses("odometry.tum", of="odometry"), TypeError, r"odometry \(n, 4, 4\), found the path odo"),
-        (lambda: given_poses(Path("a.tum"), of="poses"), TypeError, "path a.tum: sglpr_jax.read_odometry reads it"),
+        (lambda: given_poses(Path("a.tum"), of="poses"), TypeError, "path a.tum; read it with sglpr_jax.read_odometry"),
         (lambda: given_poses({"a": 1}, of="poses"), TypeError, r"poses \(n, 4, 4\), found a dict"),
         (lambda: given_poses([np.eye(4), np.eye(3)], of="poses"), TypeError, "found a list"),
         (lambda: given_poses(np.zeros((5, 3)), of="odometry"), ValueError, r"odometry .*, found .* shape \(5, 3\)"),
         (lambda: given_poses(FLAT, of="odometry"), ValueError, r"with rotations, found \[\[0\.0.* in row 0"),
         (lambda: given_pose(np.eye(3)), ValueError, "odometry as a 4 x 4 pose with a rotation, found"),
-        (lambda: given_record("000000.bin"), TypeError, "found the path 000000.bin: sglpr_jax.read_scan reads it"),
+        (lambda: given_record("000000.bin"), TypeError, "found the path 000000.bin; read it with sglpr_jax.read_scan"),
         (lambda: given_record([[1, 2, 3], [4]]), TypeError, r"points \(n, 3\) or an image \(h, w\), found a list"),
         (lambda: given_record(np.zeros((3, 3, 3))), ValueError, r"found an array of shape \(3, 3, 3\)"),
         (lambda: given_time("now"), TypeError, "expected a time in seconds, found 'now'"),
         (lambda: given_time(np.nan), ValueError, "expected a time in seconds, found nan"),
-        (lambda: check_is("a", Params, by="load"), TypeError, "a Params, which sglpr_jax.load gives, found 'a'"),
+        (lambda: check_is("a", Params, by="load"), TypeError, "a Params, found 'a'; sglpr_jax.load returns one"),
         (lambda: check_is([], Params, by="load"), TypeError, "found a list"),
     ],
 )  # fmt: skip
@@ -80,7 +80,7 @@ def test_the_functions_ask_so(recording, params):
         PlaceMap.of(recording, params, np.zeros((2, 3)))
     with pytest.raises(ValueError, match="08: expected a pose for each of 2 scans, found 1"):
         PlaceMap.of(recording, params, POSES[:1])
-    with pytest.raises(TypeError, match=r"found the path 0\.bin: sglpr_jax\.read_scan reads it"):
+    with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
         LoopDetector(params).add("0.bin")
     with pytest.raises(ValueError, match=r"expected a density image, floats from 0 to 10, found floats from 0 to 255"):
         LoopDetector(params).add(255.0 * np.eye(151))
@@ -90,7 +90,7 @@ def test_the_functions_ask_so(recording, params):
 def test_what_is_no_recording_is_named(function, params):
     """The tests check all types beforehand; `unwrap` gives what users call."""
     given = {"poses": POSES} if function is map_recording else {}
-    with pytest.raises(TypeError, match=r"expected a Recording, which sglpr_jax\.open_recording gives, found 'KITTI'"):
+    with pytest.raises(TypeError, match=r"expected a Recording, found 'KITTI'; sglpr_jax\.open_recording returns one"):
         inspect.unwrap(function)("KITTI", params, **given)
 
 
@@ -102,7 +102,7 @@ def test_points_are_looked_for_in_a_map_as_those_of_its_sensor(params, monkeypat
     monkeypatch.setattr(CandidateFinder, "seen", lambda self, record: seen.append(record) or EMPTY)
     assert places.relocate(params, [[5, 3, 1]]) == [] and places.relocate(params, np.zeros((9, 9))) == []
     assert seen[0].mounting == Mounting(2.5) and seen[1].image is not None
-    with pytest.raises(TypeError, match=r"found the path 0\.bin: sglpr_jax\.read_scan reads it"):
+    with pytest.raises(TypeError, match=r"found the path 0\.bin; read it with sglpr_jax\.read_scan"):
         places.relocate(params, "0.bin")
 
 
@@ -111,5 +111,5 @@ def test_loops_and_maps_warn_of_poses_in_the_cameras_axes(params):
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(20)})
     camera = CAMERA_FROM_LIDAR @ way @ CAMERA_FROM_LIDAR.T
     for given, function in (({"odometry": camera}, find_loops), ({"poses": camera}, map_recording)):
-        with pytest.warns(DataWarning, match="found 38 of 38 m of way up or down: are they in the axes of a camera"):
+        with pytest.warns(DataWarning, match="found 38 of 38 m of path up or down; are they in camera axes"):
             function(recording, params, **given, should_stop=lambda: True)

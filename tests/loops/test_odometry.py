@@ -44,7 +44,7 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
         "no pose",
     )
     late = dataclasses.replace(recording, times=times + 3)
-    message = r"odometry\.tum: expected 6 poses, one for each scan of 08.* 2\.5 to 9\.0 s, found 5 of 0\.0 to"
+    message = r"odometry\.tum: expected 6 poses, one for each scan of 08.* 2\.5 to 9\.0 s, found 5 from 0\.0 to"
     with pytest.raises(ValueError, match=message):
         at_scans(late, poses, path, format="tum")
 
@@ -67,10 +67,12 @@ def test_as_many_poses_of_another_clock_are_told_and_of_other_steps_refused(tmp_
     write_tum(path, poses, 1.6e9 + np.arange(5.0))
     found, given = at_scans(recording, poses, path, format="auto")
     assert given is poses and len(found) == 5
-    said = "row by row: their steps are those of the scans, -1600000000.0 s later"
+    said = "row by row: the scans have the same intervals and start -1600000000.0 s later"
     assert found.found == (f"odometry: 5 poses of odometry.tum, {said}",)
     write_tum(path, poses, 1.6e9 + 1.1 * np.arange(5.0))
-    message = r"odometry\.tum: expected 5 poses.*0\.0 to 4\.0 s, found 5 of 1600000000\.0 to .*write 12 numbers a line"
+    message = (
+        r"odometry\.tum: expected 5 poses.*0\.0 to 4\.0 s, found 5 from 1600000000\.0 to .*write 12 numbers a line"
+    )
     with pytest.raises(ValueError, match=message):
         at_scans(recording, poses, path, format="auto")
 
@@ -81,7 +83,7 @@ def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):
     write_kitti(tmp_path / "kitti.txt", poses)
     found, given = at_scans(recording, poses, tmp_path / "odometry.tum", format="auto")
     np.testing.assert_array_equal(found.times, 1.6e9 + np.arange(5.0))
-    assert given is poses and found.found[-1] == "times: those of odometry.tum"
+    assert given is poses and found.found[-1] == "times: from odometry.tum"
     assert at_scans(recording, poses, tmp_path / "kitti.txt", format="kitti")[0] is recording
 
 
@@ -104,7 +106,7 @@ def test_as_many_other_poses_without_times_name_their_file_and_the_recording(tmp
         ("", "auto", "found an empty file"),
         ("1 2 3\n", "auto", "found 3 numbers a line"),
         ("\n0 0 0 0 0 0 0 1\n", "auto", "line 1: expected 8 numbers, found 0"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "auto", "12 numbers a line and their axes named, kitti"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "auto", "found 12 numbers a line; for 12 numbers a line, name the axes"),
         ("2 0 0 0 0 2 0 0 0 0 2 0\n", "lidar", "expected a rotation and a translation in row 1"),
         ("", "kitti", "expected at least one pose, found none"),
         ("VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1\n", "g2o", "expected vertices 0, 1, 2"),

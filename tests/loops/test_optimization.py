@@ -82,7 +82,7 @@ def test_of_a_recording_the_frames_that_were_looked_at(odometry, loops, tmp_path
     corrected = optimize_trajectory(found)
     assert corrected.poses.shape == (90, 4, 4)
     np.testing.assert_array_equal(corrected.poses, optimized(odometry[:90], early).poses)
-    with pytest.raises(ValueError, match="08: expected loops found with odometry to correct, found none"):
+    with pytest.raises(ValueError, match="08: expected loops found with odometry, found loops without it"):
         optimize_trajectory(FoundLoops(of_images(images), 90, early, (), None))
     none = optimize_trajectory(FoundLoops(of_images(images), 90, (), (), odometry))
     np.testing.assert_array_equal(none.poses, odometry[:90])

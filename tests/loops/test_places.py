@@ -147,12 +147,12 @@ def test_a_map_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(first,
     places.save(tmp_path / "whole.safetensors")
     assert (tmp_path / "stopped.safetensors").read_bytes() == (tmp_path / "whole.safetensors").read_bytes()
 
-    with pytest.warns(DataWarning, match="the same settings has kept, found another spacing_m"):
+    with pytest.warns(DataWarning, match="the same settings, found another spacing_m"):
         other = map_recording(read, params, poses, spacing_m=30.0, kept_in=tmp_path / "kept")
     assert 1 < len(other.places) < MAPPED // 2
     moved = poses.copy()
     moved[:, 0, 3] += 1
-    with pytest.warns(DataWarning, match="the same settings has kept, found another poses"):
+    with pytest.warns(DataWarning, match="the same settings, found another poses"):
         map_recording(read, params, moved, spacing_m=30.0, kept_in=tmp_path / "kept", should_stop=lambda: True)
 
 
@@ -187,7 +187,7 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
         PlaceMap.of(recording, params, poses[:3])
     assert places.relocate(params, Record(points=np.zeros((3, 3), np.float32))) == []
     empty = with_points(recording, lambda path: np.full((1, 3), 5, np.float32))
-    with pytest.raises(ValueError, match="08: expected scans that show something, found 30 empty ones"):
+    with pytest.raises(ValueError, match="08: expected at least one scan that is not empty, found 30 empty ones"):
         PlaceMap.of(dataclasses.replace(empty, label_paths=()), params, poses)
     at_origin = with_points(recording, lambda path: np.zeros((3, 3), np.float32))
     with pytest.raises(ValueError, match=r"scan 000000 of sequence 08: expected points around the sensor"):

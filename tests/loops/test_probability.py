@@ -120,7 +120,7 @@ def test_recalibration_mends_probabilities_on_another_sensor():
 )
 def test_one_kind_alone_cannot_be_fitted(use):
     evidence, is_loop = pairs(20)
-    with pytest.raises(ValueError, match="expected loops and others to fit to, found 0 loops of 20"):
+    with pytest.raises(ValueError, match="expected loops and other pairs to fit, found 0 loops of 20"):
         use(evidence, is_loop & False)
 
 

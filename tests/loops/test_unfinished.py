@@ -105,7 +105,7 @@ def test_what_is_damaged_is_seen_again_and_what_others_made_is_thrown_away(twice
     for change in ({"odometry": odometry + 0.0, "words": ""}, {"odometry": None, "words": "odometry"}):
         done, words = [], change.pop("words")
         if words:
-            with pytest.warns(DataWarning, match=f"the same settings has kept, found another {words}"):
+            with pytest.warns(DataWarning, match=f"the same settings, found another {words}"):
                 find_loops(recording, params, **change, **options, on_progress=done.append)
         else:
             find_loops(recording, params, **change, **options, on_progress=done.append)
@@ -145,7 +145,7 @@ def test_scans_that_cannot_be_read_are_left_out_and_frames_keep_their_numbers(tw
     with pytest.raises(ValueError, match="expected at least one readable scan, found none"):
         find_loops(bad, params, config=CONFIG, on_bad_scan=lambda scan, error: None)
     for cloud, words in (
-        (np.full((1, 3), 5, np.float32), "08: expected scans that show something, found 24 empty ones"),
+        (np.full((1, 3), 5, np.float32), "08: expected at least one scan that is not empty, found 24 empty ones"),
         (np.full((9, 3), np.nan, np.float32), "scan 000000 of sequence 08: expected finite points, found none among 9"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -181,5 +181,7 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
 def test_a_stream_of_sensors_mounted_otherwise_is_refused(drive, params):
     finder = CandidateFinder(params)
     finder.add(Record(points=drive.points(0)))
-    with pytest.raises(ValueError, match=r"expected one sensor, mounted None, found 2\.50 m above the ground"):
+    with pytest.raises(
+        ValueError, match=r"expected one sensor mounting for all frames, None, found 2\.50 m above the ground"
+    ):
         finder.add(Record(points=drive.points(1), mounting=Mounting(2.5)))

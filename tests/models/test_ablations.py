@@ -163,13 +163,11 @@ def test_describe_costs_less_without_a_backbone(random_params, views):
 def test_labels_must_be_there_exactly_where_they_are_read(views, call):
     images, labels = views
     reads = Params({}, with_head(CONFIG, input="labels"))
-    with pytest.raises(
-        ValueError, match=r"from labels: expected maps of classes of shape \(4, 32, 32\), .* found none"
-    ):
+    with pytest.raises(ValueError, match=r"reads labels: expected class maps of shape \(4, 32, 32\), .* found none"):
         call(reads, images)
     with pytest.raises(ValueError, match=r"found shape \(2, 32, 32\)"):
         call(reads, images, labels[:2])
-    with pytest.raises(ValueError, match="from features: expected no labels, found shape"):
+    with pytest.raises(ValueError, match="reads features: expected no labels, found shape"):
         call(Params({}, CONFIG), images, labels)
 
 

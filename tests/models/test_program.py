@@ -100,7 +100,7 @@ def test_the_input_of_densities_is_made_as_it_is_said():
 
 def test_a_model_that_reads_labels_is_refused(random_params, tmp_path):
     config = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, input="labels"))
-    with pytest.raises(ValueError, match="reads images alone, found one that reads labels"):
+    with pytest.raises(ValueError, match="reads images only, found one that reads labels"):
         save_program(random_params(config), tmp_path / "out", format="stablehlo")
     assert not list(tmp_path.iterdir())
 

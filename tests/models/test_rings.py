@@ -118,11 +118,11 @@ def test_the_spectrum_reads_every_radius(random_variables):
 
 
 def test_what_does_not_fit_is_an_error():
-    with pytest.raises(ValueError, match="as many strides and means as widths"):
+    with pytest.raises(ValueError, match="equal numbers of widths, strides and means"):
         RingConfig(widths=(4, 8))
-    with pytest.raises(ValueError, match="no more than the widths"):
+    with pytest.raises(ValueError, match="at most one value for each width"):
         RingConfig(widths=(4,), strides=(1,), means=(1,), fine=(3, 3))
-    with pytest.raises(ValueError, match="'rings' sees a polar image"):
+    with pytest.raises(ValueError, match="'rings' requires a polar image"):
         ModelConfig(backbone=RINGS)
     with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
         dataclasses.replace(CONFIG, polar=(20, 32))

@@ -118,7 +118,7 @@ def test_the_preset_is_of_the_size_that_ships_and_its_mlps_double_the_channels()
 def test_what_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match="polar"):
         ModelConfig(backbone=BACKBONE)
-    with pytest.raises(ValueError, match="a head that goes around needs a polar image"):
+    with pytest.raises(ValueError, match=r"head\.means requires a polar image"):
         ModelConfig(head=HeadConfig(means=(1, 1, 1)))
     with pytest.raises(ValueError, match="a number of heads for each"):
         SglprConfig(depths=(2,))

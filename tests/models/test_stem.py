@@ -90,5 +90,7 @@ def test_every_weight_is_trained(params):
 
 
 def test_a_patch_that_the_stem_does_not_divide_is_refused():
-    with pytest.raises(ValueError, match=r"the stem's pixels of 8 cells \(4 widths\), found patch 4"):
+    with pytest.raises(
+        ValueError, match=r"patch: expected a multiple of 8, the pixel of a stem with 4 widths, found 4"
+    ):
         SwinConfig(stem=(8, 8, 8, 8))

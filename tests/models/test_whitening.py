@@ -42,7 +42,7 @@ def test_a_direction_without_spread_stays_finite():
 
 @pytest.mark.parametrize("n", [1, 20])
 def test_equal_descriptors_are_refused(n):
-    with pytest.raises(ValueError, match=f"found {n}, all equal"):
+    with pytest.raises(ValueError, match=f"found {n} equal descriptors"):
         fit_whitening(np.ones((n, 6)))
 
 

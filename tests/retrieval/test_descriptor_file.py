@@ -64,16 +64,19 @@ def test_a_failed_save_leaves_the_older_file_and_nothing_else(tmp_path, file, mo
         ({"descriptors": np.zeros((3, 4))}, r"expected descriptors as float32 .* found float64"),
         (
             {"descriptors": np.array([[0, 1], [np.nan, 0], [0, np.inf]], np.float32)},
-            "expected finite descriptors, found others in 2 rows, the first in row 1",
+            "expected finite descriptors, found NaN or infinity in 2 rows, first in row 1",
         ),
         ({"positions": np.full((3, 3), np.nan)}, "expected finite positions"),
         (
             {"ids": (), "positions": np.zeros((0, 3)), "times": None, "descriptors": np.zeros((0, 4), np.float32)},
             "expected at least one scan",
         ),
-        ({"ids": ("0", "1", "0")}, "expected an id of its own for each scan, found '0' 2 times"),
-        ({"descriptors": np.zeros((3, 0), np.float32)}, r"expected descriptors of at least one number, found \(3, 0\)"),
-        ({"times": np.array([0.0, 2.0, 1.0])}, "expected times in order, found an earlier one in row 2"),
+        ({"ids": ("0", "1", "0")}, "expected a unique id for each scan, found '0' 2 times"),
+        (
+            {"descriptors": np.zeros((3, 0), np.float32)},
+            r"expected descriptors with at least one number, found \(3, 0\)",
+        ),
+        ({"times": np.array([0.0, 2.0, 1.0])}, "expected times in ascending order, found an earlier time in row 2"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(file, change, message):
@@ -82,7 +85,7 @@ def test_what_does_not_fit_together_is_refused(file, change, message):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a descriptor file \(\.npz\), found no such file"):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz: expected a descriptor file \(\.npz\), found no file"):
         DescriptorFile.load(tmp_path / "none.npz")
 
 
@@ -122,7 +125,7 @@ def test_missing_arrays_are_listed(tmp_path):
     [
         ("{}", "expected format 'sglpr-jax descriptors 2', found None"),
         ("[1]", r"expected format 'sglpr-jax descriptors 2', found \[1\]"),
-        ("{", "expected JSON, found none that is whole"),
+        ("{", "expected JSON, found invalid JSON"),
         ('{"format": "sglpr-jax descriptors 1"}', "expected `sequence`, `pose_source`, `config`, `weights_hash`"),
     ],
 )
@@ -160,10 +163,10 @@ def test_a_file_whose_arrays_disagree_is_named(tmp_path, file):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"ids": np.array([["0", "1", "2"]])}, r"expected ids as a row of names, found <U1 \(1, 3\)"),
-        ({"ids": np.array([0.0, np.nan, 2.0])}, r"expected ids as a row of names, found float64 \(3,\)"),
-        ({"ids": np.array(["0", "1", "1"])}, "expected an id of its own for each scan, found '1' 2 times"),
-        ({"descriptors": np.zeros((3, 0), np.float32)}, "expected descriptors of at least one number"),
+        ({"ids": np.array([["0", "1", "2"]])}, r"expected ids as an array \(n,\) of strings, found <U1 \(1, 3\)"),
+        ({"ids": np.array([0.0, np.nan, 2.0])}, r"expected ids as an array \(n,\) of strings, found float64 \(3,\)"),
+        ({"ids": np.array(["0", "1", "1"])}, "expected a unique id for each scan, found '1' 2 times"),
+        ({"descriptors": np.zeros((3, 0), np.float32)}, "expected descriptors with at least one number"),
         ({"about": np.array(["{}", "{}"])}, r"expected JSON in `about`, found an array <U2 \(2,\)"),
     ],
 )
@@ -212,5 +215,5 @@ def test_scans_that_are_left_out_are_remembered_by_their_rows(file):
     last = dataclasses.replace(fewer, positions=None).only(np.array([False, True]))
     assert last.recorded.tolist() == [False, False, True] and last.times.tolist() == [0.2] and last.positions is None
     for skipped in ("3", [1, 1], [5], [-1], [0.5], {"0": 1}):
-        with pytest.raises(ValueError, match="expected the rows that were skipped, found"):
+        with pytest.raises(ValueError, match="expected row numbers of the skipped scans, found"):
             _ = dataclasses.replace(file, config={"skipped": skipped}).recorded

@@ -65,7 +65,7 @@ def test_fewer_than_k_are_filled_and_ties_come_in_order():
 
 def test_a_result_prints_itself():
     text = str(nearest(file_of(np.eye(4)), file_of(np.eye(4)[::-1], sequence="05")))
-    assert text.splitlines()[0] == "4 of 4 queries of 00 in 05 have an answer; the surest:"
+    assert text.splitlines()[0] == "4 of 4 queries of 00 in 05 have a match; the nearest ones:"
     assert text.splitlines()[1] == "000000 -> 000003  0.0000"
 
 

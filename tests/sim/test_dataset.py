@@ -313,7 +313,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
     try:
-        with pytest.raises(OSError, match=r"velodyne/00000\d.bin: expected to write it"):
+        with pytest.raises(OSError, match=r"velodyne/00000\d.bin: cannot be written"):
             write(root)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -324,5 +324,5 @@ def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp
 
 def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"simulation.json: expected to write it"):
+    with pytest.raises(OSError, match=r"simulation.json: cannot be written"):
         write(tmp_path / "file" / "town")

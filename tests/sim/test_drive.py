@@ -202,5 +202,5 @@ def test_a_malformed_pose_file_is_refused(tmp_path, content, times, said):
 
 
 def test_a_missing_pose_file_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"06.txt: no such file; expected 12 numbers a line"):
+    with pytest.raises(FileNotFoundError, match=r"06.txt: expected a file with 12 numbers a line"):
         read_path(tmp_path / "06.txt")

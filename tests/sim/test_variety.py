@@ -94,6 +94,6 @@ def test_images_are_those_of_varied_scans(tmp_path):
 
 
 def test_scans_are_not_varied(tmp_path):
-    with pytest.raises(ValueError, match="expected images with it, found scans"):
+    with pytest.raises(ValueError, match="vary: expected images, found scans"):
         simulate(tmp_path / "scans", routes=["08"], vary=True)
     assert not (tmp_path / "scans").exists()

@@ -208,7 +208,7 @@ def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(con
 
 
 def test_a_segmentation_that_learns_alone_needs_a_loss_of_its_own_and_moves_nothing_else(config):
-    with pytest.raises(ValueError, match="leaves no loss where ce_weight and dice_weight are 0"):
+    with pytest.raises(ValueError, match="leaves no loss: expected ce_weight or dice_weight above 0"):
         LossConfig(segmentation_alone=True, ce_weight=0.0, dice_weight=0.0)
     loss = dataclasses.replace(config.loss, segmentation_alone=True)
     decaying = dataclasses.replace(config.optimizer, weight_decay=0.1)

@@ -1,1 +1,1 @@
-"""Recordings packed into a few large files, to be read faster."""
+"""Packs recordings into a few large files, which are faster to read."""

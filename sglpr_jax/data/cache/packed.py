@@ -1,13 +1,12 @@
-"""Recordings packed into a few large files: training reads scans at random, and a recording is thousands of files.
+"""Packs recordings into a few large files. Training reads scans at random, and a recording has thousands of files.
 
-    DIR/08-5f0c.../pack.json    the files that were packed (path, bytes, time of change), and how the arrays lie
-    DIR/08-5f0c.../points.bin   float32 x, y, z of all scans, one after another
-    DIR/08-5f0c.../labels.bin   uint16 raw ids of all points, where any scan has labels: a SemanticKITTI id has 16 bits
-    DIR/08-5f0c.../images.bin   in place of these two, float32 rows of ready-made images
+- `DIR/08-5f0c.../pack.json`: the packed files (path, size, modification time) and the layout of the arrays.
+- `DIR/08-5f0c.../points.bin`: float32 x, y, z of all scans, one after another.
+- `DIR/08-5f0c.../labels.bin`: uint16 raw ids of all points, if any scan has labels (a SemanticKITTI id has 16 bits).
+- `DIR/08-5f0c.../images.bin`: float32 rows of ready-made images, instead of points and labels.
 
-The folder's name ends in a hash of the list of files and of the options with which they are read. So a pack never
-changes, a recording of which a file has changed is packed anew, and whoever finds a pack can use it, whichever process
-or host made it.
+The folder name ends in a hash of the file list and the read options, so a pack never changes. If a file of the
+recording changes, the recording is packed again. Any process or host can use an existing pack.
 """
 
 import contextlib
@@ -33,17 +32,25 @@ ABOUT_FILE = "pack.json"
 
 
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
-    """The same recording, read from its pack in `folder`, which is made first where there is none.
+    """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
 
-    Points, images and labels are equal to the bit to those of the files, and read-only; lasers, and the labels of
-    images, still come from the files. `recording` is as a reader opened it. `on_progress` is told how many scans are
-    packed. Raises what reading raises; OSError where the pack cannot be written; ValueError where it is damaged,
-    `recording` has no files of its own, or its images differ in width.
+    Points, labels and images are bitwise equal to those of the files. Points and images are read-only. Lasers, and the
+    labels of images, still come from the files.
+
+    Arguments:
+      recording: Recording as opened by a reader.
+      folder: Folder of the packs.
+      on_progress: Called with the number of packed scans.
+
+    Raises:
+      ValueError: If the pack is damaged, `recording` is not read from its own files, or its images differ in width.
+        Other errors are those of reading.
+      OSError: If the pack cannot be written.
     """
     if not recording.on_disk:
         raise ValueError(
-            f"sequence {recording.name}: expected a recording as it lies on disk, found one that is packed, corrupted "
-            "or simulated"
+            f"sequence {recording.name}: expected a recording that is read from its files, found a packed, "
+            "corrupted or simulated one"
         )
     source = _source(recording)
     target = folder / f"{recording.name}-{hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]}"
@@ -53,7 +60,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
 
 
 def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
-    """Reads from the arrays of a pack what it has; the rest from the recording's files."""
+    """Returns a function that reads from the arrays of a pack, and everything else from the recording's files."""
     row_of = {path: row for row, path in enumerate(recording.paths)}
     points, raw = arrays.get("points"), arrays.get("labels")
 
@@ -72,9 +79,10 @@ def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """What tells whether a pack is the recording's: its files, and the options with which they are read.
+    """Identifies the pack of a recording: its files and their read options.
 
-    Of the options only text counts: a reader whose points depend on other files gives a hash of these as an option.
+    Only options that are strings count. A reader whose points depend on other files adds a hash of these files as an
+    option.
     """
     paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
     files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
@@ -86,9 +94,9 @@ def _source(recording: Recording) -> dict[str, Any]:
 
 
 def _make(target: Path, recording: Recording, source: dict[str, Any], on_progress: Callable[[int], None]) -> None:
-    """Write a pack whole or not at all."""
+    """Writes a pack atomically."""
     _sweep(target)
-    with replacing(target, keep=True) as temporary:  # where another process is faster, its copy is as good
+    with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
         temporary.mkdir()
         arrays = _write_arrays(temporary, recording, on_progress)
         with (temporary / ABOUT_FILE).open("w") as stream:
@@ -97,15 +105,15 @@ def _make(target: Path, recording: Recording, source: dict[str, Any], on_progres
 
 
 def _sweep(target: Path) -> None:
-    """Remove what processes that were killed have left of this pack."""
+    """Removes incomplete copies of this pack that killed processes left behind."""
     for left in half_written(target.parent, target.name):
-        with contextlib.suppress(FileNotFoundError):  # another process sweeps too
+        with contextlib.suppress(FileNotFoundError):  # Another process may remove it, too.
             if time.time() - max(path.stat().st_mtime for path in (left, *left.iterdir())) > ABANDONED_S:
                 shutil.rmtree(left)
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
-    """Write the arrays of all scans or images, and return how they lie."""
+    """Writes the arrays of all scans or images, and returns their layout."""
     with contextlib.ExitStack() as opened:
         files: dict[str, StackWriter] = {}
         for i in range(len(recording)):
@@ -129,12 +137,12 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
 
 
 def open_pack(folder: Path) -> dict[str, Stacked]:
-    """The arrays of a pack, by name. Raises ValueError, naming the folder, where it is damaged."""
+    """Return the arrays of a pack by name. Raises ValueError, with the folder, if the pack is damaged."""
     try:
         lie = read_json(folder / ABOUT_FILE)["arrays"]
         return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError) as error:
         raise ValueError(
-            f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); once it is "
-            "removed the recording is packed anew"
+            f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); delete the "
+            "folder to pack the recording again"
         ) from error

@@ -1,4 +1,4 @@
-"""Arrays with rows of one shape, one after another in a file: written once, then mapped into memory."""
+"""Stores arrays with rows of one shape one after another in a file, and maps the file into memory."""
 
 import contextlib
 import dataclasses
@@ -17,9 +17,9 @@ from sglpr_jax.files import writing
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stacked:
-    """Arrays one after another in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
+    """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
 
-    What is asked for is a view, to read only. Raises ValueError where its bytes are not those that were written.
+    Indexing returns a read-only view. It raises ValueError if the checksum of the array is wrong.
     """
 
     path: Path
@@ -27,7 +27,7 @@ class Stacked:
     rows: np.ndarray
     offsets: tuple[int, ...]
     checksums: tuple[int, ...] | None
-    """Of each array; None in a file of the time before there were any."""
+    """Checksum of each array. None for older files, which have no checksums."""
 
     def __getitem__(self, i: int) -> np.ndarray:
         start, stop = self.offsets[i : i + 2]
@@ -36,19 +36,19 @@ class Stacked:
         array = self.rows[start:stop]
         if self.checksums is not None and self.checksums[i] != (found := _checksum(array)):
             raise ValueError(
-                f"{self.path}: expected array {i} with the checksum {self.checksums[i]}, as pack.json says, found"
-                f" {found}; once its folder is removed the recording is packed anew"
+                f"{self.path}: expected array {i} with the checksum {self.checksums[i]} of pack.json, found {found};"
+                " delete its folder to pack the recording again"
             )
         return array
 
     def _announce(self, start: int, stop: int) -> None:
-        """Have the disk read these bytes at once: the system by itself reads 128 KiB at each first touch."""
+        """Requests these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
         page = start - start % mmap.PAGESIZE
         self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
 
 
 class StackWriter:
-    """Writes arrays one after another into a new file; all have rows like those of `first`."""
+    """Writes arrays one after another into a new file. All arrays must have rows like those of `first`."""
 
     def __init__(self, path: Path, first: np.ndarray):
         self._path, self._dtype, self._row = path, first.dtype, first.shape[1:]
@@ -58,11 +58,11 @@ class StackWriter:
             self._stream = path.open("xb")
 
     def append(self, array: np.ndarray, *, of: str) -> None:
-        """Raises ValueError, naming `of`, where its rows are unlike the first array's; OSError on a full disk."""
+        """Append an array. Raises ValueError, with `of`, if its rows do not fit, and OSError if the disk is full."""
         if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
             raise ValueError(
-                f"{of}: expected {self._dtype} with rows of shape {self._row}, as the first one has, to be packed with "
-                f"it, found {array.dtype} {array.shape[1:]}"
+                f"{of}: expected {self._dtype} with rows of shape {self._row}, like the first array of the pack, "
+                f"found {array.dtype} {array.shape[1:]}"
             )
         array = np.ascontiguousarray(array)
         with writing(self._path):
@@ -71,28 +71,30 @@ class StackWriter:
         self._offsets.append(self._offsets[-1] + len(array))
 
     def finish(self) -> dict[str, Any]:
-        """Have all on the disk, and say how it lies there."""
+        """Flush the file to disk and return its layout, the keyword arguments of `map_stacked`."""
         with writing(self._path):
             sync(self._stream)
         lies = {"dtype": self._dtype.str, "row": self._row, "offsets": self._offsets}
         return {**lies, "checksums": self._checksums}
 
     def close(self) -> None:
-        """To be called whether it was finished or not."""
-        with contextlib.suppress(OSError):  # of what was never flushed, because of an error that is on its way
+        """Close the file, whether finished or not."""
+        with contextlib.suppress(OSError):  # An earlier write error is already being raised.
             self._stream.close()
 
 
 def map_stacked(
     path: Path, *, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
 ) -> Stacked:
-    """Map what a `StackWriter` wrote into memory; the other arguments are what its `finish` returned.
+    """Map a file written by `StackWriter` into memory. The keyword arguments are those that `finish` returned.
 
-    Raises FileNotFoundError, and ValueError where the file has another size (one too short would end the process as
-    soon as its missing part is touched) or the arguments do not fit each other.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file has the wrong size, or if the arguments contradict each other. Access to the missing part
+        of a file that is too short would kill the process.
     """
     if any(type(number) is not int for number in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
-        raise ValueError(f"{path.name}: expected offsets that rise from 0, found {offsets!s:.60}")
+        raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
     if checksums is not None and [type(number) for number in checksums] != [int] * (len(offsets) - 1):
         raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
     shape = (offsets[-1], *row)
@@ -106,11 +108,11 @@ def map_stacked(
 
 
 def _checksum(array: np.ndarray) -> int:
-    """CRC-32 of what an array is and holds: 0.2 ms for a scan of 120,000 points."""
+    """CRC-32 of type, shape and content of an array: 0.2 ms for a scan of 120,000 points."""
     return zlib.crc32(array.data, zlib.crc32(f"{array.dtype.str} {array.shape}".encode()))
 
 
 def sync(stream: IO) -> None:
-    """Have a file on the disk: renamed before that, a power cut could leave one with a hole."""
+    """Flush a file to disk. If the file were renamed before, a power failure could leave it incomplete."""
     stream.flush()
     os.fsync(stream.fileno())

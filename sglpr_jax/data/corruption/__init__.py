@@ -1,1 +1,1 @@
-"""Scans made worse on purpose, for the stress test."""
+"""Artificially degraded scans for the stress test."""

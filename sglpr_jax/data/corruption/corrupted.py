@@ -1,4 +1,4 @@
-"""Recordings of corrupted scans: any method embeds them as it does the originals."""
+"""Recordings of corrupted scans, which any method describes like the originals."""
 
 import dataclasses
 from pathlib import Path
@@ -11,10 +11,13 @@ from sglpr_jax.data.recording import Recording
 
 
 def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
-    """The recording with every scan corrupted when it is read; ids, positions and times stay.
+    """Return the recording with every scan corrupted on reading. Ids, positions and times do not change.
 
-    A scan's corruption is a function of (`seed`, its row); its labels stay with their points. Points that are not
-    finite are left out. Raises ValueError where the recording has only images.
+    The corruption of a scan is a function of `seed` and its row. Labels stay with their points. Points that are not
+    finite are removed.
+
+    Raises:
+      ValueError: If the recording contains only images.
     """
     if recording.has_images:
         raise ValueError(
@@ -36,7 +39,7 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
 
 
 def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Generator) -> Record:
-    """The scan with its finite points corrupted, and the labels and lasers of those that are left."""
+    """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points."""
     assert record.points is not None
     rows = np.flatnonzero(np.isfinite(record.points).all(axis=1))
     lasers = None if record.lasers is None else record.lasers[rows]

@@ -1,7 +1,7 @@
-"""What can go wrong with a scan, by name and strength: pure functions on clouds.
+"""Corruptions of a scan, by kind and strength, as pure functions of point clouds.
 
-`KINDS` is the table: a new kind is a function and its entry there, and its strengths are in `bin/stress`. Points are
-metres in the LiDAR frame: x forward, y left, z up. All functions keep the order of the points.
+`KINDS` lists the kinds. A new kind needs a function and an entry there, and `bin/stress` then includes its strengths.
+Points are in metres in the LiDAR frame: x forward, y left, z up. All functions keep the order of the points.
 """
 
 import dataclasses
@@ -18,7 +18,8 @@ Cloud = Float32[np.ndarray, "n 3"]
 
 @dataclasses.dataclass(frozen=True)
 class Scan:
-    """What a corruption is given: the finite points of one scan, where known the laser of each, and what draws."""
+    """Input of a corruption: the finite points of one scan, the laser of each point if known, and a random
+    generator."""
 
     points: Cloud
     lasers: Int[np.ndarray, " n"] | None
@@ -27,52 +28,54 @@ class Scan:
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of corruption."""
+    """Kind of corruption."""
 
     corrupt: Callable[[Scan, float], Cloud | Bool[np.ndarray, " n"]]
-    """Of a scan and the strength: which points are left, as flags, or all points at other places."""
+    """Function of the scan and the strength. It returns a mask of the remaining points, or all points at new
+    positions."""
     strengths: tuple[float, ...]
-    """Those of `bin/stress`, weak to strong."""
+    """Strengths that `bin/stress` uses, from weak to strong."""
     unit: str = ""
+    """Unit of the strength."""
     limits: tuple[float, float] = (0.0, np.inf)
-    """The least and the largest strength."""
+    """Minimum and maximum strength."""
     needs_lasers: bool = False
-    """Whether it is to be told which laser each point is from."""
+    """Whether `corrupt` needs the laser of each point."""
 
 
 def occlude(scan: Scan, degrees: float) -> Bool[np.ndarray, " n"]:
-    """No points in a sector so many degrees wide, about a random heading."""
+    """Removes the points in a sector of the given width, in degrees, about a random heading."""
     return outside_sector(scan.points, heading=scan.rng.uniform(-np.pi, np.pi), width=np.radians(degrees))
 
 
 def fewer_beams(scan: Scan, beams: float) -> Bool[np.ndarray, " n"]:
-    """So many of the sensor's lasers are left (`laser_rings.keep_rings`). ValueError where none tells the rings."""
+    """Keeps the given number of lasers (`laser_rings.keep_rings`). Raises ValueError if the rings are unknown."""
     return keep_rings(ring_numbers(scan.points, lasers=scan.lasers), int(beams))
 
 
 def add_noise(scan: Scan, metres: float) -> Cloud:
-    """Gaussian noise along the ray, of this standard deviation."""
+    """Adds Gaussian noise along each ray, with the given standard deviation in metres."""
     return add_to_range(scan.points, metres * scan.rng.standard_normal(len(scan.points)))
 
 
 def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
-    """Each point is lost with this probability."""
+    """Removes each point with the given probability."""
     return scan.rng.random(len(scan.points)) >= share
 
 
 def offset(scan: Scan, metres: float) -> Cloud:
-    """The scan as from so many metres to a random side."""
+    """Moves the sensor by the given distance, in metres, to a random side."""
     return moved_left(scan.points, scan.rng.choice((-1, 1)) * metres)
 
 
 def leave(scan: Scan, strength: float) -> Cloud:
-    """Nothing happens."""
+    """Returns the points unchanged."""
     return scan.points
 
 
 def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
-    """Rotation is not done on points: embedding rotates images too."""
-    raise ValueError("expected a corruption other than rotation, which is the rotation_seed of embedding")
+    """Raises ValueError. Embedding rotates the scans, because it can rotate images, too."""
+    raise ValueError("expected a corruption other than rotation; for rotation use the rotation_seed of embed")
 
 
 KINDS: dict[str, Kind] = {
@@ -84,14 +87,14 @@ KINDS: dict[str, Kind] = {
     "dropout": Kind(drop_out, strengths=(0.5, 0.9), limits=(0.0, 1.0)),
     "offset": Kind(offset, strengths=(0.5, 1.0, 2.0), unit=" m"),
 }
-"""Every kind by its name."""
+"""All kinds by name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Corruption:
-    """What happens to every scan of a recording, and how much of it: a kind of `KINDS` and a strength in its unit.
+    """Corruption of every scan of a recording: a kind of `KINDS` and a strength in its unit.
 
-    Raises ValueError for an unknown kind and for a strength that the kind cannot have.
+    Raises ValueError if the kind is unknown or the strength is outside its limits.
     """
 
     kind: str
@@ -102,34 +105,35 @@ class Corruption:
             raise ValueError(f"expected a kind of corruption among {', '.join(KINDS)}, found {self.kind!r}")
         low, high = KINDS[self.kind].limits
         if not low <= self.strength <= high:
-            raise ValueError(f"expected {self.kind} of a strength from {low:g} to {high:g}, found {self.strength:g}")
+            raise ValueError(f"expected {self.kind} with a strength from {low:g} to {high:g}, found {self.strength:g}")
 
     @property
     def name(self) -> str:
-        """As a command line takes it: "occlusion-90"."""
+        """Name on the command line: "occlusion-90"."""
         return f"{self.kind}-{self.strength:g}" if self.strength else self.kind
 
     @property
     def label(self) -> str:
-        """The strength with its unit; the name where there is none."""
+        """Strength with its unit, or the name of the kind if it has no strength."""
         return f"{self.strength:g}{KINDS[self.kind].unit}" if self.strength else self.kind
 
     @property
     def needs_lasers(self) -> bool:
-        """Whether `corrupt` is to be told the lasers."""
+        """Whether `corrupt` needs the laser of each point."""
         return KINDS[self.kind].needs_lasers
 
 
 CLEAN = Corruption("clean")
 ROTATION = Corruption("rotation")
 CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() for strength in kind.strengths)
-"""Those of `bin/stress`."""
+"""All corruptions of `bin/stress`."""
 
 
 def chosen_corruptions(names: Sequence[str]) -> tuple[Corruption, ...]:
-    """The corruptions of these names; a kind stands for all its strengths, and no name at all for everything.
+    """Return the corruptions with the given names. A kind selects all its strengths; no names select everything.
 
-    Raises ValueError, with the nearest name, where there is no such corruption.
+    Raises:
+      ValueError: If a name is unknown. The message contains the nearest name.
     """
     known = {corruption.name: corruption for corruption in CORRUPTIONS}
     kinds = {corruption.kind for corruption in CORRUPTIONS}
@@ -147,9 +151,19 @@ def corrupt(
     rng: np.random.Generator,
     lasers: Int[np.ndarray, " n"] | None = None,
 ) -> tuple[Float32[np.ndarray, "m 3"], Bool[np.ndarray, " n"]]:
-    """The points that are left, and which of the finite `points` given they are.
+    """Corrupt the finite points of a scan.
 
-    Raises ValueError for rotation, which is the `rotation_seed` of embedding, and where beams cannot be told apart.
+    Arguments:
+      points: Finite points in the LiDAR frame, in metres.
+      corruption: Kind and strength.
+      rng: Random generator.
+      lasers: Laser of each point, if known.
+
+    Returns:
+      The remaining points, and a mask of them among the given points.
+
+    Raises:
+      ValueError: If the corruption is a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
     """
     found = KINDS[corruption.kind].corrupt(Scan(points, lasers, rng), corruption.strength)
     if found.dtype == bool:
@@ -158,22 +172,22 @@ def corrupt(
 
 
 def outside_sector(points: Float[np.ndarray, "n 3"], *, heading: float, width: float) -> Bool[np.ndarray, " n"]:
-    """Whether each point lies outside a sector `width` radians wide about `heading` (0: ahead, counter-clockwise)."""
+    """Return whether each point is outside a sector of `width` radians about `heading` (0: ahead,
+    counter-clockwise)."""
     azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
     return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
 
 
 def add_to_range(points: Cloud, metres: Float[np.ndarray, " n"]) -> Cloud:
-    """Move every point along its ray, away from the sensor; a point at the sensor stays, for it has no ray."""
+    """Move every point along its ray, away from the sensor. A point at the sensor has no ray and stays."""
     distance = np.linalg.norm(points.astype(np.float64), axis=1)
     share = np.divide(metres, distance, out=np.zeros_like(distance), where=distance > 0)
     return (points * (1 + share[:, None])).astype(np.float32)
 
 
 def moved_left(points: Cloud, offset_m: float) -> Cloud:
-    """The scan about a place `offset_m` to the left of the scanner; negative: to the right.
+    """Return the scan relative to a place `offset_m` metres to the left of the sensor, or to the right if negative.
 
-    The points move, what they hide does not: a scanner over there would see behind some things and not others, and one
-    scan cannot tell what.
+    Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
     """
     return points - np.array([0, offset_m, 0], np.float32)

@@ -1,4 +1,4 @@
-"""The rings of a scan: which of the sensor's lasers every point comes from."""
+"""Assigns the points of a scan to rings, one ring per laser of the sensor."""
 
 import math
 
@@ -6,25 +6,32 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 
 GAP_DEG = 0.1
-"""Rings stand apart where none is wider than this in elevation and all gaps between them are."""
+"""Elevation separates the rings if no ring is wider than this angle, in degrees, and all gaps between rings are
+wider."""
 IN_ORDER = 0.9
-"""The least correlation of turn and elevation at which points are said to lie ring after ring."""
+"""Minimum correlation of revolution and elevation for points that are stored ring after ring."""
 
 
 def ring_numbers(
     points: Float[np.ndarray, "n 3"], *, lasers: Int[np.ndarray, " n"] | None = None
 ) -> Int32[np.ndarray, " n"]:
-    """The ring of every finite point, 0 for the lowest of those found. A ring without a point has no number.
+    """Return the ring of every finite point, counted from 0 at the lowest elevation. Rings without points have no
+    number.
 
-    Told by the first of these that does:
+    The first of these sources that separates the rings is used:
 
-    - `lasers`, the laser's number as nuScenes' and NCLT's files have it, in any order; where all are the same, as in
-      simulated files of NCLT, they tell nothing;
-    - elevation, where all rings stand apart, as in a simulated scan or that of a sensor with few lasers;
-    - the order of the points: ring after ring, each counter-clockwise from straight ahead, as in KITTI's files. There
-      elevation does not tell: within a ring it varies by more than two rings are apart.
+    - `lasers`: the laser numbers in files of nuScenes and NCLT, in any order. If all numbers are equal, as in simulated
+      NCLT files, they are ignored.
+    - Elevation, if it separates all rings, as in simulated scans and for sensors with few lasers.
+    - The order of the points, if they are stored ring after ring, each counter-clockwise from straight ahead, as in
+      KITTI's files. There the elevation varies within a ring by more than the distance between two rings.
 
-    Raises ValueError where none does.
+    Arguments:
+      points: Finite points in the LiDAR frame.
+      lasers: Laser number of each point, or None.
+
+    Raises:
+      ValueError: If no source separates the rings.
     """
     if len(points) == 0:
         return np.zeros(0, np.int32)
@@ -35,16 +42,21 @@ def ring_numbers(
     if groups is None:
         raise ValueError(
             "expected a scan with rings (laser numbers in its file, separate elevations, or points ring after ring "
-            f"from straight ahead), found {len(points)} points without"
+            f"from straight ahead), found {len(points)} points without rings"
         )
     return _from_the_lowest(groups, elevation)
 
 
 def keep_rings(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
-    """Whether each point is left with `beams` of the sensor's lasers: of 64 rings every 2nd for 32, every 4th for 16.
+    """Return whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for
+    16.
 
-    The sensor has the next power of two of the rings found: some of 64 may have returned nothing. One that has no more
-    than `beams` keeps all.
+    The sensor is assumed to have the number of found rings, rounded up to a power of two, because some lasers may have
+    no returns. A sensor with at most `beams` lasers keeps all points.
+
+    Arguments:
+      rings: Ring of each point, from `ring_numbers`.
+      beams: Number of lasers.
     """
     found = int(rings.max(initial=0)) + 1
     sensor = 2 ** math.ceil(math.log2(found))

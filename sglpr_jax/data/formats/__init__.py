@@ -1,1 +1,1 @@
-"""Single files: scans, poses, label images."""
+"""Readers of single files: scans, poses and label images."""

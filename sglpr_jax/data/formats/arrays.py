@@ -1,4 +1,4 @@
-"""Points from numpy's own files: .npy and .npz."""
+"""Reads points from numpy files: .npy and .npz."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,59 +8,64 @@ import numpy as np
 from jaxtyping import Float32
 
 NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
-"""Which array of an .npz holds the points, where there are several."""
+"""Names of the array with the points in an .npz file with several arrays, in order of preference."""
 
 
 def read_npy(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of an .npy file: rows of numbers, x, y and z first, or records that have such fields.
+    """Return the points (n, 3) of an .npy file.
 
-    Raises FileNotFoundError, and ValueError where it holds something else. Pickled objects are not read.
+    The file contains rows of numbers that begin with x, y, z, or records with the fields x, y and z. Pickled objects
+    are not read.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file contains something else.
     """
     return _points(path, _load(path, lambda array: array))
 
 
 def read_npz(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of an .npz file: of its only array, or of the one called points, xyz and the like.
+    """Return the points (n, 3) of an .npz file, from the first array named in `NAMES` or from the only array.
 
-    Raises what `read_npy` raises.
+    Raises what `read_npy` raises, and ValueError if the file has several arrays and no name matches.
     """
     return _points(path, _load(path, lambda archive: archive[_name(path, archive.files)]))
 
 
 def _name(path: Path, names: Sequence[str]) -> str:
-    """Which array of an archive holds the points."""
+    """Name of the array with the points."""
     name = next((name for name in NAMES if name in names), names[0] if len(names) == 1 else None)
     if name is None:
         found = ", ".join(names) or "none"
-        raise _NotOne(f"{path}: expected one array, or one called {', '.join(NAMES)}, found {found}")
+        raise _NotOne(f"{path}: expected one array, or one named {', '.join(NAMES)}, found {found}")
     return name
 
 
 class _NotOne(ValueError):
-    """An archive holds several arrays; the message says so already."""
+    """Raised if an archive has no single array with points. `_load` does not wrap it."""
 
 
 def _load(path: Path, choose: Callable[[Any], np.ndarray]) -> np.ndarray:
-    """What `choose` takes of what numpy reads; one clear error where it reads nothing."""
+    """Load a file with numpy and select an array with `choose`. Raises ValueError if numpy cannot read the file."""
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: expected a numpy file, found none")
     try:
         with path.open("rb") as stream:
             return choose(np.load(stream, allow_pickle=False))
     except _NotOne:
         raise
-    except Exception as error:  # numpy, zipfile, zlib and tokenize raise a dozen kinds for broken files
-        raise ValueError(f"{path}: expected an array of numpy's, found none ({error})") from error
+    except Exception as error:  # numpy, zipfile, zlib and tokenize raise many types for broken files
+        raise ValueError(f"{path}: expected a numpy array, found none ({error})") from error
 
 
 def _points(path: Path, array: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-    """The first three columns, or the fields x, y and z."""
+    """Return the fields x, y and z, or else the first three columns."""
     if {"x", "y", "z"} <= set(array.dtype.names or ()):
         array = np.stack([array[axis].reshape(-1) for axis in "xyz"], axis=1)
     numbers = array.dtype.kind in "fiu"
     if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not len(array):
         raise ValueError(
-            f"{path}: expected points as rows (n, 3) or more of numbers, found {array.dtype} of shape {array.shape}"
+            f"{path}: expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}"
         )
     with np.errstate(over="ignore", invalid="ignore"):
         return np.ascontiguousarray(array[:, :3], dtype=np.float32)

@@ -1,6 +1,6 @@
-"""Scans as records of numbers without a header: how many bytes each point has, and what its first three numbers are.
+"""Reads scans that are records of numbers without a header.
 
-A `.bin` does not say what it holds; `record_size.py` finds it out.
+A `.bin` file does not define its record format. `record_size.py` detects it.
 """
 
 from pathlib import Path
@@ -14,27 +14,27 @@ from sglpr_jax.data.choices import RecordFormat
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 NCLT_UNIT_M = 0.005
 NCLT_OFFSET_M = -100.0
-"""Metres = value * unit + offset."""
+"""Scale and offset of NCLT's integers: metres = value * unit + offset."""
 Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
-"""Half a turn about x: from forward, right, down to forward, left, up. Negating z alone would mirror the scan."""
+"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror."""
 
 
 class Records(NamedTuple):
-    """What was read of one scan."""
+    """Points of one scan, with their lasers."""
 
     points: Float32[np.ndarray, "n 3"]
-    """Metres: x forward, y left, z up, where the format says which axes it has."""
+    """Points in metres: x forward, y left, z up if the format defines its axes, or else the axes of the file."""
     lasers: Int32[np.ndarray, " n"] | None
-    """The laser that each point is from, where the format says so."""
+    """Laser number of each point, or None if the format has none."""
 
 
 def is_record(format: str) -> TypeGuard[RecordFormat]:
-    """Whether scans of a format are records without a header."""
+    """Whether scans of this format are records without a header."""
     return format in get_args(RecordFormat)
 
 
 def record_type(format: RecordFormat) -> np.dtype:
-    """Return numpy's type of one point: "xyz", and what else there is."""
+    """Return the numpy type of one point. The field "xyz" comes first."""
     if format == "nclt":
         return NCLT_RECORD
     if format == "nuscenes":
@@ -46,12 +46,15 @@ def record_type(format: RecordFormat) -> np.dtype:
 
 
 def described(format: RecordFormat) -> str:
-    """Return a format in words: "float32x6 (24 bytes a point)"."""
+    """Return a description of a format: "float32x6 (24 bytes a point)"."""
     return f"{format} ({record_type(format).itemsize} bytes a point)"
 
 
 def read_records(path: Path, format: RecordFormat) -> Records:
-    """Return the points of a file of records, and their lasers. ValueError where its size is no whole number of them.
+    """Read a file of records.
+
+    Raises:
+      ValueError: If the file is empty or its size is not a multiple of the record size.
 
     Example:
       points = read_records(path, "float32x6").points
@@ -61,18 +64,18 @@ def read_records(path: Path, format: RecordFormat) -> Records:
     if size == 0 or size % dtype.itemsize:
         others = ", ".join(f"{name} has {record_type(name).itemsize}" for name in ("kitti", "nuscenes", "nclt"))
         raise ValueError(
-            f"{path}: expected {dtype.itemsize} bytes for each point ({format}), found {size} bytes in all; the file"
-            f" is cut off, or has another format ({others} bytes a point; pcd has a header)"
+            f"{path}: expected {dtype.itemsize} bytes for each point ({format}), found {size} bytes in total; the file"
+            f" is truncated, or has another format ({others} bytes a point; pcd has a header)"
         )
     records = np.fromfile(path, dtype=dtype)
     lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers that are none: whoever uses the points drops them
-        # One axis after the other in memory: copied in half the time, and whatever comes next goes along the axes.
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers
+        # Column-major order: the copy takes half the time, and later steps work along the axes.
         return Records(np.asfortranarray(_our_axes(records["xyz"], format), dtype=np.float32), lasers)
 
 
 def _our_axes(xyz: np.ndarray, format: RecordFormat) -> np.ndarray:
-    """Metres, x forward, y left, z up."""
+    """Convert the coordinates of a format to metres, x forward, y left, z up."""
     if format == "nuscenes":
         return np.stack([xyz[:, 1], -xyz[:, 0], xyz[:, 2]], axis=1)
     if format == "nclt":

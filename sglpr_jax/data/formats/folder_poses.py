@@ -1,4 +1,4 @@
-"""Where the scans of a plain folder were taken: pose files beside them, or one that is named."""
+"""Poses and timestamps of a plain folder of scans, from files beside the scans or named by the user."""
 
 from pathlib import Path
 
@@ -17,12 +17,25 @@ TIMES_FILE = "times.txt"
 def folder_trajectory(
     root: Path, *, scans: int, poses: Path | None = None, pose_format: PoseFormat = "auto", times: Path | None = None
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
-    """Return the positions, the times and the pose source of the `scans` scans in `root`, each None where none tells.
+    """Read the positions and times of the scans in a plain folder.
 
-    Positions are those of the file `poses`, or of the one of `POSE_FILES` beside the scans, where 12 numbers a line are
-    poses of the LiDAR, z up. Times are those of the file `times`, else of `TIMES_FILE` beside the scans, else of the
-    poses. Poses of more, fewer or other times are interpolated. Raises ValueError where there are two pose files, one
-    is malformed, or the poses are not those of all scans.
+    If the poses have other times than the scans, or another number of rows, they are interpolated (`poses_at_scans`).
+
+    Arguments:
+      root: Folder of the scans.
+      scans: Number of scans.
+      poses: Pose file. By default, the file of `POSE_FILES` beside the scans. In a file beside the scans, 12 numbers a
+        line are poses of the LiDAR, z up.
+      pose_format: Format of the pose file.
+      times: File of timestamps. By default, `TIMES_FILE` beside the scans, or else the times of the poses.
+
+    Returns:
+      Positions in metres, times in seconds, and a description of the pose source. Each is `None` if unknown.
+
+    Raises:
+      FileNotFoundError: If `poses` or `times` does not exist.
+      ValueError: If the folder has several pose files, a file is malformed, `times` has another number of rows, or a
+        scan has no pose.
     """
     beside = [root / name for name in POSE_FILES if (root / name).is_file()]
     if poses is None and len(beside) > 1:
@@ -44,13 +57,13 @@ def folder_trajectory(
 def _at_scans(
     path: Path, trajectory: Trajectory, times: Float[np.ndarray, " n"] | None, scans: int, *, of: str
 ) -> tuple[Float[np.ndarray, "n 3"], str]:
-    """The positions of all scans, and how they were found if not row by row; ValueError where one has none."""
+    """Positions of all scans, and how they were matched if not row by row. Raises ValueError if a scan has no pose."""
     found = poses_at_scans(str(path), unturned(trajectory.positions), trajectory.times, times, scans=scans, of=of)
     if times is not None and not found.kept.all():
         late = times[~found.kept]
         raise ValueError(
-            f"{path}: expected poses about the times of all {scans} scans, found none for {len(late)}, the first at "
-            f"{late[0]:.1f} s; leave these scans out, or name the poses to bin/evaluate alone, which leaves them out"
+            f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
+            f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
         )
     return found.poses[:, :3, 3], f", {found.said}" if found.said else ""
 

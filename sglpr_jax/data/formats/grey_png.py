@@ -1,4 +1,7 @@
-"""Grey PNGs of BEVPlace's layout. Their rows run backwards; eq. 1 has x (forward) to the right and y (left) up."""
+"""Reads the greyscale PNG files of BEVPlace's layout.
+
+The images are rotated to the orientation of eq. 1, with x (forward) to the right and y (left) up.
+"""
 
 import io
 import struct
@@ -15,15 +18,22 @@ from sglpr_jax.files import in_short
 _MODES = {8: "L", 16: "I;16"}
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LARGEST_SIDE = 1 << 14
+"""Maximum width and height of an image, in pixels."""
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
-    """Return an image (h, w) in eq. 1's orientation.
+    """Return an image (h, w) in the orientation of eq. 1.
 
-    Raises FileNotFoundError, and ValueError where the file is no whole grey image of so many `bits` (8 or 16) a pixel.
+    Arguments:
+      path: PNG file.
+      bits: Bits per pixel, 8 or 16.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a complete greyscale image with this number of bits.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected an image, found no such file")
+        raise FileNotFoundError(f"{path}: expected an image, found none")
     expected = f"{'an 8' if bits == 8 else 'a 16'}-bit grey PNG"
     try:
         content = path.read_bytes()
@@ -31,40 +41,40 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
         with Image.open(io.BytesIO(content)) as image:
             mode, grey = image.mode, np.asarray(image)
     except (ValueError, OSError, SyntaxError, struct.error, zlib.error) as error:
-        raise ValueError(f"{path}: expected {expected}, found no such image ({in_short(error)})") from error
+        raise ValueError(f"{path}: expected {expected}, found another or a damaged file ({in_short(error)})") from error
     if mode != _MODES[bits]:
         raise ValueError(f"{path}: expected {expected} (mode {_MODES[bits]}), found mode {mode}")
     return np.rot90(grey, -1)
 
 
 def _check_whole(content: bytes) -> None:
-    """Raise ValueError where a checksum is wrong or pixels are missing: Pillow passes over both, and over these alone.
+    """Raise ValueError if a checksum is wrong or pixels are missing. Pillow reports neither.
 
-    Interlaced images, which nothing here writes, have their checksums looked at and not their pixels counted.
+    The pixels of interlaced images are not counted. This project writes no interlaced images.
     """
     if not content.startswith(_SIGNATURE):
-        raise ValueError("it does not begin as a PNG")
+        raise ValueError("no PNG signature")
     chunks = list(_chunks(content))
     if not chunks or chunks[0][0] != b"IHDR" or chunks[-1][0] != b"IEND":
-        raise ValueError("its header or its end is missing")
+        raise ValueError("the header or the end is missing")
     width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", chunks[0][1])
     if max(width, height) > LARGEST_SIDE:
-        raise ValueError(f"it promises {width} x {height} pixels")
+        raise ValueError(f"the header declares {width} x {height} pixels, more than {LARGEST_SIDE} a side")
     pixels = zlib.decompress(b"".join(data for kind, data in chunks if kind == b"IDAT"))
     channels = {2: 3, 4: 2, 6: 4}.get(colour, 1)
     if not interlaced and len(pixels) != height * (1 + (width * channels * depth + 7) // 8):
-        raise ValueError(f"it promises {width} x {height} pixels and has others")
+        raise ValueError(f"the header declares {width} x {height} pixels, but the data has another size")
 
 
 def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """The kind and the data of each part of a PNG."""
+    """Type and data of each chunk of a PNG."""
     at = len(_SIGNATURE)
     while at < len(content):
         (size,) = struct.unpack_from(">I", content, at)
         kind, data = content[at + 4 : at + 8], content[at + 8 : at + 8 + size]
         (checksum,) = struct.unpack_from(">I", content, at + 8 + size)
         if zlib.crc32(kind + data) != checksum:
-            raise ValueError(f"the checksum of its part {kind!r} is wrong")
+            raise ValueError(f"the checksum of chunk {kind!r} is wrong")
         yield kind, data
         at += 12 + size
         if kind == b"IEND":

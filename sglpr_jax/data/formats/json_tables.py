@@ -1,4 +1,4 @@
-"""Tables in JSON: a list of rows, each an object that names its columns."""
+"""Reads tables in JSON: a list of rows. Each row is an object with the column names as keys."""
 
 import json
 from collections.abc import Container, Sequence
@@ -12,10 +12,13 @@ from sglpr_jax.files import in_short
 
 
 def table_rows(path: Path, column: str = "", among: Container[Any] = ()) -> list[dict[str, Any]]:
-    """Return the rows of a table; with `column`, those whose value there is one of `among`.
+    """Return the rows of a table. With `column`, only the rows whose value in this column is in `among`.
 
-    The others are dropped while the table is read: some have millions. Raises FileNotFoundError, and ValueError where
-    it is no list of rows.
+    Other rows are dropped while the file is parsed, because some tables have millions of rows.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a list of rows.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table, found none")
@@ -26,7 +29,7 @@ def table_rows(path: Path, column: str = "", among: Container[Any] = ()) -> list
     try:
         rows = json.loads(path.read_bytes(), object_hook=wanted)
     except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path}: expected a table in JSON, found none that is whole ({in_short(error)})") from error
+        raise ValueError(f"{path}: expected a table in JSON, found invalid JSON ({in_short(error)})") from error
     kept = [row for row in rows if row is not None] if isinstance(rows, list) else [rows]
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in kept):
         raise ValueError(f"{path}: expected a list of rows, each an object, found something else")
@@ -34,7 +37,7 @@ def table_rows(path: Path, column: str = "", among: Container[Any] = ()) -> list
 
 
 def column_of(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any]:
-    """Return one value of each row. Raises ValueError, naming the table, where a row has none."""
+    """Return the values of a column. Raises ValueError if a row does not have this column."""
     lacking = next((row for row in rows if name not in row), None)
     if lacking is not None:
         raise ValueError(f"{path}: expected {name!r} in every row, found a row with {', '.join(lacking) or 'nothing'}")
@@ -42,7 +45,7 @@ def column_of(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any
 
 
 def numbers_of(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -> Float[np.ndarray, "n {size}"]:
-    """Return a column of so many finite numbers a row. Raises ValueError, naming the table, for others."""
+    """Return a column with `size` finite numbers in each row. Raises ValueError if a value is malformed."""
     values = column_of(path, rows, name)
     try:
         numbers = np.array(values, np.float64).reshape(len(rows), size)

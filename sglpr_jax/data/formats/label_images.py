@@ -1,9 +1,10 @@
-"""Label images of ready-made BEV images: what each pixel of an image shows.
+"""Label images of ready-made BEV images: the class of each pixel.
 
-    00/labels/000000.png   of 00/imgs/000000.png: as large and as oriented, 16 bits a pixel, a raw SemanticKITTI id
+The label image `00/labels/000000.png` belongs to `00/imgs/000000.png` and has the same size and orientation. Each pixel
+has 16 bits and contains a raw SemanticKITTI id. The id 0 is an empty pixel or an unknown class.
 
-0 is an empty pixel or one whose class is not known. Raw ids, as beside scans, can be sorted into any of the settings
-of docs/reference/labels.md; those of moving things do not fit 8 bits.
+Raw ids, like those of scans, can be mapped to all class settings of docs/reference/labels.md. The ids of moving objects
+do not fit into 8 bits.
 """
 
 from pathlib import Path
@@ -16,15 +17,20 @@ from sglpr_jax.labels import to_classes
 
 
 def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray, "h w"]:
-    """Return the raw ids of an image of this shape (h, w), both in eq. 1's orientation.
+    """Return the raw ids (h, w) in the orientation of eq. 1.
 
-    Raises FileNotFoundError, and ValueError where the file is no whole 16-bit grey image, has another size than its
-    image, or holds ids that do not exist.
+    Arguments:
+      path: Label image.
+      shape: Expected shape (h, w), that of the BEV image.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a complete 16-bit greyscale image, has another shape, or contains unknown ids.
     """
     raw = read_grey_png(path, bits=16).astype(np.int32)
     if raw.shape != shape:
         expected, found = (f"{rows} rows of {columns} pixels" for columns, rows in (shape, raw.shape))
-        raise ValueError(f"{path}: expected {expected}, as the image has, found {found}")
+        raise ValueError(f"{path}: expected {expected}, the size of the image, found {found}")
     try:
         to_classes(raw)
     except ValueError as error:
@@ -33,5 +39,5 @@ def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray,
 
 
 def label_image_pixels(raw: Int[np.ndarray, "h w"]) -> UInt16[np.ndarray, "w h"]:
-    """Return the pixels of a label image's file from raw ids in eq. 1's orientation."""
+    """Convert raw ids in the orientation of eq. 1 to the pixels of a label image file."""
     return np.ascontiguousarray(np.rot90(raw), np.uint16)

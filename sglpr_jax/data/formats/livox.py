@@ -1,6 +1,6 @@
-"""Points of Livox's own message in ROS bags, CustomMsg of livox_ros_driver and livox_ros_driver2.
+"""Reads Livox messages in ROS bags: CustomMsg of livox_ros_driver and livox_ros_driver2.
 
-After the header: uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd, and the points.
+The header is followed by uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd, and the points.
 """
 
 import numpy as np
@@ -18,11 +18,15 @@ POINT = {
     "tag": "u1",
     "line": "u1",
 }
-"""The fields of a point, and numpy's names of their types."""
+"""Fields of a point, and their numpy types."""
 
 
 def read_custom_msg(message: RosMessage) -> Records:
-    """Return points (n, 3), as they are in the message, and their lines. Raises ValueError for a message cut off."""
+    """Return the points (n, 3) in the axes of the message, and their line numbers.
+
+    Raises:
+      ValueError: If the message is truncated or has no points.
+    """
     message.header()
     message.numbers("u8")
     message.numbers("u4")

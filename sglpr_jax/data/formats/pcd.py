@@ -1,4 +1,4 @@
-"""Points from .pcd files, the format of the Point Cloud Library."""
+"""Reads points from .pcd files, the format of the Point Cloud Library."""
 
 import re
 from dataclasses import dataclass
@@ -14,24 +14,30 @@ from sglpr_jax.data.formats.lzf import decompress_lzf
 def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
     """Return the points (n, 3) of a .pcd file with `DATA binary`, `binary_compressed` or `ascii`, NaN points included.
 
-    Raises FileNotFoundError, and ValueError where the header, the fields or the number of points are not as expected.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the header, the fields or the number of points are invalid.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: expected a .pcd file, found none")
     try:
         return _decode(path.read_bytes())
-    except (ValueError, TypeError) as error:  # TypeError: numpy knows no such TYPE
-        raise ValueError(f"{path}: expected a .pcd file that can be read, found: {error}") from error
+    except (ValueError, TypeError) as error:  # TypeError: a TYPE unknown to numpy
+        raise ValueError(f"{path}: expected a readable .pcd file, found an invalid one: {error}") from error
 
 
 @dataclass(frozen=True)
 class _Header:
-    """How many points there are, and what fields each has: their names, types and sizes as numpy's, and repeats."""
+    """Header of a .pcd file."""
 
     points: int
+    """Number of points."""
     fields: tuple[str, ...]
+    """Names of the fields of a point."""
     dtypes: tuple[np.dtype, ...]
+    """Numpy type of each field."""
     counts: tuple[int, ...]
+    """Number of elements of each field."""
 
 
 def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -96,9 +102,9 @@ def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
 
 
 def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
-    """Two sizes, then LZF of the fields one after another: all x, all y and so on."""
+    """Decode two sizes and LZF data. The data contains one field after another: all x, all y and so on."""
     if len(body) < 8:
-        raise ValueError(f"expected two sizes in front of the points, found {len(body)} bytes")
+        raise ValueError(f"expected two sizes before the points, found {len(body)} bytes")
     packed, size = (int(number) for number in np.frombuffer(body, "<u4", count=2))
     widths = [dtype.itemsize * count for dtype, count in zip(header.dtypes, header.counts, strict=True)]
     if size != header.points * sum(widths) or len(body) < 8 + packed:

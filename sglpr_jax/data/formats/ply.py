@@ -1,4 +1,4 @@
-"""Points from .ply files: the vertices of the Stanford format, as text or binary of either byte order."""
+"""Reads the vertices of .ply files (Stanford format), in text or in binary of either byte order."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,25 +16,28 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass
 class _Element:
-    """What a file holds so many of: its properties' names and types (None: a list, whose length varies)."""
+    """Element of a .ply file."""
 
     name: str
     count: int
+    """Number of instances in the file."""
     properties: list[tuple[str, str | None]]
+    """Name and type of each property. The type of a list of variable length is `None`."""
 
 
 def read_ply(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the vertices (n, 3) of a .ply file, NaN included; the axes stay as they are.
+    """Return the vertices (n, 3) of a .ply file, NaN included. The axes are not changed.
 
-    Raises FileNotFoundError, and ValueError where the header, the properties or the number of points are not as
-    expected.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the header, the properties or the number of points are invalid.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: expected a .ply file, found none")
     try:
         return _decode(path.read_bytes())
     except (ValueError, IndexError, KeyError) as error:
-        raise ValueError(f"{path}: not a readable .ply file: {error}") from error
+        raise ValueError(f"{path}: expected a readable .ply file, found an invalid one: {error}") from error
 
 
 def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -74,7 +77,7 @@ def _parse_header(lines: list[str]) -> tuple[str, list[_Element]]:
 
 
 def _until_vertices(elements: list[_Element]) -> tuple[list[_Element], _Element]:
-    """The elements in front of the vertices, and the vertices."""
+    """Elements before the vertices, and the vertices."""
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise ValueError(f"expected an element vertex, found {' '.join(names) or 'none'}")

@@ -1,6 +1,6 @@
-"""Points of ROS's sensor_msgs/PointCloud2: any fields at any offset, either byte order, rows with padding.
+"""Reads sensor_msgs/PointCloud2 messages of ROS, with any field layout, either byte order, and padded rows.
 
-Velodyne, Ouster, Hesai and Livox drivers differ in what lies between x, y, z and the rest; each message says it.
+The drivers of Velodyne, Ouster, Hesai and Livox use different layouts. Each message describes its own layout.
 """
 
 from typing import Any
@@ -11,14 +11,18 @@ from sglpr_jax.data.formats.bin_records import Records
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LASERS = ("ring", "channel", "line", "laser_id", "laser")
-"""What drivers call the number of a point's laser."""
+"""Field names that drivers use for the laser number of a point."""
 
 
 def read_point_cloud2(message: Any) -> Records:
-    """Return points (n, 3), as they are in the message, and lasers, where there is such a field.
+    """Return the points (n, 3) in the axes of the message, and their lasers if the message has a laser field.
 
-    `message` has the attributes of sensor_msgs/PointCloud2. Raises ValueError where x, y or z are missing or no
-    numbers, or the data is shorter than width, height and steps say.
+    Arguments:
+      message: Object with the attributes of sensor_msgs/PointCloud2.
+
+    Raises:
+      ValueError: If x, y or z is missing or not numeric, or the data is shorter than its width, height and steps
+        require.
     """
     records = _records(message)
     names = records.dtype.names or ()
@@ -29,12 +33,12 @@ def read_point_cloud2(message: Any) -> Records:
 
 
 def described_fields(message: Any) -> str:
-    """Return the fields of a cloud in words: "x y z intensity ring (22 bytes a point)"."""
+    """Return a description of the fields of a cloud: "x y z intensity ring (22 bytes a point)"."""
     return f"{' '.join(field.name for field in message.fields)} ({message.point_step} bytes a point)"
 
 
 def _records(message: Any) -> np.ndarray:
-    """The points as numpy's records, one after another."""
+    """Points as a numpy array of records, without the padding of rows."""
     width, height, step, row = message.width, message.height, message.point_step, message.row_step
     if width * height == 0:
         raise ValueError("expected at least one point, found none")

@@ -1,4 +1,4 @@
-"""Text files with one row of numbers per frame: poses and times."""
+"""Reads text files with one row of numbers per frame: poses and timestamps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,17 +9,19 @@ from jaxtyping import Float
 from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""Camera x right, y down, z forward from LiDAR x forward, y left, z up; both at one place."""
+"""Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
 FARTHEST_M = 1e8
+"""Maximum absolute coordinate of a position, in metres."""
 LATEST_S = 1e11
-"""Times beyond the year 5000 are milli-, micro- or nanoseconds."""
+"""Maximum time in seconds, after the year 5000. Larger numbers are milli-, micro- or nanoseconds."""
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
-    """Return the poses (n, 3, 4) of a file with 12 numbers a line: a rotation and a translation in metres, row by row.
+    """Return the poses (n, 3, 4) of a file with 12 numbers a line: rotation and translation in metres, row-major.
 
-    Raises FileNotFoundError, and ValueError naming the first line without 12 finite numbers, or the first row that is
-    no rotation and translation.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line does not have 12 finite numbers or is not a pose. The message names the first one.
     """
     poses = read_rows(path, columns=12).reshape(-1, 3, 4)
     wrong = np.flatnonzero(~are_rotations(poses[:, :, :3]))
@@ -31,7 +33,7 @@ def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
 
 
 def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
-    """Raise ValueError naming the first row of `path` whose position is none on earth."""
+    """Raise ValueError if a coordinate exceeds `FARTHEST_M`. The message names its row in `path`."""
     far = np.flatnonzero(np.abs(positions).max(axis=1, initial=0) > FARTHEST_M)
     if far.size:
         raise ValueError(
@@ -41,7 +43,7 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
 
 
 def check_quaternions(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> None:
-    """Raise ValueError naming the first row of `path` whose qx qy qz qw are no rotation."""
+    """Raise ValueError if a quaternion qx qy qz qw does not have length 1. The message names its row in `path`."""
     wrong = np.flatnonzero(~(np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROTATION_TOLERANCE))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
@@ -49,8 +51,8 @@ def check_quaternions(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> None
 
 
 def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return the rotations that qx qy qz qw stand for; ValueError naming the first row of `path` with none."""
-    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+    """Convert quaternions qx qy qz qw to rotation matrices. Raises what `check_quaternions` raises."""
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     check_quaternions(path, quaternions)
     return Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
@@ -59,8 +61,9 @@ def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.
 def read_times(path: Path) -> Float[np.ndarray, " n"]:
     """Return the times (n,) in seconds of a file with one number a line.
 
-    Raises FileNotFoundError, and ValueError naming the first line that is no finite number or the first row whose time
-    is smaller than the one before.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line is not a finite number, or `check_times` fails. The message names the line or row.
     """
     times = read_rows(path, columns=1)[:, 0]
     check_times(path, times)
@@ -68,13 +71,15 @@ def read_times(path: Path) -> Float[np.ndarray, " n"]:
 
 
 def check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
-    """Raise ValueError naming the first row of numbers in `path` whose time is smaller than the one before.
+    """Raise ValueError if a time is smaller than the previous one. The message names its row in `path`.
 
-    Times that are no seconds are refused too: rules such as "30 s older" would mean something else.
+    Times in smaller units than seconds are rejected, too. Limits such as "30 s older" would be wrong for them.
     """
     late = np.flatnonzero(np.abs(times) > LATEST_S)
     if late.size:
-        raise ValueError(f"{path}, row {late[0] + 1}: expected seconds, found {times[late[0]]:g}: a smaller unit?")
+        raise ValueError(
+            f"{path}, row {late[0] + 1}: expected seconds, found {times[late[0]]:g}; is it in a smaller unit?"
+        )
     backwards = np.flatnonzero(np.diff(times) < 0)
     if backwards.size:
         row = int(backwards[0]) + 2
@@ -82,9 +87,15 @@ def check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
 
 
 def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
-    """Return the row of each frame in `path`, a file with `rows` rows: frame "000052" is row 52.
+    """Return the row of each frame in a file. Frame "000052" is row 52.
 
-    Raises ValueError where an id is no number, or the file has too few rows.
+    Arguments:
+      ids: Names of the frames.
+      rows: Number of rows in the file.
+      path: Path of the file, for messages.
+
+    Raises:
+      ValueError: If an id is not a number, or the file has too few rows.
     """
     strange = [name for name in ids if not name.isdecimal()]
     if strange:
@@ -98,13 +109,22 @@ def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:
 def read_rows(
     path: Path, *, columns: int, header_lines: int = 0, separator: str | None = None
 ) -> Float[np.ndarray, "n {columns}"]:
-    """Return the numbers (n, columns) of a text file, one row a line after so many lines of header.
+    """Return the numbers (n, columns) of a text file with one row a line. Lines that start with # are skipped.
 
-    Columns stand apart by `separator`; None: by white space. Lines that start with # say nothing. Raises
-    FileNotFoundError, and ValueError naming the first line without as many finite numbers.
+    Arguments:
+      path: Text file.
+      columns: Number of columns.
+      header_lines: Number of header lines to skip.
+      separator: Separator of the columns. By default, white space.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line does not have `columns` finite numbers. The message names the first one.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {columns} numbers a line, one line per frame")
+        raise FileNotFoundError(
+            f"{path}: expected a file with {columns} numbers a line, one line per frame, found none"
+        )
     lines = path.read_text(errors="replace").rstrip().splitlines()
     numbers = [i for i, line in enumerate(lines) if i >= header_lines and not line.startswith("#")]
     values = np.empty((len(numbers), columns))
@@ -114,13 +134,13 @@ def read_rows(
 
 
 def columns_of(path: Path) -> int:
-    """Return how many words the first line of a text file has that is no comment; 0 for none."""
+    """Return the number of columns in the first line that is not empty or a comment, or 0 for an empty file."""
     lines = path.read_text(errors="replace").splitlines()
     return len(next((line.split() for line in lines if line.strip() and not line.startswith("#")), []))
 
 
 def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.ndarray, " {columns}"]:
-    """Return words as numbers; ValueError, which begins with `where`, unless there are `columns` finite ones."""
+    """Convert words to numbers. Raises ValueError, prefixed by `where`, unless they are `columns` finite numbers."""
     if len(words) != columns:
         raise ValueError(f"{where}: expected {columns} numbers, found {len(words)}")
     text = " ".join(words)
@@ -128,7 +148,7 @@ def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.nd
         values = np.array(words, dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"{where}: expected numbers, found {text!r:.200}") from error
-    if "_" in text or not text.isascii():  # Python takes 1_0 for 10
+    if "_" in text or not text.isascii():  # Python parses 1_0 as 10
         raise ValueError(f"{where}: expected numbers, found {text!r:.200}")
     finite = np.isfinite(values)
     if not finite.all():

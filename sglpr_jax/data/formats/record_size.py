@@ -1,12 +1,16 @@
-"""Finds how many numbers each point of headerless scans has: the reading under which all files look like scans.
+"""Detects the record format of headerless scans: the format with which the files look like scans.
 
-Read with a wrong record, the columns of a file get mixed. Then coordinates are no longer metres, or the rows differ in
-turn: of float32x6 read as float32x4 every third row begins with x. So a reading fits where
+A wrong record format mixes the columns of a file. Then the coordinates are no longer metres, or the rows differ
+periodically. If float32x6 is read as float32x4, for example, only every third row begins with x. A format therefore
+fits if
 
-- nearly all coordinates are finite and within 300 m, half of them within 120 m, and few are next to nothing;
-- rows of every turn (each fifth to eighth, and so each second to fourth) look into the same directions, as far.
+- nearly all coordinates are finite and within 300 m, half of the points are within 120 m, and few coordinates are
+  almost 0;
+- for periods of 5 to 8 rows (which include periods of 2 to 4), the rows of each phase have similar distributions of
+  directions and distances.
 
-Of two readings that fit, one with a multiple of the columns of the other is the same points in twos or threes.
+If two formats fit and one record is a multiple of the other, the larger one combines several points. The smaller one is
+used.
 """
 
 from collections.abc import Sequence
@@ -22,40 +26,47 @@ from sglpr_jax.data.warning import warn
 from sglpr_jax.files import in_short
 
 MOST_M = 300.0
-"""Coordinates lie within so many metres, all but a share of `STRANGE`."""
+"""Maximum absolute coordinate in metres, for all points but a fraction of `STRANGE`."""
 USUAL_M = 120.0
-"""Half of the points are nearer than this on the ground."""
+"""Maximum median of the horizontal distance, in metres."""
 LEAST_M = 1e-20
-"""Coordinates that are smaller and not 0 are no measurement but the low half of a wider number."""
+"""Minimum nonzero coordinate in metres. Smaller ones are not measurements but the low half of a wider number."""
 STRANGE = 0.02
+"""Maximum fraction of points that violate a limit."""
 TURNS = (5, 6, 7, 8)
+"""Periods of rows that are compared."""
 DIRECTIONS_APART = 0.12
-"""The most by which the distributions of directions may differ from turn to turn (Kolmogorov-Smirnov)."""
+"""Maximum difference of the distributions of directions between phases (Kolmogorov-Smirnov statistic)."""
 TIMES_AS_FAR = 8.0
-"""The most by which the usual distances may differ from turn to turn."""
+"""Maximum ratio of the median distances between phases."""
 SCALED_M = 1.0
-"""A cloud within this is in no metres."""
+"""Clouds whose coordinates are all within this limit are considered scaled, not in metres."""
 FEWEST = 200
-"""So few points, of all files together, tell nothing."""
+"""Minimum number of points, over all files, for the detection."""
 MOST = 20_000
-"""Points of a file that are looked at."""
+"""Maximum number of points that are read per file."""
 FILES = 5
-"""Files that are looked at."""
+"""Maximum number of files that are read."""
 CANDIDATES: tuple[RecordFormat, ...] = tuple(
     name for name in get_args(RecordFormat) if name not in ("nuscenes", "nclt", "float32x4")
 )
-"""The float32x4 are kitti's; nuscenes are float32x5, and nclt fits nearly all."""
+"""Formats that are tried. kitti covers float32x4, and float32x5 covers nuscenes. nclt would fit almost any file."""
 
 
 def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
-    """Return the format of headerless scans, and in words how it was found; None where they are too few to tell.
+    """Detect the format of headerless scans from a few files, spread over the recording.
 
-    A few of the files are looked at, all over the recording. Some may be broken, most not; what is empty or cannot be
-    read tells nothing. Raises ValueError, with all that was tried, where no reading fits or more than one does.
+    Empty and unreadable files are ignored. Fewer than half of the files may be broken.
+
+    Returns:
+      The format, or None if there are too few points; and a description of how it was detected.
+
+    Raises:
+      ValueError: If no format fits, or several do. The message lists all formats that were tried.
     """
     chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
-        return None, "too few points to find out"
+        return None, "too few points to detect it"
     strange: dict[RecordFormat, str] = {name: strangeness(chosen, name) for name in CANDIDATES}
     fits: list[RecordFormat] = [name for name in CANDIDATES if not strange[name]]
     simplest: list[RecordFormat] = [
@@ -70,15 +81,18 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     )
     wanted = " or ".join(simplest) if simplest else "one of these"
     raise ValueError(
-        f"{paths[0].parent}: expected scans of which one reading fits, found {len(simplest)}; say --format {wanted},"
+        f"{paths[0].parent}: expected scans that fit exactly one format, found {len(simplest)}; pass --format {wanted},"
         f" or nuscenes or nclt ({tried})"
     )
 
 
 def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> RecordFormat | None:
-    """Return the format of scans that are not what their layout says; None where they are, or nothing tells.
+    """Return the format of scans that do not have the format of their dataset layout.
 
-    For own recordings that were put into the layout of a dataset: a record of another size would read as garbage.
+    Users put their own recordings into the layout of a dataset. With another record size, the points would be wrong.
+
+    Returns:
+      The detected format, or None if the scans fit `usual` or no single format is detected.
     """
     chosen = _some(paths)
     if not chosen or not strangeness(chosen, usual):
@@ -90,22 +104,22 @@ def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> R
 
 
 def check_record(paths: Sequence[Path], format: RecordFormat) -> None:
-    """Warn of scans that do not look like scans when they are read as somebody said."""
+    """Warn if the files do not look like scans in the given format."""
     chosen = _some(paths)
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type(format).itemsize:
         return
     if strange := strangeness(chosen, format):
-        warn(f"{paths[0].parent}: expected scans of {described(format)}, found that {strange}")
+        warn(f"{paths[0].parent}: expected scans of {described(format)}, found {strange}")
 
 
 def _some(paths: Sequence[Path]) -> list[Path]:
-    """A few files, all over the recording, without those that tell nothing: a crash leaves the last one empty."""
+    """A few files, spread over the recording, without empty and unreadable ones. A crash leaves the last file empty."""
     chosen = (paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, FILES).astype(int)))
     return [path for path in chosen if _has_bytes(path)]
 
 
 def _has_bytes(path: Path) -> bool:
-    """Whether there is anything to read: not in an empty file, behind a dangling link, or without permission."""
+    """Whether the file can be read and is not empty. False for dangling links and missing permissions."""
     try:
         with path.open("rb") as stream:
             return bool(stream.read(1))
@@ -114,7 +128,7 @@ def _has_bytes(path: Path) -> bool:
 
 
 def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
-    """Return "" where most of these files, read so, look like scans, else what is strange about them."""
+    """Return "" if most files look like scans in this format, or else a description of the difference."""
     clouds, reasons = [], []
     for path in paths:
         points, reason = _coordinates(path, format)
@@ -126,15 +140,15 @@ def strangeness(paths: Sequence[Path], format: RecordFormat) -> str:
 
 
 def _coordinates(path: Path, format: RecordFormat) -> tuple[Float[np.ndarray, "n 3"], str]:
-    """The first points of a file, NaN where there was no return; and what is strange about them."""
+    """The first points of a file, NaN if there was no return; and a description of invalid coordinates."""
     nothing, width = np.zeros((0, 3)), record_type(format).itemsize
     try:
         if path.stat().st_size % width:
-            return nothing, f"no whole number of {width} bytes"
+            return nothing, f"a size that is not a multiple of {width} bytes"
         with np.errstate(invalid="ignore"):
             points = read_records(path, format).points[:MOST].astype(np.float64)
-    except (OSError, ValueError) as error:  # a bad disk, or a file that is being written: the others may tell
-        return nothing, f"not readable ({in_short(error)})"
+    except (OSError, ValueError) as error:  # a disk error, or a file that is being written
+        return nothing, f"an unreadable file ({in_short(error)})"
     missing = np.isnan(points).all(axis=1) | (points == 0).all(axis=1)
     points[missing] = np.nan
     return points, _strange_range(points[~missing])
@@ -147,8 +161,8 @@ def _strange_range(points: Float[np.ndarray, "n 3"]) -> str:
     shares = {
         "not finite": ~finite,
         f"beyond {MOST_M:g} m": (size > MOST_M).any(axis=1),
-        f"nearer to an axis than {LEAST_M:g} m": ((size < LEAST_M) & (size > 0)).any(axis=1),
-        "1 m away, as normals are": np.abs(np.linalg.norm(np.where(size < 2, size, 9), axis=1) - 1) < 1e-4,
+        f"with a nonzero coordinate below {LEAST_M:g} m": ((size < LEAST_M) & (size > 0)).any(axis=1),
+        "1 m away, like normals": np.abs(np.linalg.norm(np.where(size < 2, size, 9), axis=1) - 1) < 1e-4,
     }
     for what, where in shares.items():
         if where.mean() > STRANGE:
@@ -156,9 +170,9 @@ def _strange_range(points: Float[np.ndarray, "n 3"]) -> str:
     if np.median(np.hypot(*size[finite, :2].T)) > USUAL_M:
         return f"half of the points beyond {USUAL_M:g} m"
     if size[finite].max() <= SCALED_M:
-        return f"all points within {SCALED_M:g} m, as in clouds that are scaled"
+        return f"all points within {SCALED_M:g} m, as in scaled clouds"
     flat = [axis for axis, spread in zip("xy", np.ptp(points[finite, :2], axis=0), strict=True) if spread < 0.1]
-    return f"all points have one {flat[0]}" if flat else ""
+    return f"all points with the same {flat[0]}" if flat else ""
 
 
 def _strange_turns(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> str:
@@ -170,32 +184,32 @@ def _strange_turns(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> str:
         looks, turned, far = ([_each(value, start, turn) for start in range(turn)] for value in values)
         fewest = min(map(len, looks))
         if fewest < FEWEST / 2 / turn:
-            return f"each {turn}th point is missing"
+            return f"every {turn}th point missing"
         apart = max(_apart(angles[0], other) for angles in (looks, turned) for other in angles[1:])
         if apart > DIRECTIONS_APART + 1.6 * np.sqrt(2 / fewest):
-            return f"each {turn}th point looks elsewhere"
+            return f"every {turn}th point in another direction"
         usual = [np.median(values) for values in far]
         if max(usual) > TIMES_AS_FAR * min(usual):
-            return f"each {turn}th point is elsewhere"
+            return f"every {turn}th point at another distance"
     return ""
 
 
 def _each(values: Sequence[Float[np.ndarray, "_"]], start: int, turn: int) -> Float[np.ndarray, "_"]:
-    """Every `turn`-th value of all files from `start` on, without NaN."""
+    """Every `turn`-th value of each file, beginning with `start`, without NaN."""
     found = np.concatenate([each[start::turn] for each in values])
     return found[~np.isnan(found)]
 
 
 def _apart(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> float:
-    """The largest difference of two empirical distribution functions."""
+    """Maximum difference of two empirical distribution functions."""
     a, b = np.sort(a), np.sort(b)
-    both = np.concatenate([a, b])  # two sorted halves: a search of numbers in order takes a fraction of the time
+    both = np.concatenate([a, b])  # both halves are sorted, which makes searchsorted fast
     a_below, b_below = (np.searchsorted(x, both, side="right") / len(x) for x in (a, b))
     return float(np.abs(a_below - b_below).max())
 
 
 def _repeats(name: RecordFormat, other: RecordFormat) -> bool:
-    """Whether a record is several of another, number for number."""
+    """Whether a record consists of several records of `other`."""
     this, smaller = record_type(name), record_type(other)
     same = this["xyz"].base == smaller["xyz"].base
     return same and this.itemsize % smaller.itemsize == 0

@@ -1,4 +1,4 @@
-"""ROS recordings by rosbags (extra `ros`): .bag, .mcap, and folders of ROS 2."""
+"""Reads ROS bags with rosbags (extra `ros`): .bag, .mcap, and ROS 2 folders."""
 
 import itertools
 import threading
@@ -17,11 +17,11 @@ from sglpr_jax.data.formats.ros_poses import POSES, TRANSFORMS, read_transforms
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, tracks_of
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
-"""Types of messages that are scans."""
+"""Message types of scans."""
 
 
 class RosBag:
-    """An open recording. It is closed when nobody holds it any longer."""
+    """An open bag. It is closed when the object is garbage-collected."""
 
     def __init__(self, paths: Sequence[Path]):
         self.paths = tuple(paths)
@@ -32,12 +32,12 @@ class RosBag:
 
     @property
     def topics(self) -> dict[str, str]:
-        """All topics, and the type of each one's messages."""
+        """All topics, with their message types."""
         return {connection.topic: connection.msgtype for connection in self._reader.connections}
 
     @property
     def cloud_topics(self) -> tuple[str, ...]:
-        """The topics of point clouds. Raises ValueError, with all topics there are, where there is none."""
+        """Point cloud topics. Raises ValueError, with a list of all topics, if the bag has no point clouds."""
         topics = self.topics
         clouds = tuple(sorted(topic for topic, kind in topics.items() if kind in CLOUDS))
         if not clouds:
@@ -49,49 +49,49 @@ class RosBag:
 
     @property
     def pose_topics(self) -> tuple[str, ...]:
-        """The topics of poses."""
+        """Pose topics."""
         return tuple(sorted(topic for topic, kind in self.topics.items() if kind in POSES))
 
     def stamps(self, topic: str) -> Stamps:
-        """When the messages of a topic were made. Reads the bag once. Raises ValueError for a broken one."""
+        """Read the timestamps of a topic, in one pass over the bag. Raises ValueError if the bag is broken."""
         with self._lock, _broken(self.paths[0]):
             found = [(time, message.header().time) for time, message in self._messages(topic)]
         return Stamps(np.array([time for time, _ in found], np.int64), np.array([time for _, time in found], float))
 
     def track(self, topic: str) -> Track:
-        """The poses on a topic of poses, those that are finite. Reads the bag once."""
+        """Read the poses of a pose topic, in one pass over the bag. Poses with non-finite positions are dropped."""
         read = POSES[self.topics[topic]]
         with self._lock, _broken(self.paths[0]):
             return Track.of((time, read(message)) for time, message in self._messages(topic))
 
     def transforms(self) -> list[Track]:
-        """What tf says: the poses of each frame in its parent's. Reads the bag once for each topic of tf."""
+        """Read the tf transforms: the poses of each frame in its parent frame. Needs one pass for each tf topic."""
         topics = sorted(topic for topic, kind in self.topics.items() if kind in TRANSFORMS)
         with self._lock, _broken(self.paths[0]):
             messages = [pair for topic in topics for pair in self._messages(topic)]
             return tracks_of((time, pose) for time, message in messages for pose in read_transforms(message))
 
     def frame(self, topic: str, time: int) -> str:
-        """The frame of a message recorded at this time (ns), as its header says."""
+        """Return the frame in the header of the message recorded at `time` (ns)."""
         with self._lock, _broken(self.paths[0]):
             return next(self._messages(topic, time))[1].header().frame
 
     def cloud(self, topic: str, time: int, nth: int) -> Records:
-        """The `nth` cloud of a topic among those recorded at this time (ns). Raises ValueError for a broken one."""
+        """Return the `nth` cloud among those of a topic recorded at `time` (ns). Raises ValueError if it is broken."""
         with self._lock, _broken(self.paths[0]):
             if self.topics[topic] in CUSTOM_MSG:
                 return read_custom_msg(next(itertools.islice(self._messages(topic, time), nth, None))[1])
             return read_point_cloud2(self._point_cloud2(topic, time, nth))
 
     def fields(self, topic: str, time: int) -> str:
-        """The fields of a cloud, in words."""
+        """Return a description of the fields of a cloud."""
         if self.topics[topic] in CUSTOM_MSG:
             return f"Livox, {' '.join(POINT)}"
         with self._lock, _broken(self.paths[0]):
             return described_fields(self._point_cloud2(topic, time, 0))
 
     def _messages(self, topic: str, time: int | None = None) -> Iterator[tuple[int, RosMessage]]:
-        """The messages of a topic, or those recorded at one time (ns), with their times."""
+        """Messages of a topic, or only those recorded at one time (ns), with their times."""
         for _, recorded, raw in self._raw(topic, time):
             yield recorded, RosMessage(raw, cdr=self._reader.is2)
 
@@ -106,7 +106,7 @@ class RosBag:
 
 
 class _broken:
-    """Turns what rosbags raises inside into one ValueError that names the bag."""
+    """Converts exceptions of rosbags to a ValueError that names the bag."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -117,7 +117,7 @@ class _broken:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, ImportError | FileNotFoundError):
             said = str(error) or type(error).__name__
-            raise ValueError(f"{self._path}: expected a whole recording of ROS, found a broken one ({said})") from error
+            raise ValueError(f"{self._path}: expected an intact ROS bag, found a broken one ({said})") from error
 
 
 def _open(paths: tuple[Path, ...]) -> Any:

@@ -1,7 +1,7 @@
-"""Serialised messages of ROS, read field by field: for what rosbags is slow at, since it makes an object of each part.
+"""Reads serialised ROS messages field by field. rosbags is slower, because it creates an object for each part.
 
-ROS 1 packs fields without a gap, little-endian. ROS 2 (CDR) begins with four bytes that tell the byte order; behind
-them a number stands at a multiple of its size.
+ROS 1 packs the fields without padding, in little-endian order. ROS 2 (CDR) begins with four bytes that contain the byte
+order. After them, each number is aligned to its size.
 """
 
 from typing import NamedTuple
@@ -13,12 +13,12 @@ class Header(NamedTuple):
     """std_msgs/Header."""
 
     time: float
-    """Seconds."""
+    """Timestamp in seconds."""
     frame: str
 
 
 class RosMessage:
-    """The bytes of a message, and how far they are read. Reading beyond the end raises ValueError."""
+    """A message and a read position. Reading beyond the end raises ValueError."""
 
     def __init__(self, raw: bytes, *, cdr: bool):
         self._raw = raw
@@ -27,30 +27,30 @@ class RosMessage:
         self._at = 4 if cdr else 0
 
     def numbers(self, kind: str, count: int = 1) -> np.ndarray:
-        """Return the next numbers of one kind, such as "f8"."""
+        """Read the next `count` numbers of a type such as "f8"."""
         return self._next(np.dtype(f"{self._order}{kind}"), count)
 
     def text(self) -> str:
-        """Return the next string."""
+        """Read the next string."""
         length = int(self.numbers("u4")[0])
         return self.numbers("u1", length).tobytes().rstrip(b"\0").decode(errors="replace")
 
     def header(self) -> Header:
-        """Return the header, with which messages of sensors begin."""
+        """Read the header at the start of a sensor message."""
         if not self._cdr:
-            self.numbers("u4")  # ROS 1 counts its messages
+            self.numbers("u4")  # sequence number of ROS 1
         seconds, nanoseconds = int(self.numbers("i4")[0]), int(self.numbers("u4")[0])
         return Header(seconds + nanoseconds / 1e9, self.text())
 
     def records(self, fields: dict[str, str]) -> np.ndarray:
-        """Return the next sequence of records, whose fields are numbers of 4 bytes first, then of 1 byte."""
+        """Read the next sequence of records. Fields of 4 bytes must precede fields of 1 byte."""
         count = int(self.numbers("u4")[0])
         packed = np.dtype([(name, f"{self._order}{kind}") for name, kind in fields.items()])
         padding = -packed.itemsize % 4 if self._cdr else 0
         names, offsets = list(fields), [packed.fields[name][1] for name in fields]  # pyright: ignore
         formats, size = [packed[name] for name in names], packed.itemsize + padding
         padded = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
-        found = self._next(padded, max(count - 1, 0))  # behind the last one there is no padding
+        found = self._next(padded, max(count - 1, 0))  # the last record has no padding
         return np.concatenate([found, self._next(packed, min(count, 1)).astype(found.dtype)])
 
     def _next(self, kind: np.dtype, count: int) -> np.ndarray:

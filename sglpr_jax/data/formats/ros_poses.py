@@ -1,4 +1,4 @@
-"""Poses among the messages of a bag: nav_msgs/Odometry, geometry_msgs/PoseStamped, and those of tf."""
+"""Reads poses from ROS messages: nav_msgs/Odometry, geometry_msgs/PoseStamped and tf."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -10,16 +10,16 @@ from sglpr_jax.data.formats.ros_message import RosMessage
 
 
 class StampedPose(NamedTuple):
-    """Where something was, and how it was turned."""
+    """Pose of a child frame in a frame, with its time."""
 
     time: float
-    """Seconds, of the message's header."""
+    """Time in the header of the message, in seconds."""
     child: str
-    """What was there: "base_link"; empty where the message does not say."""
+    """Child frame, such as "base_link". Empty if the message does not name it."""
     frame: str
-    """In which frame: "odom"."""
+    """Reference frame, such as "odom"."""
     numbers: Float[np.ndarray, " 7"]
-    """x, y, z in metres, and a quaternion x, y, z, w."""
+    """Position x, y, z in metres, and quaternion x, y, z, w."""
 
 
 def _odometry(message: RosMessage) -> StampedPose:
@@ -33,7 +33,7 @@ def _pose_stamped(message: RosMessage) -> StampedPose:
 
 
 def read_transforms(message: RosMessage) -> Iterator[StampedPose]:
-    """The transforms of a message of tf: each is the pose of its child frame in its header's."""
+    """Read the transforms of a tf message. Each is the pose of its child frame in the frame of its header."""
     for _ in range(int(message.numbers("u4")[0])):
         yield _odometry(message)  # header, child, and the same seven numbers
 
@@ -42,6 +42,6 @@ POSES: dict[str, Callable[[RosMessage], StampedPose]] = {
     "nav_msgs/msg/Odometry": _odometry,
     "geometry_msgs/msg/PoseStamped": _pose_stamped,
 }
-"""Types of messages that tell where the vehicle is."""
+"""Message types with poses of the vehicle, and their readers."""
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-"""Types of messages of tf."""
+"""Message types of tf."""

@@ -1,4 +1,4 @@
-"""The way of something through a bag, one pose a message; and how frames that do not move lie to each other (tf)."""
+"""Tracks of frames through a bag, with one pose per message, and transforms between static frames (tf)."""
 
 import dataclasses
 from collections import defaultdict
@@ -12,45 +12,45 @@ from sglpr_jax.data.formats.ros_poses import StampedPose
 from sglpr_jax.data.formats.timed_poses import poses_of
 
 UNIT = 0.01
-"""A quaternion's length may be off by so much."""
+"""Maximum deviation of the length of a quaternion from 1."""
 
 
 class Stamps(NamedTuple):
-    """When the messages of a topic were made."""
+    """Timestamps of the messages of a topic."""
 
     recorded: Int64[np.ndarray, " n"]
-    """By the recorder, nanoseconds."""
+    """Times of the recorder, in nanoseconds."""
     own: Float[np.ndarray, " n"]
-    """By their own headers, seconds."""
+    """Times in the headers of the messages, in seconds."""
 
     @property
     def orderly(self) -> bool:
-        """Whether their own times are some, and do not go back."""
+        """Whether the header times are positive and never decrease."""
         return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all())
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:
-        """Their own times where these are orderly, else the recorder's."""
+        """Header times in seconds if they are orderly, or else the recorder's times."""
         return self.own if self.orderly else self.recorded / 1e9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Track:
-    """The poses on a topic."""
+    """Poses of a topic."""
 
     stamps: Stamps
     positions: Float[np.ndarray, "n 3"]
-    """Metres."""
+    """Positions in metres."""
     quaternions: Float[np.ndarray, "n 4"]
-    """x, y, z, w, as they are written; see `turned`."""
+    """Quaternions x, y, z, w. They are not normalised and may be invalid; see `turned`."""
     child: str
-    """What moves: "base_link"; empty where the messages do not say."""
+    """Child frame, such as "base_link". Empty if the messages do not name it."""
     frame: str
-    """In which frame: "odom"."""
+    """Reference frame, such as "odom"."""
 
     @classmethod
     def of(cls, found: Iterable[tuple[int, StampedPose]]) -> "Track":
-        """The poses whose positions are finite, with the times at which they were recorded (ns)."""
+        """Create a track from recorder times (ns) and poses. Poses with non-finite positions are dropped."""
         kept = [(time, pose) for time, pose in found if np.isfinite(pose.numbers[:3]).all()]
         numbers = np.array([pose.numbers for _, pose in kept], np.float64).reshape(-1, 7)
         stamps = Stamps(np.array([t for t, _ in kept], np.int64), np.array([pose.time for _, pose in kept], float))
@@ -62,7 +62,7 @@ class Track:
 
     @property
     def turned(self) -> bool:
-        """Whether the quaternions tell rotations: a GPS receiver leaves them at zero, or at one that never changes."""
+        """Whether the quaternions are valid rotations that change. A GPS receiver writes zeros or a constant."""
         with np.errstate(invalid="ignore"):
             lengths = np.linalg.norm(self.quaternions, axis=1)
         return bool(len(self) and (np.abs(lengths - 1) <= UNIT).all() and np.ptp(self.quaternions, axis=0).any())
@@ -78,7 +78,7 @@ class Track:
 
 
 def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
-    """The transforms of tf, those of a child frame in its parent's together."""
+    """Group tf transforms into one track for each pair of child and parent frame."""
     found: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
     for time, pose in transforms:
         named = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
@@ -87,8 +87,8 @@ def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
 
 
 def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
-    """frame_from_other, through frames that do not move to each other; None where these do not join the two."""
-    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+    """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:

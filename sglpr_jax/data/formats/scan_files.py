@@ -1,4 +1,4 @@
-"""Single-scan files: points of every format that is known, labels from SemanticKITTI's."""
+"""Reads single scans: points in all supported formats, and SemanticKITTI labels."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,11 +21,11 @@ READERS: dict[ScanFormat, Callable[[Path], Float32[np.ndarray, "n 3"]]] = {
     "npz": read_npz,
     "las": read_las,
 }
-"""The formats with a header; each is the ending of its files too."""
+"""Readers of formats with a header. The name of each format is also its file ending."""
 ENDINGS = (".bin", ".pcd", ".ply")
-"""Of files that are scans."""
+"""File endings of scans."""
 ARRAY_ENDINGS = (".npy", ".npz", ".las")
-"""Of files that are scans where none of the others lie beside them: else they are descriptors, poses or a map."""
+"""File endings of scans in folders without files of `ENDINGS`. Beside them, they are descriptors, poses or a map."""
 
 
 def scan_id(path: Path) -> str:
@@ -35,10 +35,10 @@ def scan_id(path: Path) -> str:
 
 
 def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
-    """Return the format that "auto" stands for.
+    """Return the format of a scan by its name, for "auto".
 
-    Files with a header go by their ending, `*.pcd.bin` is nuscenes, a file in a folder `velodyne_sync` is nclt. Any
-    other .bin does not say what it holds: it is `records`.
+    The ending defines the format of files with a header. `*.pcd.bin` is nuscenes. A file in a folder `velodyne_sync` is
+    nclt. The name of any other .bin file does not define a format; it is `records`.
     """
     for format in READERS:
         if path.suffix.lower() == f".{format}":
@@ -49,23 +49,31 @@ def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
 
 
 def says_its_format(path: Path) -> bool:
-    """Whether the name of a scan file tells what it holds."""
+    """Whether the name of a scan file defines its format."""
     return guess_format(path) != "kitti"
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
     """Return the points (n, 3) of one scan in metres: x forward, y left, z up. Intensities are dropped.
 
+    Points that are not finite are kept, so that labels still match. The rasteriser drops them.
+
     - kitti: float32 x, y, z, intensity.
     - nuscenes: float32 x, y, z, intensity, ring. Its x points right and its y forward, so (x, y, z) becomes (y, -x, z).
     - nclt: uint16 x, y, z and two bytes; metres = value * 0.005 - 100, decoded in float64. Its y points right and its z
-      down, so both are negated: a rotation, where negating z alone would mirror the scan.
-    - float32x5, float64x3 and so on: so many numbers a point, x, y and z first; the axes stay as they are.
-    - pcd, ply, npy, npz, las: see their readers; the axes stay as they are.
+      down, so both are negated. This is a rotation; negating only z would mirror the scan.
+    - float32x5, float64x3 and so on: 5 or 3 numbers per point, beginning with x, y, z. The axes are not changed.
+    - pcd, ply, npy, npz, las: see their readers. The axes are not changed.
 
-    "auto" goes by the name, and takes a .bin that says nothing for kitti; `find_record` looks into the files. Points
-    that are not finite are kept, so that labels still fit; the rasteriser drops them. Raises FileNotFoundError, and
-    ValueError for another format, and where the file is empty or its size is no whole number of points.
+    Arguments:
+      path: File of the scan.
+      format: Format of the scan. "auto" uses the name of the file. If the name does not define the format, a .bin file
+        is read as kitti. (`find_record` detects the format from the content of several files.)
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the format is unknown, or the file is empty or malformed.
+      ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     return read_points_and_lasers(Path(path), format=format)[0]
 
@@ -73,13 +81,20 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 def read_points_and_lasers(
     path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti"
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """Return what `read_scan` does and, from the same read, the number of the laser that each point is from.
+    """Return the points as `read_scan` does, and the laser number of each point.
 
-    The numbers are those of the file (nuscenes, nclt), else None. `records` is what "auto" takes a .bin for that says
-    nothing. Raises what `read_scan` raises.
+    Raises what `read_scan` raises.
+
+    Arguments:
+      path: File of the scan.
+      format: Format of the scan.
+      records: Format of .bin files whose name does not define it, for "auto".
+
+    Returns:
+      Points, and laser numbers from the file (nuscenes, nclt) or None.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: expected a scan, found none")
     check_value(format, ScanFormat, f"{path}, format")
     known = guess_format(path, records=records) if format == "auto" else format
     if is_record(known):
@@ -88,12 +103,18 @@ def read_points_and_lasers(
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:
-    """Return the raw SemanticKITTI ids (n,) of a .label file; the instance number in the upper 16 bits is dropped.
+    """Return the raw SemanticKITTI ids (n,) of a .label file. The instance number in the upper 16 bits is dropped.
 
-    Raises FileNotFoundError, and ValueError where the file has not 4 bytes for each of the scan's `points`.
+    Arguments:
+      path: File of the labels.
+      points: Number of points of the scan.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file does not have 4 bytes for each point.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: expected labels, found none")
     size = path.stat().st_size
     if size != 4 * points:
         raise ValueError(f"{path}: expected {points} labels of 4 bytes, one per point of its scan, found {size} bytes")

@@ -1,4 +1,4 @@
-"""A pose for each scan from a pose file: row by row, or at the time of the scan where the file has times of its own."""
+"""Assigns a pose to each scan: row by row, or by interpolation if the pose file has its own times."""
 
 from typing import NamedTuple
 
@@ -8,19 +8,20 @@ from jaxtyping import Bool, Float
 from sglpr_jax.data.formats.timed_poses import WIDEST_S, interpolate, interpolate_turns, poses_of
 
 SAME_S = 0.001
-"""Times that differ by less are the same, written by another program."""
+"""Maximum difference of equal times, in seconds. Programs round times differently."""
 LEAST_SHARE = 0.5
-"""Of the scans must have poses about their times, for a file to be of this drive and clock."""
+"""Minimum fraction of scans with a pose. Below it, the pose file belongs to another drive or clock."""
 
 
 class ScanPoses(NamedTuple):
-    """Which scans have a pose, and how they came by it."""
+    """Poses of the scans."""
 
     kept: Bool[np.ndarray, " n"]
+    """True for scans with a pose."""
     poses: Float[np.ndarray, "k 4 4"]
-    """Of the scans that are kept."""
+    """Poses of the scans with a pose."""
     said: str
-    """How the file's times were brought together with those of the scans, for a person; "" where they are the same."""
+    """Description of how poses and scans were matched. Empty if their times are equal or unknown."""
 
 
 def poses_at_scans(
@@ -32,11 +33,23 @@ def poses_at_scans(
     scans: int,
     of: str,
 ) -> ScanPoses:
-    """The poses of a file, `source`, at the scans: those of its rows, unless there are more, fewer, or of other times.
+    """Assign a pose to each scan.
 
-    These are interpolated; scans more than 1 s between two poses, or before the first and after the last, are not kept.
-    `stamps` and `times` (seconds) are those of the poses and of the scans, `of` says what a row is for: "scan of 08".
-    Raises ValueError where most scans have no pose, and for more or fewer rows where nothing tells the times.
+    If the numbers of poses and scans are equal and their times do not differ, poses are assigned row by row. This also
+    applies to `stamps` that merely count rows, and to `stamps` with another origin but the same intervals. Otherwise
+    the poses are interpolated. A scan has no pose if the poses before and after it are more than 1 s apart, or if it is
+    more than 0.1 s before the first pose or after the last one.
+
+    Arguments:
+      source: Name of the pose file, for messages.
+      poses: Poses in the file.
+      stamps: Times of the poses in seconds, or None.
+      times: Times of the scans in seconds, or None.
+      scans: Number of scans.
+      of: What a row belongs to, for messages: "scan of 08".
+
+    Raises:
+      ValueError: If fewer than half of the scans have a pose, or if interpolation is needed and times are missing.
     """
     if len(poses) == scans and (said := _row_by_row(stamps, times)) is not None:
         return ScanPoses(np.ones(scans, bool), poses, said)
@@ -53,15 +66,12 @@ def poses_at_scans(
 
 
 def unturned(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:
-    """Poses at these positions, not turned: for files of which positions are all that is used."""
+    """Poses at these positions with identity rotations, for files whose rotations are not used."""
     return poses_of(positions, np.tile(np.eye(3), (len(positions), 1, 1)))
 
 
 def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
-    """What is said of row i being scan i; None where the times speak against it.
-
-    Some programs count rows for want of times, 0, 1, 2, ..., and some begin at 0: the steps are those of the scans.
-    """
+    """Description of a match row by row, or None if the times contradict it."""
     if stamps is None or times is None or np.array_equal(stamps, np.arange(len(stamps))):
         return ""
     behind = times - stamps
@@ -69,14 +79,14 @@ def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray,
         return ""
     elsewhere = stamps[-1] < times[0] or times[-1] < stamps[0]
     if elsewhere and np.ptp(behind) <= SAME_S:
-        return f"row by row: their steps are those of the scans, {behind.mean():.1f} s later"
+        return f"row by row: the scans have the same intervals and start {behind.mean():.1f} s later"
     return None
 
 
 def _turned(
     poses: Float[np.ndarray, "m 4 4"], stamps: Float[np.ndarray, " m"], times: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     return interpolate_turns(stamps, Rotation.from_matrix(poses[:, :3, :3]).as_quat(), times)
 
@@ -86,10 +96,10 @@ def _expected(scans: int, of: str) -> str:
 
 
 def _other_clock(source: str, stamps: Float[np.ndarray, " m"], times: Float[np.ndarray, " n"], of: str) -> str:
-    """What is said of poses whose times are not those of the scans."""
-    found = f"found {len(stamps)} of {stamps[0]:.1f} to {stamps[-1]:.1f} s"
-    by_row = "; if row i belongs to scan i all the same, write 12 numbers a line, without times"
+    """Error message for poses whose times differ from those of the scans."""
+    found = f"found {len(stamps)} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
+    by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
     return (
-        f"{source}: {_expected(len(times), of)}, at its time, or poses at most {WIDEST_S:g} s apart about the times of "
-        f"these, {times[0]:.1f} to {times[-1]:.1f} s, {found}{by_row if len(stamps) == len(times) else ''}"
+        f"{source}: {_expected(len(times), of)}, at its time, or poses at most {WIDEST_S:g} s apart that cover the "
+        f"scans, {times[0]:.1f} to {times[-1]:.1f} s, {found}{by_row if len(stamps) == len(times) else ''}"
     )

@@ -1,4 +1,4 @@
-"""Poses that were measured at other times than the scans: for each scan the nearest one, or one between two."""
+"""Matches poses to scans with other times: nearest pose, or interpolation."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -7,27 +7,28 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
 WIDEST_S = 1.0
-"""Between poses farther apart in time nothing is interpolated."""
+"""Maximum time between two poses for interpolation, in seconds."""
 BEYOND_S = 0.1
-"""A scan may come so much before the first pose, or after the last."""
+"""Maximum time of a scan before the first pose or after the last one, in seconds."""
 
 
 class Matched(NamedTuple):
-    """Which scans have a pose near enough in time, and which."""
+    """Nearest poses of the scans."""
 
     kept: Bool[np.ndarray, " q"]
+    """True for scans with a pose near enough in time."""
     rows: Int[np.ndarray, " k"]
-    """Of the scans that are kept."""
+    """Row of the nearest pose, for the scans with a pose."""
 
     def described(self, file: str, *, max_gap_s: float) -> str:
-        """The pose file, and how many scans are left out."""
+        """Return the name of the pose file, with the number of skipped scans if there are any."""
         left_out = len(self.kept) - int(self.kept.sum())
         said = f"{file} ({left_out} of {len(self.kept)} scans left out: no pose within {max_gap_s:g} s)"
         return said if left_out else file
 
 
 def nearest_rows(stamps: Int64[np.ndarray, " n"], times: Int64[np.ndarray, " q"]) -> Int[np.ndarray, " q"]:
-    """Return which of the ordered `stamps` is nearest to each of `times`, the earlier one of two equally near."""
+    """Return the row of the nearest of the ordered `stamps` for each of `times`. Ties go to the earlier one."""
     later = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
     earlier = (later - 1).clip(0)
     return np.where(np.abs(times - stamps[earlier]) <= np.abs(stamps[later] - times), earlier, later)
@@ -42,9 +43,18 @@ def match_times(
     poses: Path,
     scans: Path,
 ) -> Matched:
-    """Return the nearest of the poses' `stamps` for the scans' `times`, both in ticks of `tick_s` seconds.
+    """Find the nearest pose of each scan.
 
-    Raises ValueError, which names both files, where no scan has a pose within `max_gap_s` seconds.
+    Arguments:
+      stamps: Times of the poses, in ticks.
+      times: Times of the scans, in ticks.
+      tick_s: Duration of a tick, in seconds.
+      max_gap_s: Maximum time between a scan and its pose, in seconds.
+      poses: Pose file, for messages.
+      scans: Folder of the scans, for messages.
+
+    Raises:
+      ValueError: If no scan has a pose within `max_gap_s`.
     """
     order = np.argsort(stamps, kind="stable")
     rows = order[nearest_rows(stamps[order], times)]
@@ -59,18 +69,18 @@ def match_times(
 
 
 class Interpolated(NamedTuple):
-    """Where the scans were taken, by poses of other times."""
+    """Interpolated positions of the scans."""
 
     kept: Bool[np.ndarray, " q"]
-    """Which scans have poses near enough in time on both sides."""
+    """True for scans with poses near enough in time on both sides."""
     positions: Float[np.ndarray, "q 3"]
-    """Metres; of the others they mean nothing."""
+    """Positions in metres, valid where `kept` is true."""
 
 
 def interpolate(
     stamps: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " q"]
 ) -> Interpolated:
-    """Return the positions at `times` on straight lines between those at `stamps`, all in seconds, in any order."""
+    """Interpolate positions linearly at `times`. `stamps` and `times` are in seconds and in any order."""
     if len(stamps) < 2:
         return Interpolated(np.zeros(len(times), bool), np.zeros((len(times), 3)))
     order = np.argsort(stamps, kind="stable")
@@ -84,8 +94,8 @@ def interpolate(
 def interpolate_turns(
     stamps: Float[np.ndarray, " n"], quaternions: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
 ) -> Float[np.ndarray, "q 3 3"]:
-    """Return the rotations at `times`, turning evenly between those at `stamps`, of which there are two or more."""
-    from scipy.spatial.transform import Rotation  # takes longer than all else that opens a folder of scans
+    """Interpolate rotations at `times` with constant angular velocity. At least two `stamps` are required."""
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     order = np.argsort(stamps, kind="stable")
     stamps, quaternions = stamps[order], quaternions[order]
@@ -98,7 +108,7 @@ def interpolate_turns(
 
 
 def poses_of(positions: Float[np.ndarray, "n 3"], rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4 4"]:
-    """Positions and rotations as poses."""
+    """Combine positions and rotations to poses."""
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rotations, positions
     return poses

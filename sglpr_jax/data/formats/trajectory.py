@@ -1,9 +1,9 @@
-"""Trajectories from files: where every frame was taken, in the formats that tools write.
+"""Reads trajectories: the position of every frame, in common file formats.
 
-kitti   12 numbers a line, camera frame (x right, y down, z forward): KITTI's own poses and SemanticKITTI's
-lidar   12 numbers a line, z up: poses of the sensor or the car
-tum     t x y z qx qy qz qw, z up
-csv     a header that names columns, x, y and z among them and perhaps t, time or timestamp (seconds); # may begin it
+- kitti: 12 numbers a line, camera frame (x right, y down, z forward), as in the poses of KITTI and SemanticKITTI.
+- lidar: 12 numbers a line, z up. Poses of the sensor or the car.
+- tum: t x y z qx qy qz qw, z up.
+- csv: a header with the column names x, y, z and optionally t, time or timestamp (seconds). It may begin with #.
 """
 
 from collections.abc import Sequence
@@ -29,29 +29,30 @@ from sglpr_jax.fields import check_value
 from sglpr_jax.poses import positions_from_camera
 
 MOST_HEIGHT_M = 100.0
-"""Over a drive; more is believed where it reaches farther still on the ground."""
+"""Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
 JUMP_M = 10.0
 JUMP_STEPS = 8.0
-"""A step from scan to scan is a jump above so many metres, and above so many times the usual step."""
+"""A step between two scans is a jump if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Where and when the frames of a sequence were taken."""
+    """Positions and times of the frames of a sequence."""
 
     positions: np.ndarray
-    """(n, 3) float64, metres, z up."""
+    """Positions (n, 3) as float64, in metres, z up."""
     times: np.ndarray | None
-    """(n,) float64 seconds, or None."""
+    """Times (n,) as float64, in seconds, or None."""
     source: str
-    """Which poses these are, in words."""
+    """Description of the pose source."""
     by_row: bool = False
-    """Whether row i is frame i whatever the times, which were given for the frames."""
+    """Whether row i belongs to frame i regardless of the times, because the times are those of the frames."""
 
 
 TIME_COLUMNS = ("t", "time", "timestamp")
+"""Names of the csv column with the times in seconds."""
 TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
-"""Names that say their unit, for files without one of `TIME_COLUMNS`."""
+"""Names with a unit, used if none of `TIME_COLUMNS` exists."""
 KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
 
 
@@ -62,11 +63,19 @@ def read_trajectory(
     times: Path | None = None,
     twelve_numbers: Literal["kitti", "lidar"] | None = None,
 ) -> Trajectory:
-    """Read a pose file, one row per frame; a file of `times`, one number a line, replaces those of the pose file.
+    """Read a pose file with one row per frame. Warns if the heights look wrong.
 
-    "auto" knows csv by its ending and tum by its 8 numbers a line. It does not guess which frame 12 numbers are in,
-    for horizontal distances depend on it, but may be told (`twelve_numbers`). Raises FileNotFoundError, and ValueError
-    naming the file, what was expected and what was found.
+    Arguments:
+      path: Pose file.
+      format: Format of the pose file. "auto" recognises csv by its ending and tum by its 8 numbers a line.
+      times: File of timestamps in seconds, one number a line. They replace the times of the pose file.
+      twelve_numbers: Format of files with 12 numbers a line, for "auto". It cannot be detected, and horizontal
+        distances depend on it.
+
+    Raises:
+      FileNotFoundError: If a file does not exist.
+      ValueError: If a file is malformed or empty, the numbers of poses and times differ, or "auto" cannot determine the
+        format.
     """
     check_value(format, PoseFormat, f"{path}, format")
     trajectory = READERS[_format_of(path, twelve_numbers) if format == "auto" else format](path)
@@ -77,22 +86,22 @@ def read_trajectory(
         return trajectory
     clock = read_times(times)
     if len(clock) != len(trajectory.positions):
-        raise ValueError(f"{times}: expected {len(trajectory.positions)} times, as many as poses, found {len(clock)}")
+        raise ValueError(f"{times}: expected {len(trajectory.positions)} times, one per pose, found {len(clock)}")
     return replace(trajectory, times=clock, by_row=True)
 
 
 def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
-    """Warn of a height that runs as far as a road does: the poses are in another frame than they were read in."""
+    """Warn if the heights range over more than `MOST_HEIGHT_M` and a horizontal range: the frame is probably wrong."""
     forward, left, up = np.ptp(positions, axis=0)
     if up > MOST_HEIGHT_M and up > min(forward, left):
         warn(
             f"{path}: expected z up, found heights over {up:.0f} m and {forward:.0f} x {left:.0f} m on the ground;"
-            " are these poses in another frame (kitti: the camera's, lidar: z up)?"
+            " are the poses in another frame (kitti: camera axes, lidar: z up)?"
         )
 
 
 def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path: Path) -> None:
-    """Warn where consecutive scans are much farther apart than most: their order may not be that of the poses."""
+    """Warn if consecutive scans are much farther apart than most: the scans may have another order than the poses."""
     if len(positions) < 3:
         return
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -103,21 +112,21 @@ def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path
         return
     worst = int(np.argmax(steps))
     warn(
-        f"{path}: expected scans near the ones before them, found {ids[worst]} and {ids[worst + 1]} {steps[worst]:.0f}"
-        f" m apart ({len(far)} jumps; half of the steps are below {usual:.1f} m, the nearest other pose is"
-        f" {near:.1f} m away); are the poses in the order of the scans?"
+        f"{path}: expected consecutive scans near each other, found {ids[worst]} and {ids[worst + 1]}"
+        f" {steps[worst]:.0f} m apart ({len(far)} jumps; half of the steps are below {usual:.1f} m, the median distance"
+        f" to the nearest other pose is {near:.1f} m); are the poses in the order of the scans?"
     )
 
 
 def _nearest(positions: Float[np.ndarray, "n 3"]) -> float:
-    """How far the nearest other pose is, in the middle of all."""
-    from scipy.spatial import KDTree  # takes longer than all else that opens a folder of scans
+    """Median distance to the nearest other pose, in metres."""
+    from scipy.spatial import KDTree  # imported here because the import is slow
 
     return float(np.median(KDTree(positions).query(positions, k=2)[0][:, 1]))
 
 
 def _format_of(path: Path, twelve_numbers: str | None) -> str:
-    """Return the format that the ending or the first line tells."""
+    """Return the format by the ending or the first line."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     if path.suffix == ".csv":
@@ -165,9 +174,9 @@ def _read_csv(path: Path) -> Trajectory:
 
 
 def _header(path: Path) -> tuple[list[str], str | None]:
-    """Return the names of a csv's columns, and which one has the times; ValueError where they do not tell."""
+    """Return the column names of a csv file, and the name of the time column or None."""
     header = path.read_text(errors="replace").partition("\n")[0]
-    names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt writes # before it
+    names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt begins it with #
     clocks = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
@@ -182,7 +191,7 @@ def _header(path: Path) -> tuple[list[str], str | None]:
 
 
 def _said(path: Path, format: str) -> str:
-    """Name the file shortly: a table has no room for a whole path."""
+    """Short description of the file for tables: the last two parts of its path, and the format."""
     return f"{Path(*path.parts[-2:])} ({format})"
 
 

@@ -1,6 +1,6 @@
-"""Readers, one file for each layout of a dataset on disk: all modules here that define READER are found by themselves.
+"""Readers of datasets on disk, one module for each layout. Modules that define `READER` are found automatically.
 
-A new layout is a new file here and its test.
+To support a new layout, add a module to this folder and a test.
 """
 
 import functools
@@ -18,7 +18,7 @@ from sglpr_jax.data.recording import Recording
 
 @functools.cache
 def readers() -> tuple[Reader, ...]:
-    """Return all readers, in the order in which they look at a folder."""
+    """Return all readers, in the order in which they are tried."""
     names = sorted(module.name for module in pkgutil.iter_modules(__path__))
     modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
     found = [module.READER for module in modules if isinstance(getattr(module, "READER", None), Reader)]
@@ -28,7 +28,10 @@ def readers() -> tuple[Reader, ...]:
 def recording_names(root: Path | str) -> tuple[str, ...]:
     """Return the names of the sequences in `root`, in order.
 
-    Raises FileNotFoundError, with the layouts there are, where `root` has none of them.
+    Raises:
+      FileNotFoundError: If `root` has no supported layout. The message lists the layouts.
+      ValueError: If a table or bag that names the sequences is malformed.
+      ImportError: If `root` is a bag and the extra `ros` is not installed.
     """
     return _reader_of(Path(root))[1]
 
@@ -45,14 +48,24 @@ def open_recording(
     times: Path | str | None = None,
     pose_topic: str | None = None,
 ) -> Recording:
-    """Open one sequence of `root`, whatever its layout.
+    """Open one sequence of `root`, in any supported layout.
 
-    Without `name`, `root` must have one sequence. `pose_source` chooses between the two pose files of KITTI's layout
-    and is not used for the others; `format` tells what each point of a .bin is. `sensor_height` (metres over the
-    ground) says how the sensor was mounted; "auto" estimates it, and the tilt, from some scans where the layout does
-    not tell. `poses` and `times` are the pose file of a plain folder and its file of seconds, where they do not lie
-    beside the scans; `pose_topic` is the topic of a bag's poses, where it has several. Raises FileNotFoundError where
-    something is missing, ValueError where a file is malformed, or poses are named for a layout that has its own.
+    Arguments:
+      root: Folder of a dataset or of scans, or a bag.
+      name: Name of the sequence. It may be omitted if `root` has only one sequence.
+      pose_source: Choice between the two pose files of KITTI's layout. Other layouts ignore it.
+      format: Format of the scan files, for a plain folder and for KITTI's layout. "auto" detects it.
+      sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates the height and the tilt from
+        some scans. "auto" estimates them only if the layout does not define the mounting.
+      poses: Pose file of a plain folder, if it is not beside the scans.
+      pose_format: Format of the pose file of a plain folder.
+      times: File of timestamps of a plain folder in seconds, if it is not beside the scans.
+      pose_topic: Pose topic of a bag. By default, the topic that covers most scans is used.
+
+    Raises:
+      FileNotFoundError: If the sequence or one of its files is missing.
+      ValueError: If a file is malformed, or if `poses`, `times` or `pose_topic` does not apply to the layout.
+      ImportError: If `root` is a bag and the extra `ros` is not installed.
 
     Example:
       recording = open_recording("KITTI", "08")
@@ -66,9 +79,9 @@ def open_recording(
         raise FileNotFoundError(f"{root}: expected {asked}, found {', '.join(names)}")
     given = next((path for path in (poses, times) if path is not None), None)
     if given is not None and not reader.takes_poses:
-        raise ValueError(f"{given}: expected poses named for a plain folder of scans, found {root}: {reader.layout}")
+        raise ValueError(f"{given}: expected poses or times for a plain folder of scans, found {root}: {reader.layout}")
     if pose_topic is not None and not reader.takes_pose_topic:
-        raise ValueError(f"{root}: expected a bag, whose topic of poses is named, {pose_topic}, found {reader.layout}")
+        raise ValueError(f"{root}: expected a bag with the pose topic {pose_topic}, found {reader.layout}")
     pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
     options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, pose_topic)
     recording = reader.open(root, name, options)
@@ -76,7 +89,7 @@ def open_recording(
 
 
 def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
-    """The first reader that finds recordings in `root`, and their names."""
+    """Return the first reader that finds recordings in `root`, and their names."""
     for reader in readers():
         names = reader.recording_names(root)
         if names:
@@ -84,10 +97,10 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
     *layouts, last = (reader.layout for reader in readers() if reader.layout)
     if root.is_file():
         scan = (
-            "; put scans into a folder, or read one by read_scan"
+            "; put the scans into a folder, or read a single scan with read_scan"
             if root.name.endswith((*ENDINGS, *ARRAY_ENDINGS))
             else ""
         )
         raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{scan}")
-    found = f"nothing of the kind: {left_aside(root, ()) or 'no files'}" if root.is_dir() else "no such folder"
+    found = f"no known layout: {left_aside(root, ()) or 'no files'}" if root.is_dir() else "no such folder"
     raise FileNotFoundError(f"{root}: expected {', '.join(layouts)} or {last}, found {found}")

@@ -1,8 +1,8 @@
-"""Sequences of ready-made BEV images in BEVPlace's layout.
+"""Reader of ready-made BEV images in BEVPlace's layout.
 
-00/imgs/000000.png     8-bit density images; the number is the frame, and frames may be left out
-00/labels/000000.png   what their pixels show (`label_images.py`; optional, each)
-00/pose.txt            12 numbers a line, LiDAR frame, one line per frame
+- `00/imgs/000000.png`: 8-bit density image. The number is the frame; frames may be missing.
+- `00/labels/000000.png`: label image (`label_images.py`), optional for each frame.
+- `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame.
 """
 
 from functools import partial
@@ -26,7 +26,12 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open `root/<name>`. Raises FileNotFoundError without images or poses, ValueError on malformed poses."""
+    """Open `root/<name>`.
+
+    Raises:
+      FileNotFoundError: If the images or the poses are missing.
+      ValueError: If the poses are malformed, or an image is not named by the row of its pose.
+    """
     folder = root / name
     image_paths = files_in(folder / "imgs", ".png")
     if not image_paths:
@@ -49,15 +54,17 @@ def open_recording(root: Path, name: str) -> Recording:
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Return an image (h, w) in eq. 1's orientation, its grey values 0..255 scaled to counts 0..10.
+    """Return an image (h, w) in the orientation of eq. 1. Grey values 0..255 are scaled to counts 0..10.
 
-    Raises FileNotFoundError, and ValueError where the file is no whole 8-bit grey image.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is not a complete 8-bit greyscale image.
     """
     return as_counts(read_grey_png(path, bits=8))
 
 
 def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The counts 0..10 that grey values 0..255 stand for."""
+    """Scale grey values 0..255 to counts 0..10."""
     return np.ascontiguousarray(grey) * np.float32(MAX_COUNT / 255)
 
 

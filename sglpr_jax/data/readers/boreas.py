@@ -1,9 +1,10 @@
-"""Sequences of Boreas: a Velodyne Alpha Prime on a car, over a year.
+"""Reader of Boreas: a Velodyne Alpha Prime on a car, recorded over a year.
 
-    boreas-2020-12-01-13-26/lidar/1606847163437292.bin     float32 x, y, z, intensity, laser, time
-    boreas-2020-12-01-13-26/applanix/lidar_poses.csv       GPSTime, easting, northing, altitude and nine more
+- `boreas-2020-12-01-13-26/lidar/1606847163437292.bin`: float32 x, y, z, intensity, laser, time.
+- `boreas-2020-12-01-13-26/applanix/lidar_poses.csv`: GPSTime, easting, northing, altitude and nine other columns.
 
-The number of a scan and GPSTime are microseconds. Positions are the LiDAR's; axes of points stay as they are.
+Scans are named by their time. Names and GPSTime are in microseconds. Positions are those of the LiDAR. The axes of the
+points are not changed.
 """
 
 from functools import partial
@@ -21,14 +22,14 @@ COLUMNS = 13
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the sequences in `root`, or its own where it is one."""
+    """Return the names of the sequences in `root`. `root` may be a sequence itself."""
     if _is_sequence(root):
         return (root.resolve().name,)
     return tuple(sorted(path.parent.name for path in root.glob("*/lidar") if _is_sequence(path.parent)))
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open a sequence; see `stamped_recording` for the errors."""
+    """Open a sequence. Raises what `stamped_recording` and `read_table` raise."""
     folder = root if _is_sequence(root) else root / name
     stamps, numbers = read_table(folder / POSES, columns=COLUMNS, header_lines=1)
     return stamped_recording(

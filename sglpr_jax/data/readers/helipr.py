@@ -1,9 +1,9 @@
-"""Sequences of HeLiPR: four LiDARs on a car, each a recording of its own.
+"""Reader of HeLiPR: four LiDARs on a car. Each LiDAR is a separate recording.
 
-    Roundabout01/LiDAR/Ouster/1689519060427055360.bin   scans; the number is the time in nanoseconds
-    Roundabout01/LiDAR_GT/Ouster_gt.txt                 time x y z qx qy qz qw of that sensor: east, north, up
+- `Roundabout01/LiDAR/Ouster/1689519060427055360.bin`: a scan, named by its time in nanoseconds.
+- `Roundabout01/LiDAR_GT/Ouster_gt.txt`: time x y z qx qy qz qw of that sensor, in axes east, north, up.
 
-The points of each sensor are packed in a way of its own, without padding; axes stay as they are.
+Each sensor has its own record format, without padding. The axes of the points are not changed.
 """
 
 from functools import partial
@@ -24,14 +24,14 @@ RECORDS = {
     ),
     "Velodyne": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("line", "<u2"), ("time", "<f4")]),
 }
-"""The points of each sensor."""
+"""Record of one point, for each sensor."""
 AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset", "<i4"), ("line", "u1")])
 AEVA_CHANGED = 1691936557946849179
-"""Aeva's scans up to this time have no intensities."""
+"""Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return SEQUENCE-SENSOR for each sensor with scans in `root`, which holds sequences or is one."""
+    """Return SEQUENCE-SENSOR for each sensor with scans and poses. `root` holds sequences or is a sequence itself."""
     itself = {root.resolve().name: root} if (root / "LiDAR").is_dir() else {}
     folders = itself or {path.parent.name: path.parent for path in sorted(root.glob("*/LiDAR"))}
     return tuple(
@@ -43,7 +43,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open what one sensor saw of a sequence; see `stamped_recording` for the errors."""
+    """Open the scans of one sensor in a sequence. Raises what `stamped_recording` and `read_table` raise."""
     sequence, _, sensor = name.rpartition("-")
     folder = root if (root / "LiDAR").is_dir() else root / sequence
     poses = folder / "LiDAR_GT" / f"{sensor}_gt.txt"
@@ -61,12 +61,16 @@ def open_recording(root: Path, name: str) -> Recording:
 
 
 def read_points(path: Path, *, sensor: str) -> Records:
-    """Read a scan and the lines of its points. ValueError where its size is no whole number of points."""
+    """Read the points of a scan and their line numbers.
+
+    Raises:
+      ValueError: If the file is empty or its size is not a multiple of the record size.
+    """
     before = sensor == "Aeva" and int(path.stem) <= AEVA_CHANGED
     record = AEVA_BEFORE if before else RECORDS[sensor]
     size = path.stat().st_size
     if size == 0 or size % record.itemsize:
-        raise ValueError(f"{path}: expected {record.itemsize} bytes a point ({sensor}), found {size} bytes in all")
+        raise ValueError(f"{path}: expected {record.itemsize} bytes a point ({sensor}), found {size} bytes in total")
     found = np.fromfile(path, record)
     return Records(np.ascontiguousarray(found["xyz"], np.float32), found["line"].astype(np.int32))
 

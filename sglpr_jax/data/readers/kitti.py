@@ -1,12 +1,12 @@
-"""Sequences of scans in the layout of KITTI odometry and SemanticKITTI.
+"""Reader of the layout of KITTI odometry and SemanticKITTI.
 
-    sequences/08/velodyne/000000.bin   scans; the number is the frame, and frames may be left out
-    sequences/08/labels/000000.label   SemanticKITTI's labels (optional, each)
-    sequences/08/times.txt             seconds, one line per frame (optional)
-    sequences/08/poses.txt             SemanticKITTI's poses: loops closed in height too
-    poses/08.txt                       KITTI's own ground truth: its height drifts
+- `sequences/08/velodyne/000000.bin`: a scan. The number is the frame; frames may be missing.
+- `sequences/08/labels/000000.label`: SemanticKITTI's labels, optional for each frame.
+- `sequences/08/times.txt`: timestamps in seconds, one line per frame (optional).
+- `sequences/08/poses.txt`: SemanticKITTI's poses. Their loops are also closed in height.
+- `poses/08.txt`: KITTI's ground truth. Its height drifts.
 
-Both pose files move the left camera, so `calib.txt` is not needed for positions.
+Both pose files contain poses of the left camera. Positions are computed without `calib.txt`.
 """
 
 from functools import partial
@@ -29,20 +29,29 @@ from sglpr_jax.files import read_json
 from sglpr_jax.poses import positions_from_camera
 
 SIMULATION = "simulation.json"
-"""Beside the sequences that `bin/simulate` wrote: what they were made with."""
+"""File with the settings of a simulated dataset, written by `bin/simulate`."""
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the sequences in `root` that have a folder of scans, in order."""
+    """Return the names of the sequences in `root` that have a folder `velodyne`, in order."""
     return tuple(sorted(folder.parent.name for folder in root.glob("sequences/*/velodyne")))
 
 
 def open_recording(
     root: Path, name: str, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
 ) -> Recording:
-    """Open `root/sequences/<name>`; see `read_trajectory` for the errors and the choice of poses.
+    """Open `root/sequences/<name>`.
 
-    Scans that look like another record than KITTI's, and do not look like that, are read so (`unusual_record`).
+    Arguments:
+      root: Folder of the dataset.
+      name: Name of the sequence.
+      pose_source: Choice of the pose file, as in `read_trajectory`.
+      format: Format of the scans. With "auto", scans that do not fit KITTI's record but clearly fit another record are
+        read as the other one (`unusual_record`).
+
+    Raises:
+      FileNotFoundError: If the scans or the poses are missing.
+      ValueError: If a file is malformed, has too few rows, or a scan is not named by its row.
     """
     folder = root / "sequences" / name
     scan_paths = files_in(folder / "velodyne", ".bin")
@@ -68,7 +77,7 @@ def open_recording(
 
 
 def _mounting(root: Path) -> Mounting | None:
-    """Of simulated drives, whose sensor may have stood higher or lower than KITTI's; else None: as models know it."""
+    """Mounting in a simulated dataset, or None if the sensor is mounted as the models assume."""
     path = root / SIMULATION
     if not path.is_file():
         return None
@@ -76,7 +85,7 @@ def _mounting(root: Path) -> Mounting | None:
     sensor = settings.get("sensor") if isinstance(settings, dict) else None
     height = sensor.get("height_m") if isinstance(sensor, dict) else None
     if not isinstance(height, int | float):
-        raise ValueError(f"{path}: expected the settings of a simulated dataset with the sensor's height_m, found none")
+        raise ValueError(f"{path}: expected the settings of a simulated dataset with sensor.height_m, found none")
     try:
         return None if height == MODEL_HEIGHT_M else Mounting(float(height))
     except ValueError as error:
@@ -84,9 +93,9 @@ def _mounting(root: Path) -> Mounting | None:
 
 
 def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
-    """How the scans are read, and what to say about it: of a recording, `read` and `found`."""
+    """Values for the fields `read` and `found` of the recording."""
     if format != "auto":
-        return {"read": partial(scan_record, format=format), "found": (f"format: {format}, as said",)}
+        return {"read": partial(scan_record, format=format), "found": (f"format: {format}, as given",)}
     unusual = unusual_record(paths)
     if unusual is None:
         return {"read": scan_record, "found": (f"format: {described('kitti')}",)}
@@ -96,10 +105,19 @@ def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
 def read_trajectory(
     root: Path, name: str, *, pose_source: PoseChoice = "auto"
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"] | None, str]:
-    """Return the positions of all frames (metres, z up), their times or None, and the pose file's name.
+    """Read the trajectory of a sequence. The scans are not needed.
 
-    The scans themselves need not be there. `pose_source` chooses the file; "auto" takes SemanticKITTI's where it
-    exists. Raises FileNotFoundError where there is no such file, ValueError where it is malformed.
+    Arguments:
+      root: Folder of the dataset.
+      name: Name of the sequence.
+      pose_source: Choice of the pose file. "auto" prefers SemanticKITTI's.
+
+    Returns:
+      Positions of all frames in metres, z up; their times in seconds, or None; and the name of the pose file.
+
+    Raises:
+      FileNotFoundError: If the pose file does not exist.
+      ValueError: If a file is malformed.
     """
     pose_files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
     candidates = list(pose_files.values()) if pose_source == "auto" else [pose_files[pose_source]]

@@ -1,11 +1,11 @@
-"""Drives of KITTI's raw data.
+"""Reader of KITTI's raw data.
 
-    2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/0000000000.bin   scans as in KITTI odometry
-    2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/timestamps.txt        2011-09-26 13:02:25.951199337
-    2011_09_26/2011_09_26_drive_0001_sync/oxts/data/0000000000.txt              latitude, longitude, altitude, ...
+- `2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/0000000000.bin`: a scan, as in KITTI odometry.
+- `2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/timestamps.txt`: lines such as 2011-09-26 13:02:25.951199337.
+- `2011_09_26/2011_09_26_drive_0001_sync/oxts/data/0000000000.txt`: latitude, longitude, altitude, ...
 
-A scan may be missing: then its line of times is blank. Positions are those of the GPS (0.8 m behind the LiDAR), east,
-north, up, by the dataset's Mercator projection.
+If a scan is missing, its line of the timestamps is blank. Positions are those of the GPS, 0.8 m behind the LiDAR. They
+are computed with the dataset's Mercator projection, in axes east, north, up.
 """
 
 import math
@@ -27,14 +27,19 @@ OXTS_COLUMNS = 30
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the drives in `root`: a drive, a day, or a folder of days."""
+    """Return the names of the drives in `root`, which is a drive, a day, or a folder of days."""
     return tuple(folder.name for folder in _drives(root))
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open a drive. Scans are numbered; GPS and times are those of the same number.
+    """Open a drive.
 
-    Raises FileNotFoundError without scans, ValueError where times or GPS are malformed. Without them there are none.
+    Scans, GPS positions and timestamps are matched by number. Without the file of timestamps, `times` is `None`. If a
+    GPS file is missing, `positions` is `None`.
+
+    Raises:
+      FileNotFoundError: If there are no scans.
+      ValueError: If the timestamps or GPS positions are malformed.
     """
     folder = next(folder for folder in _drives(root) if folder.name == name)
     paths = files_in(folder / "velodyne_points" / "data", ".bin")
@@ -63,7 +68,7 @@ def _drives(root: Path) -> tuple[Path, ...]:
 
 
 def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
-    """East, north and up of the first GPS position, metres."""
+    """Positions relative to the first GPS position, in metres east, north and up."""
     numbers = [numbers_of(file.read_text().split(), columns=OXTS_COLUMNS, where=str(file)) for file in files]
     latitude, longitude, altitude = np.array(numbers)[:, :3].T
     scale = math.cos(math.radians(latitude[0]))
@@ -74,24 +79,24 @@ def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
 
 
 def _times(file: Path, paths: tuple[Path, ...]) -> Float[np.ndarray, " n"] | None:
-    """Seconds since 1970 of these scans; None without the file."""
+    """Times of the scans in seconds since 1970, or None if the file does not exist."""
     if not file.is_file():
         return None
-    lines = file.read_text(errors="replace").splitlines()  # also the blank ones: the line of a scan is its number
+    lines = file.read_text(errors="replace").splitlines()  # blank lines count, too: scan i is line i
     try:
         return np.array([_seconds(lines[int(path.stem)]) for path in paths])
     except (ValueError, IndexError) as error:
         raise ValueError(
-            f"{file}: expected a date and time, 2011-09-26 13:02:25.951199337, for each of {len(paths)} scans, found"
-            f" {len(lines)} lines or others ({in_short(error)})"
+            f"{file}: expected a date and time such as 2011-09-26 13:02:25.951199337 for each of {len(paths)} scans,"
+            f" found {len(lines)} lines or malformed ones ({in_short(error)})"
         ) from error
 
 
 def _seconds(line: str) -> float:
-    """Seconds since 1970 of a date and time; ValueError for anything else."""
+    """Convert a date and time to seconds since 1970. Raises ValueError if the line is malformed."""
     stamp = np.datetime64(line.strip().replace(" ", "T"), "ns")
-    if np.isnat(stamp):  # numpy's reading of a blank line
-        raise ValueError(f"a scan whose line is {line.strip()!r}")
+    if np.isnat(stamp):  # numpy converts a blank line to NaT
+        raise ValueError(f"the line of a scan is {line.strip()!r}")
     return float(stamp.astype(np.int64) / 1e9)
 
 

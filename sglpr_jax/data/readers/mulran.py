@@ -1,10 +1,10 @@
-"""Sequences of MulRan: an Ouster OS1-64 on a car.
+"""Reader of MulRan: an Ouster OS1-64 on a car.
 
-    KAIST01/Ouster/1561000444390857630.bin   float32 x, y, z, intensity; the number is the time in nanoseconds
-    KAIST01/global_pose.csv                  time, 12 numbers (world_from_base: east, north, up), about 100 a second
+- `KAIST01/Ouster/1561000444390857630.bin`: float32 x, y, z, intensity. The name is the time in nanoseconds.
+- `KAIST01/global_pose.csv`: time and 12 numbers (world_from_base, in axes east, north, up), about 100 rows per second.
 
-The Ouster stands half a turn about z from the car (179.67 degrees by its calibration): points are turned to x forward.
-Positions are the Ouster's.
+The Ouster is rotated by 180 degrees about z relative to the car (179.67 degrees by its calibration). The points are
+rotated so that x points forward. Positions are those of the Ouster.
 """
 
 from pathlib import Path
@@ -17,20 +17,20 @@ from sglpr_jax.data.readers.stamped import read_table, stamped_recording
 from sglpr_jax.data.recording import Recording
 
 LIDAR_IN_BASE_M = np.array([1.7042, -0.021, 1.8047])
-"""Where the Ouster is in the car's frame, by the dataset's calibration."""
+"""Position of the Ouster in the car's frame by the dataset's calibration, in metres."""
 FORWARD_FROM_LIDAR = np.array([-1, -1, 1], np.float32)
 POSES = "global_pose.csv"
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the sequences in `root`, or its own where it is one."""
+    """Return the names of the sequences in `root`. `root` may be a sequence itself."""
     if _is_sequence(root):
         return (root.resolve().name,)
     return tuple(sorted(path.parent.name for path in root.glob("*/Ouster") if _is_sequence(path.parent)))
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open a sequence; see `stamped_recording` for the errors."""
+    """Open a sequence. Raises what `stamped_recording` and `read_table` raise."""
     folder = root if _is_sequence(root) else root / name
     stamps, numbers = read_table(folder / POSES, columns=13)
     world_from_base = numbers.reshape(-1, 3, 4)
@@ -42,12 +42,12 @@ def open_recording(root: Path, name: str) -> Recording:
         pose_file=folder / POSES,
         tick_s=1e-9,
         read_points=read_points,
-        format=f"MulRan, {described('kitti')}, turned to x forward",
+        format=f"MulRan, {described('kitti')}, rotated to x forward",
     )
 
 
 def read_points(path: Path) -> Records:
-    """Read a scan; its points look forward."""
+    """Read a scan and rotate its points so that x points forward."""
     return Records(read_records(path, "kitti").points * FORWARD_FROM_LIDAR, None)
 
 

@@ -1,14 +1,15 @@
-"""Sessions of NCLT: one place on many days, each session with its own ground truth in one common frame.
+"""Reader of NCLT: sessions of one place on many days. The ground truth of all sessions has one common frame.
 
-    2012-01-15/velodyne_sync/1326652795280148.bin   scans; the number is the time in microseconds since 1970
-    groundtruth_2012-01-15.csv                      utime, x, y, z, roll, pitch, yaw; in the date's folder or in
-                                                    ground_truth/ as well
+- `2012-01-15/velodyne_sync/1326652795280148.bin`: a scan, named by its time in microseconds since 1970.
+- `groundtruth_2012-01-15.csv`: utime, x, y, z, roll, pitch, yaw. It may also lie in the date's folder or in
+  `ground_truth/`.
 
-Frames. The ground truth is world_from_body: the world is north, east, down about one origin for all sessions, metres;
-the body is forward, right, down, with its origin on the ground. The scans of `velodyne_sync` are in the body's frame
-already, so no extrinsics are used (the Velodyne itself is upside down, 1.0 m above that origin). Both frames have y and
-z negated here, a half turn about x: positions are those of the body, x north, y west, z up, as points are x forward,
-y left, z up.
+The ground truth is world_from_body, in metres. The world frame is north, east, down, with one origin for all sessions.
+The body frame is forward, right, down, with its origin on the ground. The scans of `velodyne_sync` are already in the
+body frame, so no extrinsics are used. (The Velodyne itself is mounted upside down, 1.0 m above that origin.)
+
+The reader negates y and z of both frames, a rotation by 180 degrees about x. The positions are those of the body, x
+north, y west, z up. The points are x forward, y left, z up.
 """
 
 from pathlib import Path
@@ -25,13 +26,13 @@ from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
 
 MAX_GAP_S = 0.5
-"""A scan without a pose this near in time is left out. A Segway goes half a metre in it."""
+"""Maximum time between a scan and its pose, in seconds. A Segway moves half a metre in this time."""
 
 LATEST_US = 1e17
-"""Times beyond the year 5000 are none."""
+"""Maximum valid time in microseconds, after the year 5000."""
 
 BODY = Mounting(0.0)
-"""Points are given in the body's frame, whose origin is on the ground, and not from the sensor."""
+"""Mounting of the body frame: the origin of the points is on the ground, not at the sensor."""
 _DATE = "[0-9][0-9][0-9][0-9]-[0-9][0-9]-[0-9][0-9]"
 _COLUMNS = ("utime", "x", "y", "z", "roll", "pitch", "yaw")
 
@@ -42,10 +43,17 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str, *, max_gap_s: float = MAX_GAP_S) -> Recording:
-    """Open the session `root/<name>`, a date such as "2012-01-15". Each scan has the pose nearest to it in time.
+    """Open the session `root/<name>`. Each scan gets the pose nearest in time.
 
-    Scans with no pose within `max_gap_s` seconds are left out; `pose_source` says how many. Raises FileNotFoundError
-    without scans or ground truth, ValueError where the ground truth is malformed or near to no scan.
+    Arguments:
+      root: Folder of the dataset.
+      name: Date of the session, such as "2012-01-15".
+      max_gap_s: Maximum time between a scan and its pose, in seconds. Scans without a pose are skipped, and
+        `pose_source` contains their number.
+
+    Raises:
+      FileNotFoundError: If the scans or the ground truth are missing.
+      ValueError: If a scan is not named by its time, the ground truth is malformed, or no scan has a pose.
     """
     paths = _scan_paths(root / name / "velodyne_sync")
     truth = _truth_path(root, name)
@@ -62,15 +70,18 @@ def open_recording(root: Path, name: str, *, max_gap_s: float = MAX_GAP_S) -> Re
         paths=kept_paths,
         read=scan_record,
         mounting=BODY,
-        found=("sensor: points are given from the ground below it",),
+        found=("sensor: coordinates are relative to the ground below it",),
     )
 
 
 def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Return the times in microseconds, in order, and the positions (metres; north, west, up) of a ground truth file.
+    """Read a ground truth file. Rows with NaN, which occur at the start of the files, are dropped.
 
-    Rows with NaN, with which the files begin, are dropped. Raises ValueError where the file is no such table, all rows
-    are NaN, or a time is smaller than the one before.
+    Returns:
+      Times in microseconds, in order, and positions in metres (north, west, up).
+
+    Raises:
+      ValueError: If the table is malformed, all rows are NaN, or a time is smaller than the previous one.
     """
     rows = _read_table(path)
     known = np.isfinite(rows).all(axis=1)
@@ -83,7 +94,7 @@ def read_ground_truth(path: Path) -> tuple[Int64[np.ndarray, " n"], Float[np.nda
     backwards = np.flatnonzero(np.diff(stamps) < 0)
     if backwards.size:
         first = int(backwards[0])
-        raise ValueError(f"{path}: expected a time from {stamps[first]} on, found {stamps[first + 1]} in the next row")
+        raise ValueError(f"{path}: expected a time >= {stamps[first]}, found {stamps[first + 1]} in the next row")
     return stamps, rows[known, 1:4] * Z_UP_FROM_Z_DOWN
 
 
@@ -94,7 +105,7 @@ def _scan_paths(folder: Path) -> tuple[Path, ...]:
         raise FileNotFoundError(f"{folder}: expected scans (*.bin), found {found}")
     strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
     if strange:
-        raise ValueError(f"{folder}: expected scans named by their time, 1326652795280148.bin, found {strange}")
+        raise ValueError(f"{folder}: expected scans named by their time, as 1326652795280148.bin, found {strange}")
     return paths
 
 
@@ -113,7 +124,7 @@ def _read_table(path: Path) -> Float[np.ndarray, "n 7"]:
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found others ({error})") from error
+        raise ValueError(f"{path}: expected rows of {', '.join(_COLUMNS)}, found malformed ones ({error})") from error
     if rows.shape[1] != len(_COLUMNS):
         raise ValueError(f"{path}: expected {len(_COLUMNS)} columns, {', '.join(_COLUMNS)}, found {rows.shape[1]}")
     return rows

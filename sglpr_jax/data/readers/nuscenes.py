@@ -1,11 +1,11 @@
-"""Scenes of nuScenes: what the 32-beam LiDAR on the roof saw in 20 seconds, a sequence each.
+"""Reader of nuScenes: scenes of 20 seconds, scanned by the 32-beam LiDAR on the roof. Each scene is a sequence.
 
-    v1.0-mini/scene.json, sample.json, sample_data.json, ego_pose.json, calibrated_sensor.json
-    samples/LIDAR_TOP/*.pcd.bin    key frames, two a second: float32 x, y, z, intensity, laser
-    sweeps/LIDAR_TOP/*.pcd.bin     those in between, twenty a second in all (optional)
+- `v1.0-mini/`: `scene.json`, `sample.json`, `sample_data.json`, `ego_pose.json`, `calibrated_sensor.json`.
+- `samples/LIDAR_TOP/*.pcd.bin`: key frames, two per second: float32 x, y, z, intensity, laser.
+- `sweeps/LIDAR_TOP/*.pcd.bin`: the scans between the key frames (optional). Together there are twenty per second.
 
-Tables refer to each other by tokens. Positions are the LiDAR's, in the map's frame: east, north, up (the height of the
-car is 0 throughout). Points are turned to x forward.
+The tables refer to each other by tokens. Positions are those of the LiDAR in the map frame: east, north, up. The height
+of the car is always 0. The points are rotated so that x points forward.
 """
 
 from collections.abc import Sequence
@@ -27,15 +27,16 @@ CHANNEL = "LIDAR_TOP"
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the scenes in all versions in `root`, in order."""
+    """Return the names of the scenes of all dataset versions in `root`, in order."""
     return tuple(sorted({name for tables in _versions(root) for name in _scenes(tables)}))
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open a scene: its key frames and sweeps as far as their files are there, in order of time.
+    """Open a scene: its key frames and sweeps in order of time. Listed scans without a file are skipped.
 
-    Raises FileNotFoundError where a table is missing or no scan is there, ValueError where a table is malformed or
-    refers to nothing.
+    Raises:
+      FileNotFoundError: If a table is missing, or no scan has a file.
+      ValueError: If a table is malformed or refers to a missing row.
     """
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
@@ -55,7 +56,7 @@ def open_recording(root: Path, name: str) -> Recording:
     order = np.argsort(ticks, kind="stable")
     paths, rows = zip(*(there[i] for i in order), strict=True)
     keys = sum(path.parent.parent.name == "samples" for path in paths)
-    missing = f", {len(scans) - len(paths)} more are listed but not there" if len(scans) > len(paths) else ""
+    missing = f", {len(scans) - len(paths)} more are listed but missing" if len(scans) > len(paths) else ""
     return Recording(
         name=name,
         ids=tuple(map(scan_id, paths)),
@@ -65,26 +66,26 @@ def open_recording(root: Path, name: str) -> Recording:
         paths=paths,
         read=scan_record,
         found=(
-            f"format: {described('nuscenes')}, turned to x forward",
+            f"format: {described('nuscenes')}, rotated to x forward",
             f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
         ),
     )
 
 
 def _versions(root: Path) -> tuple[Path, ...]:
-    """The folders of tables; v1.0-mini, the quickest to read, comes first."""
+    """Folders of tables. v1.0-mini comes first; it is the fastest to read."""
     return tuple(sorted(path.parent for path in root.glob("v1.0-*/scene.json")))
 
 
 def _scenes(tables: Path) -> dict[str, str]:
-    """The tokens of the scenes by their names."""
+    """Token of each scene, by name."""
     path = tables / "scene.json"
     rows = table_rows(path)
     return dict(zip(column_of(path, rows, "name"), column_of(path, rows, "token"), strict=True))
 
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
-    """Where the LiDAR was: its place on the car, by the pose of the car."""
+    """Positions of the LiDAR in the map frame, in metres."""
     world_from_car, cars = _poses(tables / "ego_pose.json", rows, "ego_pose_token")
     _, lidars_in_car = _poses(tables / "calibrated_sensor.json", rows, "calibrated_sensor_token")
     return (world_from_car @ lidars_in_car[:, :, None])[:, :, 0] + cars
@@ -93,12 +94,14 @@ def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray
 def _poses(
     path: Path, rows: Sequence[dict[str, Any]], column: str
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """The rotations and translations in a table that a column of `rows` refers to."""
+    """Rotations and translations of the table rows that a column of `rows` refers to."""
     tokens = column_of(path.with_name("sample_data.json"), rows, column)
     found = {row["token"]: row for row in table_rows(path, "token", set(tokens))}
     lost = [token for token in tokens if token not in found]
     if lost:
-        raise ValueError(f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} such rows)")
+        raise ValueError(
+            f"{path}: expected a row with the token {lost[0]!r}, found none ({len(lost)} broken references)"
+        )
     named = [found[token] for token in tokens]
     quaternions = numbers_of(path, named, "rotation", 4)[:, [1, 2, 3, 0]]  # w comes first in the file
     return rotations_of(path, quaternions), numbers_of(path, named, "translation", 3)

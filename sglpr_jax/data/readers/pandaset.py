@@ -1,11 +1,12 @@
-"""Sequences of PandaSet, once its pickles are converted: a pickle is a program, and this project runs none.
+"""Reader of PandaSet with scans converted to .npy. The original pickles are not opened, since they can execute code.
 
-    001/lidar/00.pkl.gz         as it comes: a pickle, not opened
-    001/lidar/00.npy            converted (docs/guides/own-data.md): x, y, z in the world, of the LiDAR on the roof
-    001/lidar/poses.json        position and heading of that LiDAR, a row for each scan
-    001/lidar/timestamps.json   seconds
+- `001/lidar/00.pkl.gz`: the original scan, a pickle.
+- `001/lidar/00.npy`: the converted scan (docs/guides/own-data.md): x, y, z of the LiDAR on the roof, in world axes.
+- `001/lidar/poses.json`: position and heading of that LiDAR, one row for each scan.
+- `001/lidar/timestamps.json`: timestamps in seconds.
 
-The LiDAR's own x points right and its y forward: points are turned to x forward. The world has z up.
+In the LiDAR frame of the dataset, x points right and y forward. The points are rotated so that x points forward. The
+world frame has z up.
 """
 
 import hashlib
@@ -28,7 +29,7 @@ PICKLES = ".pkl.gz"
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the sequences in `root`, converted or not; its own where it is one."""
+    """Return the names of the sequences in `root`, converted or not. `root` may be a sequence itself."""
     if (root / "lidar" / "poses.json").is_file():
         return (root.resolve().name,)
     return tuple(sorted(path.parent.parent.name for path in root.glob("*/lidar/poses.json")))
@@ -37,15 +38,16 @@ def recording_names(root: Path) -> tuple[str, ...]:
 def open_recording(root: Path, name: str) -> Recording:
     """Open a sequence.
 
-    Raises ValueError where its scans are pickles still, or poses or times are malformed or too few; FileNotFoundError
-    where there is no scan or no file of times.
+    Raises:
+      FileNotFoundError: If the scans or the timestamps are missing.
+      ValueError: If the scans are not converted, or the poses or timestamps are malformed or too few.
     """
     folder = root / "lidar" if (root / "lidar" / "poses.json").is_file() else root / name / "lidar"
     paths, pickles = files_in(folder, ".npy"), files_in(folder, PICKLES)
     if not paths and pickles:
         raise ValueError(
-            f"{folder}: expected scans as .npy, found {len(pickles)} pickles (*{PICKLES}): pickles are programs, and"
-            " this project opens none; docs/guides/own-data.md says how to convert them"
+            f"{folder}: expected scans as .npy, found {len(pickles)} pickles (*{PICKLES}), which are not opened because"
+            " they can execute code; docs/guides/own-data.md says how to convert them"
         )
     if not paths:
         raise FileNotFoundError(f"{folder}: expected scans (*.npy), found none")
@@ -65,28 +67,36 @@ def open_recording(root: Path, name: str) -> Recording:
         pose_source="lidar/poses.json",
         paths=paths,
         read=partial(_read, poses=poses, poses_hash=_hash(folder / "poses.json")),
-        found=(f"format: PandaSet as npy, from the world's frame into the LiDAR's, x forward{left}",),
+        found=(f"format: PandaSet as npy, transformed from the world frame to the LiDAR frame, x forward{left}",),
     )
 
 
 def read_poses(path: Path) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Return the rotations (world from LiDAR) and positions (metres) of a file of poses; ValueError for others."""
+    """Read a file of poses.
+
+    Returns:
+      Rotations (world from LiDAR), and positions in metres.
+
+    Raises:
+      ValueError: If the poses are malformed.
+    """
     poses = read_json(path)
     try:
         turned = np.array([[pose["heading"][axis] for axis in "xyzw"] for pose in poses], np.float64).reshape(-1, 4)
         positions = np.array([[pose["position"][axis] for axis in "xyz"] for pose in poses], np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{path}: expected a list of poses, each with position (x, y, z) and heading (w, x, y, z), found others"
+            f"{path}: expected a list of poses, each with position (x, y, z) and heading (w, x, y, z), found another"
+            " structure"
         ) from error
     if not np.isfinite(positions).all():
-        raise ValueError(f"{path}: expected finite positions, found others")
+        raise ValueError(f"{path}: expected finite positions, found NaN or infinite ones")
     check_positions(path, positions)
     return rotations_of(path, turned), positions
 
 
 def _times(path: Path) -> Float[np.ndarray, " n"]:
-    """Seconds, one for each scan."""
+    """Timestamps in seconds, one for each scan."""
     values: Any = read_json(path)
     try:
         times = np.array(values, np.float64)
@@ -109,7 +119,7 @@ def _read(
     poses: dict[Path, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]],
     poses_hash: str,
 ) -> Record:
-    """Read a scan; `poses_hash` is for those who keep its points, and must know when the poses are others."""
+    """Read a scan. Caches of its points use `poses_hash` to detect changed poses."""
     world_from_lidar, position = poses[path]
     x, y, z = ((read_npy(path) - position) @ world_from_lidar).T
     return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))

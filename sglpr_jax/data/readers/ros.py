@@ -1,8 +1,10 @@
-"""Recordings of ROS: a .bag, an .mcap, a folder of ROS 2 (metadata.yaml), or a folder of .bag or .mcap files.
+"""Reader of ROS bags: a .bag, an .mcap, a ROS 2 folder (metadata.yaml), or a folder of .bag or .mcap files.
 
-A topic of point clouds is a recording. Where there is one, it has the bag's name; of several, each has its topic's,
-with _ for /. Poses are those of the topic of poses that most scans have a pose on, interpolated. They are moved to the
-LiDAR where tf says how it is mounted; else they stay those of the frame that the topic is about.
+Each point cloud topic is a recording. A single recording has the name of the bag. If the bag has several topics, each
+recording has the name of its topic, with _ instead of /.
+
+The poses come from the pose topic that covers most scans. They are interpolated at the times of the scans and
+transformed to the LiDAR frame by tf. If tf does not contain the mounting of the LiDAR, the poses are not transformed.
 """
 
 import dataclasses
@@ -24,23 +26,34 @@ from sglpr_jax.data.recording import Recording
 
 ENDINGS = (".bag", ".mcap", ".db3")
 LEAST_SHARE = 0.5
-"""Of the scans must have a pose on a topic: a goal or a start that somebody set is no trajectory."""
+"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return a name for each topic of point clouds; none where there is no bag.
+    """Return a name for each point cloud topic, or an empty tuple if `root` is not a bag.
 
-    Raises ValueError where a bag has no such topic or is broken, ImportError without the extra.
+    Raises:
+      ValueError: If a bag has no point cloud topic or is broken.
+      ImportError: If the extra `ros` is not installed.
     """
     paths = bag_files(root)
     return tuple(_topics(root, RosBag(paths))) if paths else ()
 
 
 def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> Recording:
-    """Open the point clouds of one topic, with poses where the bag has them, of `pose_topic` where it is named.
+    """Open the point clouds of one topic, with poses if the bag has them.
 
-    Reads the bag once for the times, and once for each topic of poses and of tf; where poses are found, scans without
-    one are left out. Raises as `recording_names` does, and ValueError where `pose_topic` has no poses of most scans.
+    The bag is read once for the times and once for each topic of poses and of tf. If a pose topic is used, scans
+    without a pose are skipped.
+
+    Arguments:
+      root: File or folder of the bag.
+      name: Name of the recording, from `recording_names`.
+      pose_topic: Pose topic. By default, the topic that covers most scans is used.
+
+    Raises:
+      ValueError: If the bag is broken, the topic has no messages, or `pose_topic` does not cover most scans.
+      ImportError: If the extra `ros` is not installed.
     """
     bag = RosBag(bag_files(root))
     topic = _topics(root, bag)[name]
@@ -49,7 +62,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
     if not len(recorded):
         raise ValueError(f"{root}: expected point clouds on {topic}, found no message")
     ids = tuple(f"{i:06d}" for i in range(len(recorded)))
-    first = np.searchsorted(recorded, recorded)  # messages of one nanosecond differ in their order
+    first = np.searchsorted(recorded, recorded)  # `nth` numbers the messages with equal times
     nth = np.arange(len(recorded)) - first
     where = dict(zip(ids, zip(recorded.tolist(), nth.tolist(), strict=True), strict=True))
     recording = Recording(
@@ -68,7 +81,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
-    """Return what rosbags opens together; nothing where there is no bag."""
+    """Return the paths that rosbags opens together, or an empty tuple if `root` is not a bag."""
     if root.is_file():
         return (root,) if root.suffix in ENDINGS else ()
     if (root / "metadata.yaml").is_file():
@@ -77,7 +90,7 @@ def bag_files(root: Path) -> tuple[Path, ...]:
 
 
 def _topics(root: Path, bag: RosBag) -> dict[str, str]:
-    """The topics of point clouds, by the names of their recordings."""
+    """Point cloud topics, by the names of their recordings."""
     topics = bag.cloud_topics
     if len(topics) == 1:
         return {root.resolve().stem if root.is_file() else root.resolve().name: topics[0]}
@@ -85,31 +98,32 @@ def _topics(root: Path, bag: RosBag) -> dict[str, str]:
 
 
 class _Placed(NamedTuple):
-    """A track, and what it says at the times of the scans."""
+    """A track, and its positions at the times of the scans."""
 
     track: Track
     clocks: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]
-    """Seconds of its poses and of the scans."""
+    """Times of the poses and of the scans, in seconds of one clock."""
     kept: Bool[np.ndarray, " q"]
-    """Which scans have a pose."""
+    """True for scans with a pose."""
     positions: Float[np.ndarray, "q 3"]
+    """Positions in metres, valid where `kept` is true."""
 
     @classmethod
     def at(cls, scans: Stamps, track: Track) -> "_Placed":
-        """The track at the times of the scans."""
+        """Interpolate the track at the times of the scans."""
         clocks = _clocks(track, scans)
         return cls(track, clocks, *interpolate(clocks[0], track.positions, clocks[1]))
 
     @property
     def share(self) -> float:
-        """Of the scans, those that have a pose."""
+        """Fraction of scans with a pose."""
         return float(self.kept.mean())
 
 
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
-    """The recording with the poses of `topic` or, without it, of that which most scans have a pose on.
+    """Add the poses of `topic`, or else of the topic that covers most scans, to the recording.
 
-    `lidar` is the frame of the scans. The other topics are told.
+    `lidar` is the frame of the scans. The unused topics are listed in `found`.
     """
     transforms = bag.transforms()
     tracks = {one: bag.track(one) for one in bag.pose_topics} | _tracks_of_lidar(transforms, lidar)
@@ -138,22 +152,22 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
 
 
 def _chosen(placed: dict[str, _Placed], topic: str | None, bag: Path) -> str:
-    """The topic whose poses are used: the one that is asked for, else the fullest; "" where none has enough.
+    """Return `topic`, or else the topic that covers most scans; "" if no topic covers enough scans.
 
-    Raises ValueError, naming the bag, where the one that is asked for has not.
+    Raises ValueError if `topic` does not exist or does not cover enough scans.
     """
     if topic is None:
         best = max(placed, key=lambda one: placed[one].share, default="")
         return best if best and placed[best].share >= LEAST_SHARE else ""
     if topic not in placed:
-        raise ValueError(f"{bag}: expected a topic of poses {topic}, found {', '.join(placed) or 'none'}")
+        raise ValueError(f"{bag}: expected the pose topic {topic}, found {', '.join(placed) or 'none'}")
     if placed[topic].share < LEAST_SHARE:
         raise ValueError(f"{bag}: expected poses of most scans on {topic}, found {placed[topic].share:.0%} of them")
     return topic
 
 
 def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
-    """The transforms of tf that move the LiDAR's frame, by names like those of topics."""
+    """The tf transforms that move the LiDAR frame, named like topics."""
     moving = (track for track in transforms if track.moves)
     return {
         f"/tf/{track.frame}/{track.child}": track
@@ -163,7 +177,7 @@ def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
 
 
 def _clocks(track: Track, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
-    """Seconds of the poses and of the scans: by the messages' own times or, where those do not meet, the recorder's."""
+    """Times of the poses and of the scans in seconds: header times, or recorder times if the headers do not overlap."""
     if scans.orderly and track.stamps.orderly:
         own = interpolate(track.stamps.own, track.positions, scans.own)
         if own.kept.mean() >= LEAST_SHARE:
@@ -172,17 +186,17 @@ def _clocks(track: Track, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float
 
 
 def _of_lidar(placed: _Placed, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "q 4 4"] | None, str]:
-    """The LiDAR's poses by a track that tells rotations, None by another one; and how they were made, in words."""
+    """Poses of the LiDAR, or None if the track has no rotations; and a description of how they were computed."""
     track, (poses_s, scans_s) = placed.track, placed.clocks
     if not track.turned:
-        return None, "interpolated; its rotations never change or are none"
+        return None, "interpolated; its rotations are constant or missing"
     poses = poses_of(placed.positions, interpolate_turns(poses_s, track.quaternions, scans_s))
     child = track.child.strip("/")
     if not child or child == lidar:
         return poses, "interpolated"
     child_from_lidar = fixed_transform(transforms, child, lidar)
     if child_from_lidar is None:
-        return poses, f"interpolated; taken as poses of {lidar or 'the LiDAR'}, since tf does not join the two"
+        return poses, f"interpolated; used as poses of {lidar or 'the LiDAR'}, since tf does not connect the two frames"
     return poses @ child_from_lidar, f"interpolated, moved to {lidar} by tf"
 
 

@@ -1,8 +1,8 @@
-"""A plain folder of single scans, with poses and times beside them or without (`folder_poses.py`).
+"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_poses.py`).
 
-my_scans/full0.bin, full1.bin, ..., full10.bin   in the order of their numbers; hidden files are none
-my_scans/poses.txt     12 numbers a line (LiDAR frame, z up) or 8 (TUM); or poses.tum or poses.csv
-my_scans/times.txt     seconds, one number a line
+- `my_scans/full0.bin`, `full1.bin`, ..., `full10.bin`: scans in the order of their numbers. Hidden files are ignored.
+- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `poses.tum` and `poses.csv` work, too.
+- `my_scans/times.txt`: timestamps in seconds, one number a line.
 """
 
 from collections import Counter
@@ -22,7 +22,7 @@ from sglpr_jax.data.recording import Recording
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the folder's own name if there are scans in it, else nothing."""
+    """Return the name of the folder if it contains scans, or else an empty tuple."""
     return (root.resolve().name,) if _scans(root) else ()
 
 
@@ -34,12 +34,20 @@ def open_recording(
     pose_format: PoseFormat = "auto",
     times: Path | None = None,
 ) -> Recording:
-    """Open the folder `root`; see above for what lies in it, and `read_scan` for `format`.
+    """Open the folder `root`. Warns if the format looks wrong or consecutive poses are far apart.
 
-    What a .bin holds is found out where neither `format` nor its name says it (`find_record`). Poses and times have
-    one row for each scan; see `folder_trajectory` for the files, and for the errors. Without poses the positions are
-    None. Raises ValueError where two files have the same name but for the ending. Warns where consecutive poses are
-    far apart.
+    Arguments:
+      root: Folder of the scans.
+      format: Format of the scans (`read_scan`). If neither `format` nor the name defines the record of a .bin file, it
+        is detected (`find_record`).
+      poses: Pose file (`folder_trajectory`), if it is not beside the scans. Without poses, `positions` is `None`.
+      pose_format: Format of the pose file.
+      times: File of timestamps, if it is not beside the scans.
+
+    Raises:
+      FileNotFoundError: If the folder has no scans, or `poses` or `times` does not exist.
+      ValueError: If two files differ only by their ending, the record cannot be detected, or the poses or timestamps
+        are malformed.
     """
     paths = _scans(root)
     if not paths:
@@ -64,7 +72,7 @@ def open_recording(
 
 
 def _scans(root: Path) -> tuple[Path, ...]:
-    """The scans in a folder; arrays are scans where there are no others."""
+    """Scan files in a folder. Arrays count as scans if there are no other scans."""
     return files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
 
 
@@ -73,7 +81,7 @@ def _endings() -> str:
 
 
 def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """The scans' names; ValueError where two files have one: which of them is the scan?"""
+    """Names of the scans. Raises ValueError if two files have the same name."""
     first: dict[str, Path] = {}
     for path in paths:
         other = first.setdefault(scan_id(path), path)
@@ -83,7 +91,7 @@ def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
 
 
 def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
-    """What a .bin is whose name does not say it, and the formats of all scans in words."""
+    """Record of the .bin files whose name does not define it, and a description of all formats."""
     unsaid = [path for path in paths if not says_its_format(path)] if format == "auto" else []
     found, how = find_record(unsaid) if unsaid else (None, "")
     if is_record(format):
@@ -96,7 +104,7 @@ def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat,
 
 
 def _left_aside(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """What else lies in the folder."""
+    """Description of the other files in the folder."""
     aside = left_aside(root, [*paths, *(root / name for name in (*POSE_FILES, TIMES_FILE))])
     return (f"left aside: {aside}",) if aside else ()
 

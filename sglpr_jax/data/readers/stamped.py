@@ -1,4 +1,4 @@
-"""What MulRan, HeLiPR and Boreas share: scans named by their time, and a file of poses with times of its own."""
+"""Shared code of the readers of MulRan, HeLiPR and Boreas: scans named by time, and poses with their own times."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +14,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 
 MAX_GAP_S = 0.1
-"""A scan without a pose this near in time is left out: the time of one turn."""
+"""Maximum time between a scan and its pose, in seconds: the duration of one sweep."""
 
 
 def stamped_recording(
@@ -28,17 +28,30 @@ def stamped_recording(
     read_points: Callable[[Path], Records],
     format: str,
 ) -> Recording:
-    """Open the `.bin` files of `folder`, named by their time in ticks of `tick_s` seconds, with poses by time.
+    """Open the `.bin` files of `folder`. Each scan gets the pose nearest in time.
 
-    Scans without a pose within `MAX_GAP_S` are left out; `pose_source` says how many. Raises FileNotFoundError without
-    scans, ValueError for a name that is no time and where no pose is near.
+    Scans without a pose within `MAX_GAP_S` are skipped. `pose_source` contains their number.
+
+    Arguments:
+      folder: Folder of the scans, which are named by their time in ticks.
+      name: Name of the recording.
+      stamps: Time of each pose, in ticks.
+      positions: Position of each pose, in metres.
+      pose_file: Pose file, for messages.
+      tick_s: Duration of a tick, in seconds.
+      read_points: Function that reads a scan.
+      format: Description of the format.
+
+    Raises:
+      FileNotFoundError: If there are no scans.
+      ValueError: If a scan is not named by its time, or no scan has a pose.
     """
     paths = files_in(folder, ".bin")
     if not paths:
         raise FileNotFoundError(f"{folder}: expected scans (*.bin), found none")
     strange = next((path.name for path in paths if not path.stem.isdecimal()), None)
     if strange:
-        raise ValueError(f"{folder}: expected scans named by their time, 1561000444390857630.bin, found {strange}")
+        raise ValueError(f"{folder}: expected scans named by their time, as 1561000444390857630.bin, found {strange}")
     times = np.array([int(path.stem) for path in paths], np.int64)
     matched = match_times(stamps, times, tick_s=tick_s, max_gap_s=MAX_GAP_S, poses=pose_file, scans=folder)
     kept = tuple(path for path, keep in zip(paths, matched.kept, strict=True) if keep)
@@ -60,10 +73,14 @@ def _read(path: Path, labels: Path | None, lasers: bool, *, read_points: Callabl
 
 
 def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:
-    """Return the times of a table, whole numbers of up to 19 digits, and its other columns as float64.
+    """Read a table of poses. Columns are separated by commas or white space.
 
-    Columns stand apart by commas or white space. Raises FileNotFoundError, and ValueError that names the first line
-    that is not as expected.
+    Returns:
+      First column, the times, as integers of up to 19 digits; and the other columns as float64.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line is malformed. The message names the first one.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table of poses, found none")

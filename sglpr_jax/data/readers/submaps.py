@@ -1,11 +1,11 @@
-"""Submaps of the PointNetVLAD benchmark (Oxford RobotCar and three districts): known, and refused.
+"""Rejects the submaps of the PointNetVLAD benchmark (Oxford RobotCar and three districts) with a clear error.
 
-    2014-05-19-13-20-57/pointcloud_20m_10overlap/1400505794141322.bin   float64 x, y, z, 4096 points
-    2014-05-19-13-20-57/pointcloud_locations_20m_10overlap.csv          timestamp, northing, easting
-    business_run1/pointcloud_25m_25/*.bin, pointcloud_centroids_25.csv
+- `2014-05-19-13-20-57/pointcloud_20m_10overlap/1400505794141322.bin`: float64 x, y, z, 4096 points.
+- `2014-05-19-13-20-57/pointcloud_locations_20m_10overlap.csv`: timestamp, northing, easting.
+- `business_run1/pointcloud_25m_25/*.bin` and `pointcloud_centroids_25.csv`.
 
-An image counts points in cells of metres around a sensor. These have no sensor, and each submap is scaled into [-1, 1]
-by a factor of its own that is not kept (docs/decisions/data.md). Read as a plain folder they would look like scans.
+A density image counts points in metric cells around a sensor. Submaps have no sensor. Each submap is scaled to [-1, 1],
+and its factor is not stored (docs/decisions/data.md). Without this reader, a run looks like a plain folder of scans.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ TABLES = ("pointcloud_locations_*.csv", "pointcloud_centroids_*.csv")
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
-    """Return the names of the runs in `root`: a folder of submaps, a run, or a folder of runs or of districts."""
+    """Return the names of the runs in `root`, which is a folder of submaps, a run, or a folder of runs or districts."""
     if not root.is_dir():
         return ()
     folders = [root.resolve().parent] if root.name.startswith("pointcloud_") else []
@@ -28,10 +28,10 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def refuse(root: Path, name: str, options: ReadOptions) -> Recording:
-    """Raise ValueError, which says why."""
+    """Raise ValueError with the reason why submaps cannot be used."""
     raise ValueError(
-        f"{root}: expected scans in metres, found submaps ({name}, PointNetVLAD's benchmark): each is scaled into"
-        " [-1, 1] by a factor that is not kept, and has neither a sensor nor the ground; open the dataset's own scans"
+        f"{root}: expected scans in metres, found submaps ({name}, PointNetVLAD benchmark): each is scaled to"
+        " [-1, 1] by an unknown factor, and has neither a sensor nor the ground; open the original scans of the dataset"
     )
 
 

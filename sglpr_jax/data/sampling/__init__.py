@@ -1,1 +1,1 @@
-"""What a training step reads: tuples of places, and the batches made of them."""
+"""Input of a training step: tuples of places, and batches of tuples."""

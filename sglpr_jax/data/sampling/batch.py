@@ -1,4 +1,4 @@
-"""A batch of training tuples: read from files on the host, rotated and rasterised on the device."""
+"""Batches of training tuples: read from files on the host, rotated and rasterised on the device."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,35 +17,39 @@ from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.labels import UNLABELLED
 
 Place = tuple[Any, Any]
-"""What is read of one place: an image (h, w) or points (n, 3), and their classes (h, w) or (n,), or None."""
+"""Data of one place: an image (h, w) or points (n, 3), and their classes (h, w) or (n,), or None."""
 
 
 @flax.struct.dataclass
 class Batch:
-    """Tuples as arrays; t tuples of k = 1 + k_p + k_n places, flattened to b = t k where not said otherwise.
+    """Training tuples as arrays: t tuples of k = 1 + k_p + k_n places, flattened to b = t k places.
 
-    Either `images` (b, h, w) with their `maps` of classes (b, h, w), or `points` (b, n, 3) with `count` (b,) valid
-    ones each and their `classes` (b, n); maps and classes are None where no recording has labels. `labelled` (b,) says
-    which places have labels, `negatives` (t, b) which places are negatives of each tuple's anchor, `positives` how many
-    places after an anchor are its positives.
-
-    With `also`, a second batch, its places come after those here: `labelled` covers both, and `negatives` both or,
-    where the triplet loss does not count the second one, the first alone.
+    A batch has either `images` with `maps`, or `points` with `count` and `classes`. If no recording has
+    labels, `maps` and `classes` stay None.
     """
 
     labelled: Any
+    """Whether each place has labels (b,), including the places of `also`."""
     negatives: Any
+    """Whether each place is a negative of each anchor (t, b). Covers `also`, unless the triplet loss ignores it."""
     positives: int = flax.struct.field(pytree_node=False)
+    """Number of positives after each anchor."""
     images: Any = None
+    """Images (b, h, w)."""
     maps: Any = None
+    """Classes of the pixels (b, h, w)."""
     points: Any = None
+    """Padded points (b, n, 3)."""
     count: Any = None
+    """Number of valid points of each place (b,)."""
     classes: Any = None
+    """Classes of the points (b, n)."""
     also: Any = None
+    """Second batch, whose places follow the places of this batch."""
 
     @property
     def places(self) -> int:
-        """How many places are held here, those of `also` not counted."""
+        """Number of places, without those of `also`."""
         return len(self.points if self.images is None else self.images)
 
 
@@ -62,10 +66,19 @@ def read_batch(
 ) -> Batch:
     """Read the frames of some tuples.
 
-    With `share_negatives` every place of the batch that is far enough from an anchor is its negative, not only those
-    of its own tuple. Clouds of more than `max_points` points are thinned evenly. `categories` says how labels are
-    sorted into classes; with 0 they are not read. `image` "density" makes an image like the ready-made ones of all
-    points of a scan. `part` says which tuples to read; their negatives are still sought among all of the batch.
+    Arguments:
+      recordings: Recordings of the pool.
+      pool: Pool of the frames.
+      frames: Frame numbers of the pool, one row per tuple, from `TuplePool.draw`.
+      max_points: Maximum number of points of a cloud. Larger clouds are thinned evenly.
+      share_negatives: Whether every place of the batch that is far enough from an anchor is its negative. Otherwise
+        only the negatives of its own tuple count.
+      categories: Number of classes; with 0 no labels are read.
+      image: Kind of image. "density" computes density images from all points of a scan.
+      part: Tuples to read. Their negatives come from the whole batch.
+
+    Raises:
+      ValueError: If the batch mixes scans and images, images differ in size, or a scan shows no place.
     """
     flat = frames.reshape(-1)
     negatives = pool.far_apart(frames[:, :1], flat[None, :])
@@ -94,9 +107,15 @@ def read_batch(
 
 
 def views(batch: Batch, angles: Float[Array, "b"] | None, grid: Grid) -> View:
-    """What the model sees of each place, rotated by its angle (radians; None: as it is), inside jit on the device.
+    """Return the model input of each place, inside jit on the device.
 
-    No map of classes where there are no labels.
+    Arguments:
+      batch: Places to convert.
+      angles: Rotation angle of each place in radians, or None.
+      grid: Grid of the model.
+
+    Returns:
+      Images, and maps of classes or None if no place has labels.
     """
     if batch.also is None:
         return _views(batch, angles, grid)
@@ -124,7 +143,7 @@ def _own_negatives(shape: tuple[int, int], *, positives: int) -> Bool[np.ndarray
 def _read(recording: Recording, frame: int, *, images: bool, labels: bool) -> Record:
     if recording.has_images != images:
         expected, found = ("images", "scans") if images else ("scans", "images")
-        raise ValueError(f"expected all recordings of a batch to be {expected}, found {found} in {recording.name}")
+        raise ValueError(f"expected only {expected} in a batch, found {found} in recording {recording.name}")
     record = recording.record(frame, labels=labels)
     if record.points is not None:
         check_cloud(record.points, name=record.name)
@@ -137,18 +156,18 @@ def _require_one_size(places: list[tuple[Recording, int]], pictures: list[Place]
         if image.shape != expected:
             raise ValueError(
                 f"recording {recording.name}, frame {recording.ids[frame]}: expected an image of {expected[0]} x"
-                f" {expected[1]} pixels, as of {places[0][0].name}, found {image.shape[0]} x {image.shape[1]}"
+                f" {expected[1]} pixels, as in {places[0][0].name}, found {image.shape[0]} x {image.shape[1]}"
             )
 
 
 def _stacked(pictures: list[Place]) -> tuple[np.ndarray, np.ndarray]:
-    """Images, and their maps of classes, UNLABELLED all over where there is none."""
+    """Stacks images and maps of classes. Missing maps are filled with UNLABELLED."""
     maps = [np.full(image.shape, UNLABELLED, np.int32) if classes is None else classes for image, classes in pictures]
     return np.stack([image for image, _ in pictures]), np.stack(maps)
 
 
 def _padded(scans: list[Place], max_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Clouds of one size, how many points of each count, and their classes, 0 where there are none."""
+    """Pads clouds to one size. Returns points, numbers of valid points, and classes (0 without labels)."""
     points = np.zeros((len(scans), max_points, 3), np.float32)
     classes = np.zeros((len(scans), max_points), np.int32)
     count = np.zeros(len(scans), np.int32)

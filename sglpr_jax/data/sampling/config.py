@@ -1,4 +1,4 @@
-"""Which places a training draws and which it holds out, as plain values."""
+"""Configuration of the training tuples and of the held-out part."""
 
 import dataclasses
 from typing import Annotated, Literal
@@ -9,30 +9,34 @@ from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 @dataclasses.dataclass(frozen=True)
 class TupleConfig:
-    """How tuples are drawn. Distances are horizontal: ground-truth heights drift by metres within a recording."""
+    """Configuration of the training tuples. Distances are horizontal, because ground-truth heights drift by metres."""
 
     positives: Count = 1
+    """Number of positives of an anchor."""
     negatives: CountOrNone = 10
+    """Number of negatives of an anchor."""
     positive_m: NotNegative = POSITIVE_M
+    """Maximum distance of a positive from its anchor, in metres."""
     negative_m: NotNegative = NEGATIVE_M
+    """Minimum distance of a negative from its anchor, in metres."""
     revisit_fraction: Share = 0.5
-    """The share of tuples whose positives come from another visit; the others' come from neighbouring frames."""
+    """Fraction of tuples with positives from another visit. In the other tuples, positives are neighbouring frames."""
     revisit_gap: CountOrNone = 50
-    """Frames at most this far apart belong to one visit."""
+    """Maximum difference of the frame numbers within one visit."""
     cluster: Count = 1
-    """Tuples in a row whose anchors lie near each other. Where tuples share their places as negatives, neighbouring
-    places of one street are harder to tell apart than any two of a whole recording."""
+    """Number of consecutive tuples with anchors near each other. If tuples share negatives, neighbouring places of a
+    street are harder to distinguish than random places."""
     cluster_m: NotNegative = 100.0
-    """How near: the distance to the first anchor of the row."""
+    """Maximum distance of the anchors of a cluster from its first anchor, in metres."""
     mining: Literal["none", "hardest"] = "none"
-    """`none`: negatives at random, as in the paper. `hardest`: those that look most like the anchor (BEVPlace++); the
-    anchors of a cluster are then alike rather than near each other."""
+    """`none`: random negatives, as in the paper. `hardest`: negatives that look most like the anchor (BEVPlace++);
+    anchors of a cluster are then similar instead of near each other."""
     hardest: CountOrNone = 10
-    """Negatives are drawn from this many places: those that look most like the anchor, beyond the negative distance."""
+    """Number of most similar places beyond the negative distance, from which negatives are drawn."""
     refresh_steps: CountOrNone = 1000
-    """Steps after which the descriptors that mining compares are computed anew."""
+    """Number of steps after which mining recomputes the descriptors."""
     mined_places: CountOrNone = 0
-    """Places that are described then, other ones each time, and anchors of the tuples drawn; 0: all."""
+    """Number of random places that mining describes each time, and draws anchors from; 0: all."""
 
     def __post_init__(self):
         check_fields(self)
@@ -40,8 +44,8 @@ class TupleConfig:
             return
         if self.negatives == 0 and self.cluster == 1:
             raise ValueError(
-                "sampling.mining chooses negatives or the other anchors of a cluster: expected sampling.negatives or "
-                "sampling.cluster above 0 and 1, found 0 and 1"
+                "sampling.mining selects negatives and the anchors of a cluster: expected sampling.negatives above 0 "
+                "or sampling.cluster above 1, found 0 and 1"
             )
         if min(self.hardest, self.refresh_steps) < 1:
             raise ValueError(
@@ -52,10 +56,11 @@ class TupleConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValidationConfig:
-    """What is held out of every training recording."""
+    """Held-out part of every training recording."""
 
     share: Annotated[float, Bounds(0, 0.5)] = 0.0
-    """The length of a stretch of frames in a row, as a share of the recording; 0: nothing, as in the paper."""
+    """Length of the held-out stretch of consecutive frames, as a fraction of the recording; 0: none, as in the
+    paper."""
 
     def __post_init__(self):
         check_fields(self)

@@ -1,4 +1,4 @@
-"""Descriptors of places as they were some steps ago: what hard negatives are chosen by."""
+"""Descriptors of places from an earlier training step, for selecting hard negatives."""
 
 import dataclasses
 import functools
@@ -12,21 +12,21 @@ from sglpr_jax.files import read_arrays, replacing
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DescriptorCache:
-    """The descriptor of each of some places; `places` are frame numbers of a `TuplePool`, rising."""
+    """Descriptors of some places. `places` are frame numbers of a `TuplePool` in ascending order."""
 
     places: Int[np.ndarray, "n"]
     descriptors: Float32[np.ndarray, "n d"]
 
     def nearest(self, anchor: int, candidates: Int[np.ndarray, "_"], size: int) -> Int[np.ndarray, "_"]:
-        """The up to `size` candidates whose descriptors are nearest to the anchor's, nearest first.
+        """Return at most `size` candidates with the descriptors nearest to the anchor's, nearest first.
 
-        Candidates that are not in the cache are left out; of an anchor that is not there nothing is near.
+        Candidates that are not in the cache are skipped. If the anchor is not in the cache, the result is empty.
         """
         candidates = candidates[np.isin(candidates, self.places, assume_unique=True)]
         if anchor not in self.places:
             return candidates[:0]
         rows, row = np.searchsorted(self.places, candidates), np.searchsorted(self.places, anchor)
-        # |a - b|^2 less |a|^2: one product of a matrix and a vector, where differences would copy the whole cache.
+        # |a - b|^2 - |a|^2 needs one matrix-vector product. Differences would copy the whole cache.
         square = self._squares - 2 * (self.descriptors @ self.descriptors[row])
         return candidates[np.argsort(square[rows], kind="stable")[:size]]
 
@@ -35,13 +35,13 @@ class DescriptorCache:
         return np.square(self.descriptors).sum(1)
 
     def save(self, path: Path) -> None:
-        """Write the file whole or not at all."""
+        """Write the file atomically."""
         with replacing(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, places=self.places, descriptors=self.descriptors)
 
     @classmethod
     def load(cls, path: Path) -> "DescriptorCache":
-        """Read what `save` wrote. Raises FileNotFoundError, or ValueError where it is damaged."""
+        """Read a file written by `save`. Raises FileNotFoundError, or ValueError if the file is damaged."""
         found = read_arrays(path, expected="descriptors of places")
         places, descriptors = found.get("places"), found.get("descriptors")
         if places is None or descriptors is None or places.shape != descriptors.shape[:1] or descriptors.ndim != 2:

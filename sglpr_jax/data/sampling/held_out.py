@@ -1,4 +1,4 @@
-"""A part of the training recordings that nothing is learnt from: on it a training is judged before the test."""
+"""Holds out a part of the training recordings for validation."""
 
 import dataclasses
 
@@ -12,18 +12,18 @@ from sglpr_jax.revisits import close_pairs
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Split:
-    """Frames of one recording, rising. Those in neither part lie too near to both."""
+    """Frames of one recording, in ascending order. Frames near the validation part are in neither part."""
 
     training: Int[np.ndarray, "_"]
     validation: Int[np.ndarray, "_"]
 
 
 def hold_out(positions: Float[np.ndarray, "n 3"], config: ValidationConfig, sampling: TupleConfig) -> Split:
-    """Split a recording: a stretch of frames and all its revisits for validation, what lies far from them for training.
+    """Split a recording: a stretch of frames with all its revisits for validation, and distant frames for training.
 
-    Every validation frame lies within the positive distance of the stretch, every training frame beyond the negative
-    distance of every validation frame (both horizontal), so that no house is seen from both parts. Of all stretches
-    it is the first whose share of the recording's revisiting frames is nearest to its share of the frames.
+    Every validation frame is within the positive distance of the stretch. Every training frame is beyond the negative
+    distance of all validation frames, so that no house is visible in both parts. Both distances are horizontal. The
+    stretch is the first one whose fraction of the revisiting frames is nearest to its fraction of all frames.
     """
     n = len(positions)
     length = round(config.share * n)
@@ -39,7 +39,7 @@ def hold_out(positions: Float[np.ndarray, "n 3"], config: ValidationConfig, samp
 
 
 def _revisiting(places: Float[np.ndarray, "n 2"], sampling: TupleConfig) -> Bool[np.ndarray, "n"]:
-    """Which frames have a positive in another visit."""
+    """Marks the frames that have a positive in another visit."""
     pairs = close_pairs(places, closer_than_m=sampling.positive_m)
     revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
     return np.isin(np.arange(len(places)), revisits)

@@ -1,4 +1,4 @@
-"""Two sources in one batch: real images without labels, say, and simulated scans with them."""
+"""Combines two sources in one batch, such as real images without labels and simulated scans with labels."""
 
 import dataclasses
 
@@ -8,10 +8,14 @@ from sglpr_jax.data.sampling.batch import Batch
 
 
 def mix(main: Batch, also: Batch, *, triplets: bool, share_negatives: bool) -> Batch:
-    """One batch with the places of `also` after those of `main`.
+    """Return one batch with the places of `main`, followed by those of `also`.
 
-    With `triplets` the tuples of both count in the triplet loss, and with `share_negatives` each source's places are
-    negatives of the other's anchors, since no place is in two datasets. Without `triplets` the loss sees `main` alone.
+    Arguments:
+      main: First batch.
+      also: Second batch, from another dataset.
+      triplets: Whether the triplet loss counts the tuples of both batches. Otherwise it counts only those of `main`.
+      share_negatives: With `triplets`, whether the places of each batch are negatives of the anchors in the other one.
+        The datasets must not share a place.
     """
     negatives = main.negatives
     if triplets:

@@ -1,4 +1,4 @@
-"""Reading ahead: the next batches are read by a thread while the device works on this one."""
+"""Reads the next batches in a thread while the device processes the current batch."""
 
 import queue
 import threading
@@ -9,9 +9,9 @@ T = TypeVar("T")
 
 
 def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 2) -> Generator[T, None, None]:
-    """Yield make(start), ..., make(stop - 1) in order, up to `depth` of them made ahead by a thread.
+    """Yield make(start), ..., make(stop - 1) in order. A thread computes up to `depth` values ahead.
 
-    An exception of `make` is raised here, at its turn. Closing the iterator ends the thread.
+    An exception of `make` is raised when its value is due. Closing the iterator stops the thread.
     """
     ready: queue.Queue = queue.Queue(maxsize=depth)
     ended = threading.Event()
@@ -29,7 +29,7 @@ def read_ahead(make: Callable[[int], T], *, start: int, stop: int, depth: int = 
         for step in range(start, stop):
             try:
                 item = (make(step), None)
-            except BaseException as error:  # carried over to the consumer, whoever interrupts or fails
+            except BaseException as error:  # The consumer raises it.
                 item = (None, error)
             if not put(item) or item[1] is not None:
                 return

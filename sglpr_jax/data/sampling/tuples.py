@@ -1,4 +1,4 @@
-"""Which frames make a training tuple: 1 anchor, k_p positives of the same place, k_n negatives of other places."""
+"""Draws training tuples: 1 anchor, k_p positives of the same place, k_n negatives of other places."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,24 +13,24 @@ from sglpr_jax.revisits import close_pairs
 
 @dataclasses.dataclass(frozen=True)
 class Positives:
-    """For every frame of the pool its positives, as slices of one flat array."""
+    """Positives of every frame of the pool, as slices of one flat array."""
 
     frames: Int[np.ndarray, "pairs"]
     starts: Int[np.ndarray, "bounds"]
 
     @property
     def anchors(self) -> Int[np.ndarray, "anchors"]:
-        """The frames that have a positive at all."""
+        """Frames with at least one positive."""
         return np.flatnonzero(np.diff(self.starts))
 
     def draw(self, rng: np.random.Generator, anchor: int, size: int) -> Int[np.ndarray, "size"]:
-        """Some positives of `anchor`; all different where there are enough."""
+        """Draw positives of `anchor`, without repetition if there are enough."""
         choices = self.frames[self.starts[anchor] : self.starts[anchor + 1]]
         return rng.choice(choices, size, replace=len(choices) < size)
 
 
 class TuplePool:
-    """All frames of several recordings, counted through, and the tuples that can be drawn from them."""
+    """All frames of several recordings, numbered consecutively, and the tuples that can be drawn from them."""
 
     def __init__(
         self,
@@ -39,7 +39,16 @@ class TuplePool:
         *,
         frames: Sequence[Int[np.ndarray, "_"]] | None = None,
     ):
-        """`frames` are those of each recording that may be used (None: all). ValueError when none has a positive."""
+        """Number the frames and find their positives.
+
+        Arguments:
+          positions: Positions of each recording, in metres.
+          config: Configuration of the tuples.
+          frames: Frames of each recording to use, or None for all.
+
+        Raises:
+          ValueError: If no frame has a positive.
+        """
         self.config = config
         frames = [np.arange(len(p)) for p in positions] if frames is None else frames
         self.positions = np.concatenate([p[kept] for p, kept in zip(positions, frames, strict=True)])
@@ -58,10 +67,13 @@ class TuplePool:
     def draw(
         self, *, seed: int, step: int, tuples: int, cache: DescriptorCache | None = None
     ) -> Int[np.ndarray, "{tuples} k"]:
-        """The pool's frame numbers of one batch, (anchor, positives, negatives) a row. A pure function.
+        """Draw the frame numbers of one batch, with one row (anchor, positives, negatives) per tuple.
 
-        With a `cache` the anchors are among its places, and negatives and clusters are mined. Raises ValueError for an
-        anchor that has no negatives.
+        The result is a pure function of the arguments. With a cache, anchors are among its places, and negatives and
+        clusters are mined.
+
+        Raises:
+          ValueError: If an anchor has no negatives.
         """
         rng = np.random.default_rng([seed, step])
         anchored: list[list[int]] = []
@@ -71,13 +83,13 @@ class TuplePool:
         return np.array([[*row, *self._draw_negatives(rng, row[0], cache)] for row in anchored])
 
     def draw_places(self, *, seed: int, step: int, tuples: int) -> Int[np.ndarray, "{tuples} k"]:
-        """As many frame numbers as `draw` returns, but any places, where what counts is that they differ."""
+        """Draw the same number of frames as `draw`, but at any places, and without repetition if there are enough."""
         rng = np.random.default_rng([seed, step])
         shape = tuples, 1 + self.config.positives + self.config.negatives
         return rng.choice(len(self), shape, replace=bool(np.prod(shape) > len(self)))
 
     def _draw_anchored(self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None) -> list[int]:
-        """An anchor and its positives; `cluster` are the anchors of the same cluster that were drawn before."""
+        """Draws an anchor and its positives. `cluster` contains the earlier anchors of the same cluster."""
         other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
         source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
         anchors = source.anchors
@@ -91,7 +103,8 @@ class TuplePool:
     def _alike_or_near(
         self, cluster: list[int], anchors: Int[np.ndarray, "_"], cache: DescriptorCache | None
     ) -> Int[np.ndarray, "_"]:
-        """Which anchors fit a cluster: those near its first one or, mined, the likest ones far from all of it."""
+        """Selects anchors that fit a cluster: near its first anchor or, with a cache, similar to it and far from all
+        anchors."""
         if cache is None:
             return anchors[self._within(cluster[0], anchors, self.config.cluster_m)]
         far = self.far_apart(np.array(cluster)[:, None], anchors[None]).all(0)
@@ -109,11 +122,11 @@ class TuplePool:
         return rng.choice(choices, size, replace=len(choices) < size)
 
     def far_apart(self, a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> np.ndarray:
-        """Whether two frames are certainly other places: of other recordings, or beyond the negative distance."""
+        """Return whether two frames show different places: in different recordings, or beyond the negative distance."""
         return ~self._within(a, b, self.config.negative_m)
 
     def _within(self, a: Int[np.ndarray, "..."] | int, b: Int[np.ndarray, "..."], metres: float) -> np.ndarray:
-        """Whether two frames are of one recording and at most so far apart."""
+        """Whether two frames are in the same recording and at most this distance apart, in metres."""
         offset = self.positions[a, :2] - self.positions[b, :2]
         return (self.recording[a] == self.recording[b]) & (np.hypot(offset[..., 0], offset[..., 1]) <= metres)
 

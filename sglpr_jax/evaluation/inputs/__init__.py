@@ -1,10 +1,10 @@
-"""What a method hands in, whatever made it: descriptors, a top-k list or scored pairs, by the kind of file.
+"""Readers of the inputs of an evaluation: descriptors, a top-k list or scored pairs of any method.
 
     .npz   a descriptor file (`DescriptorFile`)
-    .npy   a matrix of descriptors, a row per frame
-    text   `query: frame frame ...` is a top-k list, `i j score [label]` a list of scored pairs
+    .npy   a matrix of descriptors, one row per frame
+    text   a top-k list has lines `query: frame frame ...`, a list of scored pairs `i j score [label]`
 
-Frames are numbered from 0, as the rows of the poses.
+Frames are numbered from 0, in the order of the poses.
 """
 
 from pathlib import Path
@@ -21,10 +21,18 @@ Input = Source | ScoredPairs
 
 
 def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str | None = None) -> Input:
-    """Read a file of any kind, to be scored on `trajectory`; None: what the file itself knows is all there is.
+    """Read an input file of any kind.
 
-    `distance` names how the descriptors of a matrix are compared; None: by L2. The other files say it themselves.
-    Raises FileNotFoundError, and ValueError naming the file, what was expected and what was found.
+    Arguments:
+      path: File to read.
+      trajectory: Positions and times of the frames. If None, only those in the file are used.
+      sequence: Name of the sequence, for files that do not contain it.
+      distance: Name of the distance between the descriptors of a .npy file, L2 by default. Other files define their
+        own distance.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is invalid or does not fit the other arguments. The message names the file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a descriptor file, .npy, top-k list or scored pairs, found none")
@@ -33,7 +41,7 @@ def read_input(path: Path, trajectory: Trajectory | None, *, sequence: str, dist
     if path.suffix == ".npy":
         return read_matrix(path, trajectory, sequence=sequence, distance=distance or "l2")
     if distance is not None:
-        raise ValueError(f"{path}: expected a .npy beside --distance, found a file that has its own distances")
+        raise ValueError(f"{path}: expected a .npy beside --distance, found a file that defines its own distance")
     if path.suffix == ".npz":
         return read_own_file(path, trajectory)
     if is_top_k_list(path):

@@ -1,4 +1,4 @@
-"""Whether methods that are compared speak of the same frames: a table of two recordings would compare nothing."""
+"""Check that compared methods have the same frames. Scores on different recordings cannot be compared."""
 
 import numpy as np
 
@@ -7,19 +7,22 @@ from sglpr_jax.evaluation.protocols import ScoredPairs
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 NEAR_M = 0.01
-"""Positions that differ by less are the same, written by another program."""
+"""Largest difference of equal positions, in metres. Programs round the numbers in their files."""
 NEAR_S = 0.001
+"""Largest difference of equal times, in seconds."""
 
 
 def check_agreement(first: Input, other: Input) -> None:
-    """Raise ValueError, naming a frame, unless `other` has the frames, the positions and the times of `first`."""
+    """Raise ValueError if `other` has other frames, positions or times than `first`. The message names a frame."""
     if isinstance(first, DescriptorFile) and isinstance(other, DescriptorFile) and first.ids != other.ids:
         raise ValueError(f"expected the frames of the first file, {_ids(first, other)}, found {_ids(other, first)}")
     _check_rows("positions", first.positions, other.positions, NEAR_M)
     if not isinstance(first, ScoredPairs) and not isinstance(other, ScoredPairs):
         if (first.times is None) != (other.times is None):
             has, has_not = ("times", "none") if first.times is not None else ("none", "times")
-            raise ValueError(f"expected the times of the first file, {has}, found {has_not}")
+            raise ValueError(
+                f"expected times in both files or in neither, found {has} in the first and {has_not} in this one"
+            )
         _check_rows("times", first.times, other.times, NEAR_S)
 
 
@@ -27,7 +30,7 @@ def _check_rows(what: str, first: np.ndarray | None, other: np.ndarray | None, n
     if first is None or other is None:
         return
     if len(first) != len(other):
-        raise ValueError(f"expected {len(first)} {what}, as the first file has, found {len(other)}")
+        raise ValueError(f"expected {len(first)} {what}, as in the first file, found {len(other)}")
     apart = np.abs(first - other).reshape(len(first), -1).max(axis=1)
     row = int(apart.argmax())
     if apart[row] > near:
@@ -37,7 +40,7 @@ def _check_rows(what: str, first: np.ndarray | None, other: np.ndarray | None, n
 
 
 def _ids(file: DescriptorFile, beside: DescriptorFile) -> str:
-    """How many there are, and the first that differs."""
+    """Return the number of frames and the first id that differs."""
     pairs = zip(file.ids, [*beside.ids, *[None] * len(file)], strict=False)
     strange = next((name for name, other in pairs if name != other), "none more")
     return f"{len(file)} with {strange!r}"

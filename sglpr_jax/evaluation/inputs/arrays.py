@@ -1,4 +1,4 @@
-"""Descriptors and positions that are arrays already."""
+"""Descriptors and positions from arrays."""
 
 import numpy as np
 from jaxtyping import Float, Float32, Num
@@ -10,7 +10,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 def as_trajectory(
     positions: Float[np.ndarray, "n 3"] | None, times: Float[np.ndarray, " n"] | None = None
 ) -> Trajectory | None:
-    """Return positions (metres, z up) and times (seconds) as a pose file would give them; None without positions."""
+    """Return a trajectory of positions (metres, z up) and times (seconds), or None without positions."""
     if positions is None:
         return None
     return Trajectory(np.asarray(positions, np.float64), times, "positions given as an array", by_row=True)
@@ -19,7 +19,10 @@ def as_trajectory(
 def as_descriptors(
     rows: Num[np.ndarray, "n d"], trajectory: Trajectory, *, sequence: str, method: str, distance: str
 ) -> DescriptorFile:
-    """Return descriptors of any real type, row i that of pose i. Raises ValueError where a row is not finite."""
+    """Return descriptors from an array of real numbers. Row i belongs to pose i.
+
+    Raises ValueError if a row is not finite.
+    """
     return DescriptorFile(
         sequence=sequence,
         ids=tuple(f"{row:06d}" for row in range(len(rows))),
@@ -34,6 +37,6 @@ def as_descriptors(
 
 
 def _as_float32(rows: Num[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
-    # A number too large for float32 becomes infinite, which the descriptor file refuses; no need to warn as well.
+    # Numbers too large for float32 become infinite. `DescriptorFile` rejects them, so numpy need not warn.
     with np.errstate(over="ignore"):
         return np.array(rows, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Plain .npy files: one row of numbers per frame, from any program."""
+"""Reader of .npy files with one descriptor per row, from any program."""
 
 from pathlib import Path
 
@@ -13,9 +13,9 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
 def read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, distance: str) -> DescriptorFile:
-    """Read descriptors (n, d) of any real type, row i the frame of pose i; they become float32.
+    """Read descriptors (n, d) of any real type and convert them to float32. Row i belongs to pose i.
 
-    Raises ValueError naming the file where it is no such array, a row is not finite, or poses are another number.
+    Raises ValueError if the array is invalid, if a row is not finite, or if the numbers of rows and poses differ.
     """
     rows = _load(path)
     trajectory = needed(path, trajectory, rows=len(rows))
@@ -26,15 +26,15 @@ def read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, dis
 
 
 def _load(path: Path) -> Num[np.ndarray, "n d"]:
-    """Return the array of a file; what pickle would have to read is refused."""
+    """Return the array of a file. Files that need pickle are rejected."""
     expected = f"{path}: expected descriptors (n, d) as numbers"
     try:
         with path.open("rb") as stream:
             rows = np.lib.format.read_array(stream, allow_pickle=False)
     except MemoryError as error:
         raise ValueError(f"{expected}, found an array larger than the memory") from error
-    except Exception as error:  # numpy parses the header as Python, with all that this can raise
-        raise ValueError(f"{expected}, found no such .npy ({in_short(error)})") from error
+    except Exception as error:  # numpy parses the header as Python, which can raise any exception
+        raise ValueError(f"{expected}, found no valid .npy file ({in_short(error)})") from error
     if rows.ndim != 2 or rows.dtype.kind not in "fiub" or rows.size == 0:
         raise ValueError(f"{expected}, found {rows.dtype} {rows.shape}")
     return rows

@@ -1,4 +1,4 @@
-"""The files of several methods on the same frames, to be compared."""
+"""Reader of the files of several methods on the same frames."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,11 +18,19 @@ def read_methods(
     sequence: str | None = None,
     distance: str | None = None,
 ) -> dict[str, Input]:
-    """Read the file of every method, by the name of the method: that of its file.
+    """Read the file of every method and return the inputs by method name, which is the name of the file.
 
-    `poses` replace those of every file; where they have no times, those of the first file that has some serve all.
-    Files that have none of their own get those of the first file or, where that has none either, of the `dataset`.
-    `distance` names how the descriptors of the first file, and of every .npy, are compared. Errors as of `read_input`.
+    Arguments:
+      paths: Files of the methods.
+      poses: Positions that replace those of every file. If they have no times, the times of the first file with times
+        are used for all files.
+      dataset: Positions for files without positions, if the first file has no positions either.
+      sequence: Name of the sequence. By default the name of each file.
+      distance: Name of the distance between descriptors, for the first file and for every .npy file.
+
+    Raises:
+      FileNotFoundError: As `read_input`.
+      ValueError: As `read_input`.
     """
     methods: dict[str, Input] = {}
     for path in paths:
@@ -34,7 +42,7 @@ def read_methods(
 
 
 def _of_first(methods: Mapping[str, Input]) -> Trajectory | None:
-    """Where and when the frames of the first method were taken, where its file says it by itself."""
+    """Return the positions and times in the file of the first method, or None if it has no positions."""
     first = next(iter(methods.values()), None)
     if not isinstance(first, DescriptorFile) or first.positions is None:
         return None
@@ -42,7 +50,7 @@ def _of_first(methods: Mapping[str, Input]) -> Trajectory | None:
 
 
 def _timed(methods: Mapping[str, Input]) -> dict[str, Input]:
-    """Give the methods without times those of the first that has some: with the same poses they have as many rows."""
+    """Give methods without times the times of the first method with times. All have the same poses."""
     retrieved = [method for method in methods.values() if not isinstance(method, ScoredPairs)]
     times = next((method.times for method in retrieved if method.times is not None), None)
     return {
@@ -52,5 +60,5 @@ def _timed(methods: Mapping[str, Input]) -> dict[str, Input]:
 
 
 def _name(path: Path, others: Sequence[Path]) -> str:
-    """Return the file's name without its ending, or its whole path where another has the same name."""
+    """Return the file name without suffix, or the whole path if another file has the same name."""
     return path.stem if sum(other.stem == path.stem for other in others) == 1 else str(path)

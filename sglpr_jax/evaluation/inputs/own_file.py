@@ -1,4 +1,4 @@
-"""Descriptor files, as `bin/embed` writes them."""
+"""Reader of descriptor files of `bin/embed`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +9,14 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
 def read_own_file(path: Path, trajectory: Trajectory | None) -> DescriptorFile:
-    """Read a descriptor file; a trajectory replaces its positions, and its times where these were given for the frames.
+    """Read a descriptor file, optionally with the positions of another trajectory.
 
-    A trajectory of all scans of the recording serves a file from which some were left out. One of other times is
-    interpolated at those of the file (`poses_at_scans`); frames without a pose are left out. Raises ValueError where
-    it does not fit, and where there are no positions.
+    A trajectory replaces the positions of the file. Its times replace those of the file if the file has no times, or if
+    they were given for the frames (`Trajectory.by_row`). If `bin/embed` skipped scans, the trajectory may have a pose
+    for every scan of the recording. If the times of the trajectory and the file differ, positions are interpolated
+    (`poses_at_scans`) and frames without a pose are dropped.
+
+    Raises ValueError if the trajectory does not fit or if there are no positions.
     """
     file = DescriptorFile.load(path)
     if trajectory is not None:
@@ -27,7 +30,7 @@ def read_own_file(path: Path, trajectory: Trajectory | None) -> DescriptorFile:
 
 
 def _placed(file: DescriptorFile, trajectory: Trajectory, name: str) -> DescriptorFile:
-    """The frames of a file that have a pose, at it."""
+    """Return the frames of a file that have a pose, with the positions of the trajectory."""
     poses, times = trajectory.positions, trajectory.times
     recorded = file.recorded
     if len(poses) == len(recorded) != len(file):

@@ -1,4 +1,7 @@
-"""Lists of scored pairs: `i j score` or `i j score label` on every line, label 1 for one place and 0 for two."""
+"""Reader of lists of scored pairs.
+
+Each line is `i j score` or `i j score label`. Label 1 means the same place, label 0 different places.
+"""
 
 from pathlib import Path
 
@@ -13,10 +16,10 @@ LABELS = {"0": False, "1": True}
 
 
 def read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
-    """Read pairs of frames, the query first; a higher score is closer. Without labels the positions tell.
+    """Read pairs of frames, the query first. Higher scores mean closer. Pairs without labels need positions.
 
-    Raises ValueError naming the line that is malformed or names a frame without a pose, or the file where it is empty
-    or needs positions and has none.
+    Raises ValueError if the file is empty, if a line is malformed or names a frame without a pose, or if positions are
+    needed but missing. The message names the line or the file.
     """
     where, rows = _read(path)
     pairs = np.array([[as_frame(word, place) for word in row[:2]] for place, row in zip(where, rows, strict=True)])
@@ -30,7 +33,7 @@ def read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
 
 
 def _read(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Return the places and the words of all lines: 3 on each, or 4 on each."""
+    """Return location and words of all lines. Every line has 3 words, or every line has 4."""
     lines = [(where, line.split()) for where, line in read_lines(path)]
     if not lines:
         raise ValueError(f"{path}: expected lines `i j score [label]` or `query: frame frame ...`, found none")

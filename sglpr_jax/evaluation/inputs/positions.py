@@ -1,4 +1,4 @@
-"""The positions that an input is scored on."""
+"""Check of the positions that an input needs."""
 
 from pathlib import Path
 
@@ -6,12 +6,12 @@ from sglpr_jax.data.formats.trajectory import Trajectory
 
 
 def needed(path: Path, trajectory: Trajectory | None, *, rows: int | None = None) -> Trajectory:
-    """Return the trajectory; ValueError where there is none, or it has not as many poses as `path` has rows."""
+    """Return the trajectory. Raises ValueError if it is missing or if its number of poses is not `rows`."""
     if trajectory is None:
         raise ValueError(f"{path}: expected positions to score against (--poses, or --data with poses), found none")
     poses = len(trajectory.positions)
     if rows is not None and rows != poses:
         raise ValueError(
-            f"{path}: expected {poses} descriptors, as many as {trajectory.source} has poses, found {rows}"
+            f"{path}: expected {poses} descriptors, one for each pose of {trajectory.source}, found {rows}"
         )
     return trajectory

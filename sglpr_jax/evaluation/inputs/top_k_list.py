@@ -1,6 +1,7 @@
-"""Top-k lists: `query: frame frame ...` on every line, or `query: frame=score ...`, best first.
+"""Reader of top-k lists.
 
-The colon tells them from scored pairs. A query without an answer is `query:`.
+Each line is `query: frame frame ...` or `query: frame=score ...`, best first. A line `query:` has no answer. The colon
+distinguishes top-k lists from scored pairs.
 """
 
 from pathlib import Path
@@ -13,19 +14,19 @@ from sglpr_jax.evaluation.inputs.text_list import as_frame, as_score, check_rows
 from sglpr_jax.evaluation.protocols import TopK
 
 Answer = tuple[int, float | None]
-"""A retrieved frame and its score, if it has one."""
+"""A retrieved frame and its score, or None without a score."""
 
 
 def is_top_k_list(path: Path) -> bool:
-    """Whether the first line that says something has a colon."""
+    """Return whether the first line that is not empty or a comment has a colon."""
     return ":" in next((line for _, line in read_lines(path)), "")
 
 
 def read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str) -> TopK:
-    """Read the frames retrieved for each query; a higher score is closer, and all have one or none has.
+    """Read the frames retrieved for each query. Higher scores mean closer. Either all frames have a score or none has.
 
-    Raises ValueError naming the line that is malformed or names a frame without a pose, or the file where positions
-    are missing.
+    Raises ValueError if a line is malformed or names a frame without a pose, or if positions are missing. The message
+    names the line or the file.
     """
     trajectory = needed(path, trajectory)
     where = [place for place, _ in read_lines(path)]
@@ -60,11 +61,11 @@ def _answer(word: str, where: str) -> Answer:
 
 
 def _scores(answers: tuple[list[Answer], ...]) -> np.ndarray | None:
-    """Return the scores of all answers, or None where no answer has one; ValueError where only some have."""
+    """Return the scores of all answers, or None without scores. Raises ValueError if only some answers have a score."""
     scores = [[score for _, score in row] for row in answers]
     missing = sum(score is None for row in scores for score in row)
     if missing == sum(map(len, scores)):
         return None
     if missing:
-        raise ValueError(f"expected a score for every retrieved frame or for none, found {missing} without")
+        raise ValueError(f"expected a score for every retrieved frame or for none, found {missing} without a score")
     return padded([[score or 0.0 for score in row] for row in scores], fill=0.0)

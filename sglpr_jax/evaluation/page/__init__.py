@@ -1,4 +1,4 @@
-"""An evaluation as one HTML page that stands alone."""
+"""Self-contained HTML page of an evaluation."""
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page import sections
@@ -11,7 +11,7 @@ from sglpr_jax.evaluation.scoring import Evaluation
 def page(found: Evaluation, *, curves: Plots, trajectory: Plots, pictures: Pictures) -> str:
     """Return the page as HTML.
 
-    Where something is missing for a section, one line says which option of the command line would add it.
+    If a section cannot be filled, one line names the command-line option that adds it.
     """
     drawn = figures.can_draw()
     parts = [sections.results_section(found.results)]

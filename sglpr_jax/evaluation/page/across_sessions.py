@@ -1,4 +1,4 @@
-"""The page of an evaluation across sessions: the table of sessions, then what each number rests on."""
+"""HTML page of an evaluation across sessions: table of sessions, then rule and counts of each score."""
 
 from html import escape
 
@@ -8,7 +8,7 @@ from sglpr_jax.evaluation.sessions import PUBLISHED_NOTE, AcrossSessions
 
 
 def sessions_page(found: AcrossSessions) -> str:
-    """Return the page as HTML, with the rows of table 3 where they were asked for."""
+    """Return the page as HTML, with the rows of table 3 if the evaluation has them."""
     note = f"\n<p class='about'>{escape(PUBLISHED_NOTE)}</p>" if found.published else ""
     table = html_table(found.columns, found.rows() + list(found.published), numbers=found.columns[1:])
     return document(found.title, found.about, [Section("Sessions", table + note), results_section(found.results)])

@@ -1,4 +1,4 @@
-"""HTML that stands alone: style and pictures are in the file, nothing is fetched and no script runs."""
+"""Self-contained HTML: style and images are embedded, and the page has no scripts."""
 
 import base64
 import io
@@ -42,14 +42,14 @@ figcaption { font-size: 0.85rem; }
 
 @dataclass(frozen=True)
 class Section:
-    """A headline and the HTML below it."""
+    """Section of a page: a headline and the HTML below it."""
 
     title: str
     body: str
 
 
 def document(title: str, about: str, sections: Iterable[Section]) -> str:
-    """Return the whole page as HTML."""
+    """Return a page of these sections as HTML."""
     parts = "\n".join(f"<section>\n<h2>{escape(part.title)}</h2>\n{part.body}\n</section>" for part in sections)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -60,7 +60,7 @@ def document(title: str, about: str, sections: Iterable[Section]) -> str:
 
 
 def html_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[str] = ()) -> str:
-    """Return a table of plain texts; the columns named in `numbers` are set as such."""
+    """Return an HTML table of plain text. Columns named in `numbers` are typeset as numbers."""
     styles = [' class="number"' if name in numbers else "" for name in header]
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
     body = "\n".join(
@@ -71,27 +71,27 @@ def html_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, numbers:
 
 
 def paragraph(text: str) -> str:
-    """Return a paragraph of plain text."""
+    """Return an HTML paragraph of plain text."""
     return f"<p>{escape(text)}</p>"
 
 
 def missing(text: str) -> str:
-    """Return a line that says what a section would need."""
+    """Return a line that says why a section is empty or how to fill it."""
     return f'<p class="missing">{escape(text)}</p>'
 
 
 def figure_html(figure: "matplotlib.figure.Figure", name: str, *, caption: str = "") -> str:
-    """Return a matplotlib figure as a picture in the page; `name` says what it shows, the caption below it more."""
+    """Return a matplotlib figure as an embedded image. `name` is the alternative text."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=DOTS_PER_INCH)
     width = round(figure.get_figwidth() * 96)  # a CSS pixel is 1/96 of an inch
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     picture = f'<img src="{_uri(stream)}" width="{width}" alt="{escape(name)}">'
-    return f'<figure style="width: {width}px">{picture}{below}</figure>'  # a long caption does not widen it
+    return f'<figure style="width: {width}px">{picture}{below}</figure>'  # the width limits a long caption
 
 
 def bev_html(bev: Num[np.ndarray, "h w"], name: str) -> str:
-    """Return point counts as a grey picture in the page."""
+    """Return point counts as an embedded grey image. `name` is the alternative text."""
     stream = io.BytesIO()
     Image.fromarray((255 * brightness(bev)).astype(np.uint8)).save(stream, format="PNG")
     return f'<img src="{_uri(stream)}" alt="{escape(name)}">'

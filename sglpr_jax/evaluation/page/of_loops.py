@@ -34,7 +34,7 @@ def write_loops_page(found: FoundLoops, folder: Path, *, optimized: OptimizedTra
 def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> str:
     """Self-contained HTML of the page. With an `optimized` trajectory it shows the trajectory before and after."""
     about = "with odometry" if found.odometry is not None else "without odometry"
-    sections = [Section("Where", _where(found))]
+    sections = [Section("Trajectory", _where(found))]
     if reasons := why_none(found):
         sections.insert(0, Section("Why no loops", "\n".join(map(paragraph, reasons))))
     if optimized is not None and found.frames:
@@ -43,7 +43,7 @@ def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = Non
         Section("Pairs", _pairs(found)),
         Section("Loops", _table(found)),
         Section("Rejected", _rejected(found)),
-        Section("Sure of it?", _sure(found)),
+        Section("Reliability", _sure(found)),
     ]
     return document(f"Loops of {found.recording.name}", f"{found}; {about}.", sections)
 
@@ -52,16 +52,16 @@ def _where(found: FoundLoops) -> str:
     if not figures.can_draw():
         return missing("The drawing needs matplotlib: pip install 'sglpr-jax[viz]'.")
     if not found.frames:
-        return missing("No scan was looked at.")
+        return missing("No scan was processed.")
     positions = found.recording.positions
     if found.odometry is not None:
         positions = upright_odometry(found.odometry, found.recording.mounting)[:, :3, 3]
     parts, wrong = [], _frames(wrong_loops(found))
     right = [pair for pair in _frames(found.loops) if pair not in set(wrong)]
     if positions is not None:
-        what = "as the odometry has it" if found.odometry is not None else f"by {found.recording.pose_source}"
+        what = "from the odometry" if found.odometry is not None else f"from {found.recording.pose_source}"
         lines = "Long lines are drift, or wrong loops."
-        caption = f"The trajectory {what}. A line joins the two frames of each loop. {_judged(found) or lines}"
+        caption = f"The trajectory {what}. A line connects the two frames of each loop. {_judged(found) or lines}"
         drawn = figures.loops(positions[: found.frames], right, wrong=wrong)
         parts.append(figure_html(drawn, "The loops on the trajectory", caption=caption))
     shown = [(one.query, one.match, one.probability) for one in found.loops]
@@ -73,18 +73,18 @@ def _where(found: FoundLoops) -> str:
 
 
 def wrong_loops(found: FoundLoops) -> list[Loop]:
-    """Loops whose frames are more than 20 m apart by the true positions. Empty if these are not known."""
+    """Return loops whose true positions are more than 20 m apart. Empty if true positions are not known."""
     return [loop for loop in found.loops if (_apart_m(found, loop) or 0) > NEGATIVE_M]
 
 
 def _apart_m(found: FoundLoops, loop: Loop) -> float | None:
-    """True distance between the two frames of a loop, if it is known."""
+    """Return the true distance between the two frames of a loop in metres, or None if it is not known."""
     true = found.recording.positions
     return None if true is None else float(np.linalg.norm(true[loop.query] - true[loop.match]))
 
 
 def _judged(found: FoundLoops) -> str:
-    """How many loops are wrong, in a sentence. Empty if the true positions are not known."""
+    """Return a sentence with the number of wrong loops. Empty if true positions are not known."""
     if found.recording.positions is None or not found.loops:
         return ""
     wrong = len(wrong_loops(found))
@@ -97,14 +97,14 @@ def _frames(loops: Iterable[Loop]) -> list[tuple[int, int]]:
 
 
 def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
-    """The trajectory before and after the correction and, if true positions are known, the error of each."""
+    """Draw the trajectory before and after the correction. If true positions are known, the caption has both errors."""
     assert found.odometry is not None
     both = {"odometry": found.odometry[: found.frames], "optimized": optimized.poses}
     about = f"{str(optimized)[0].upper()}{str(optimized)[1:]}."
     true = found.recording.positions
     if true is not None and found.frames > 2:
         errors = (f"{name} {trajectory_error(poses, true[: found.frames]):.2f} m" for name, poses in both.items())
-        about += f" Off by (RMSE after alignment, by {found.recording.pose_source}): {', '.join(errors)}."
+        about += f" Position error (RMSE after alignment with {found.recording.pose_source}): {', '.join(errors)}."
     if not figures.can_draw():
         return missing(about)
     level = {name: upright_odometry(poses, found.recording.mounting)[:, :3, 3] for name, poses in both.items()}
@@ -112,18 +112,18 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
 
 
 def _sure(found: FoundLoops) -> str:
-    """Share of loops among the pairs of each probability, if true positions are known."""
+    """Plot and table of the share of loops over the predicted probability, if true positions are known."""
     if found.recording.positions is None or found.model is None:
-        return missing("How many of the pairs are loops is not known: the recording has no poses to judge by.")
+        return missing("The share of loops among the pairs is not known: the recording has no poses.")
     bins = reliability_of(found.candidates, found.model, found.recording.positions)
     if not bins:
-        return missing("No pair was looked at.")
+        return missing("No pair was compared.")
     header = ("probability", "pairs", "loops", "share", "said")
     cells = ((f"{b.low:g} to {b.high:g}", b.pairs, b.loops, f"{b.share:.3f}", f"{b.said:.3f}") for b in bins)
     rows = [tuple(map(str, row)) for row in cells]
     caption = (
-        f"All candidates, before neighbours and odometry speak: how many are loops (up to 10 m apart by "
-        f"{found.recording.pose_source}; 10 to 20 m count as neither). The numbers are counts of pairs."
+        f"Share of loops among all candidates, before neighbours and odometry are considered. A loop is a pair up to "
+        f"10 m apart by {found.recording.pose_source}; pairs 10 to 20 m apart are ignored. Labels: number of pairs."
     )
     table = html_table(header, rows, numbers=header[1:])
     if not figures.can_draw():
@@ -139,7 +139,7 @@ def _pairs(found: FoundLoops) -> str:
         return missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
     rows = np.unique(np.linspace(0, len(found.loops) - 1, SHOWN_PAIRS).astype(int))
     pictures = {_title(found.loops[row]): _overlay(found, found.loops[row]) for row in rows}
-    caption = "The match in red, the query laid over it in cyan; white where both have points. Spread over the drive."
+    caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
     return figure_html(figures.overlays(pictures), "Pairs of images", caption=caption)
 
 
@@ -149,20 +149,20 @@ def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
 
 
 def _title(loop: Loop) -> str:
-    return f"{loop.query} on {loop.match}"
+    return f"query {loop.query}, match {loop.match}"
 
 
 def _rejected(found: FoundLoops) -> str:
-    """Table of the reasons why pairs were rejected."""
+    """Table of the reasons for rejections, with counts."""
     if not found.rejected:
         return missing("No pair was rejected.")
     rows = [(reason, str(count), MEANING[reason]) for reason, count in counted(found.rejected).items()]
-    about = "Pairs that look like loops and were rejected. rejected.jsonl lists them."
+    about = "Pairs that look like loops but were rejected. They are listed in rejected.jsonl."
     return f"{paragraph(about)}\n{html_table(('reason', 'pairs', 'meaning'), rows, numbers=('pairs',))}"
 
 
 def _table(found: FoundLoops) -> str:
-    """Table of the wrong loops, if these are known, and of the loops with the lowest probabilities."""
+    """Table of the wrong loops, if known, and of the loops with the lowest probabilities."""
     if not found.loops:
         return missing("No loops.")
     known = found.recording.positions is not None

@@ -1,4 +1,4 @@
-"""What a dataset and a model have to show, as plain arrays: the page knows nothing of where they come from."""
+"""Images of a dataset and a model as plain arrays, independent of their source."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,34 +9,35 @@ from jaxtyping import Float, Int, Num
 
 @dataclass(frozen=True, eq=False)
 class SemanticPicture:
-    """One scan's semantic map."""
+    """Semantic map of one scan."""
 
     counts: Num[np.ndarray, "h w"]
-    """Points in each cell."""
+    """Number of points in each cell."""
     truth: Int[np.ndarray, "h w"] | None
-    """Class ids, or None where the scan has no labels."""
+    """True class ids, or None for a scan without labels."""
     predicted: Int[np.ndarray, "h w"]
-    """Class ids."""
+    """Predicted class ids."""
     resolution_m: float
+    """Side of a cell, in metres."""
     categories: int = 20
-    """Which classes the ids are (`labels.taxonomy`)."""
+    """Number of categories in the taxonomy of the class ids (`labels.taxonomy`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatPicture:
-    """How strongly the features of a network answer to one image."""
+    """Activation strength of the features of a network for one image."""
 
     image: Num[np.ndarray, "h w"]
-    """Point counts."""
+    """Number of points in each cell."""
     maps: Mapping[str, Float[np.ndarray, "h w"]]
-    """From 0 to 1, NaN where the network does not look, by the name of the layer."""
+    """Activation from 0 to 1 by the name of the layer. NaN outside the field of view of the network."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """All pictures of a page, by frame; where there are none, a line says what they would need."""
+    """Images of a page, by frame. A string instead of images says which options add them."""
 
     images: Mapping[int, Num[np.ndarray, "_ _"]] = field(default_factory=dict)
-    """Point counts of the frames of false positives."""
+    """Point counts of the queries and answers of false positives, by frame number."""
     semantic: Mapping[str, SemanticPicture] | str = "Semantic maps: add --weights and --data."
     heat: Mapping[str, HeatPicture] | str = "Feature heat maps: add --weights and --data."

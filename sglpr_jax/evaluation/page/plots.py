@@ -1,4 +1,4 @@
-"""The plots of an evaluation, by the name of the file that each is written to."""
+"""Plots of an evaluation, by file name."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -15,12 +15,16 @@ TRAJECTORY = "trajectory.png"
 
 
 def plot_names(results: Iterable[str]) -> set[str]:
-    """Return every name that a plot of results with these names may have."""
+    """Return all possible file names of the plots of results with these names."""
     return {CURVES, TRAJECTORY, *map(_name, results)}
 
 
 def draw_curves(found: Evaluation) -> Plots:
-    """Draw the curves of one method in one plot; of several methods one plot for each protocol, a line for each."""
+    """Draw precision-recall curves.
+
+    A single method gets one plot with a line for each protocol. Several methods get one plot for each protocol, with a
+    line for each method.
+    """
     if len(found.methods) == 1:
         curves = {result.name: result.curve for result in found.results if result.curve is not None}
         return {CURVES: figures.precision_recall(curves, title=found.title)} if curves else {}
@@ -34,7 +38,7 @@ def draw_curves(found: Evaluation) -> Plots:
 
 
 def draw_trajectory(found: Evaluation) -> Plots:
-    """Draw the decisions of the first protocol that has any."""
+    """Draw the trajectory with the decisions of the first protocol that has decisions."""
     for result in found.results:
         if found.positions is not None and result.decisions is not None:
             return {TRAJECTORY: figures.trajectory(found.positions, result.decisions, title=result.name)}
@@ -42,5 +46,5 @@ def draw_trajectory(found: Evaluation) -> Plots:
 
 
 def _name(result: str) -> str:
-    """The file of the curves of several methods by one protocol."""
+    """Return the file name of the plot of several methods by one protocol."""
     return f"precision-recall-{result.lower().replace(' ', '-').replace(':', '-')}.png"

@@ -1,4 +1,4 @@
-"""What a page or figure shows of a dataset and a model: images of scans, semantic maps, feature heat maps."""
+"""Images for a page from a dataset and a model: scans, semantic maps and feature heat maps."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,15 +18,15 @@ from sglpr_jax.retrieval.heat_maps import heat_maps
 from sglpr_jax.retrieval.semantic_maps import semantic_map
 
 SHOWN = (1 / 3, 2 / 3)
-"""How far along the recording the scans are whose maps are shown."""
+"""Positions of the shown scans, as fractions of the recording."""
 
 
 def take_pictures(
     recording: Recording, params: Params | None, source: Input, worst: Sequence[FalsePositive]
 ) -> Pictures:
-    """Return pictures of the false positives, and with `params` maps of two scans of the recording.
+    """Return images of the false positives and, with `params`, maps of two scans of the recording.
 
-    Raises ValueError where the frames of `source` are not those of the recording.
+    Raises ValueError if `source` and the recording have different frames.
     """
     rows = recording_rows(recording, source)
     frames = sorted({frame for found in worst for frame in (found.query, found.answer)})
@@ -42,33 +42,35 @@ def take_pictures(
 
 
 def check_same_frames(recording: Recording, source: Input) -> None:
-    """Raise ValueError where the frames of `source` are not those of the recording."""
+    """Raise ValueError if `source` and the recording have different frames."""
     recording_rows(recording, source)
 
 
 def poses_of(recording: Recording) -> Trajectory | None:
-    """Return the positions and times of a recording as a pose file would give them; None where it has none."""
+    """Return the positions and times of a recording, or None if it has no positions."""
     if recording.positions is None:
         return None
     return Trajectory(recording.positions, recording.times, recording.pose_source or recording.name)
 
 
 def recording_rows(recording: Recording, source: Input) -> Mapping[int, int]:
-    """Return the row in the recording of each frame of `source`: by its id, or by its number where both have as many.
+    """Return the row in the recording of each frame of `source`.
 
-    Raises ValueError where neither serves.
+    Frames are matched by id or, if ids do not match, by number. Raises ValueError if the numbers of frames differ, too.
     """
     n = len(recording) if source.positions is None else len(source.positions)
     row_of = {name: row for row, name in enumerate(recording.ids)}
     if isinstance(source, DescriptorFile) and set(source.ids) <= set(row_of):
         return {frame: row_of[name] for frame, name in enumerate(source.ids)}
     if n != len(recording):
-        raise ValueError(f"--data: expected {n} frames in sequence {recording.name}, as scored, found {len(recording)}")
+        raise ValueError(
+            f"--data: expected {n} frames in sequence {recording.name}, as in the input, found {len(recording)}"
+        )
     return {frame: frame for frame in range(n)}
 
 
 def _image(recording: Recording, row: int, grid: Grid) -> np.ndarray:
-    """Ready-made images come whole; scans are rasterised on `grid`."""
+    """Return the image of a scan, rasterised on `grid`. Ready-made images are not cropped."""
     return np.asarray(view(recording.record(row, labels=False), None if recording.has_images else grid).image)
 
 
@@ -80,7 +82,7 @@ def _heat(recording: Recording, params: Params, row: int) -> HeatPicture:
 
 
 def semantic_picture(recording: Recording, params: Params, row: int) -> SemanticPicture:
-    """Return one scan's counts and semantic maps: the network's and, with labels, the true one."""
+    """Return point counts and predicted semantic map of a scan, and the true map if the scan has labels."""
     config, found = params.config, semantic_map(params, recording.record(row))
     truth = found.truth if recording.labelled[row] else None
     return SemanticPicture(found.counts, truth, found.predicted, config.grid.resolution_m, config.categories)

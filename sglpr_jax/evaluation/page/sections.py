@@ -1,4 +1,4 @@
-"""The parts of the page, each a function from what was found to a section."""
+"""Sections of the HTML page of an evaluation."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -15,54 +15,57 @@ from sglpr_jax.evaluation.report import COLUMNS, PUBLISHED_COLUMNS, PUBLISHED_NO
 
 NO_MATPLOTLIB = "Drawings: install the extra viz (pip install 'sglpr-jax[viz]')."
 INTERVALS = (
-    "95 %: bootstrap interval over the queries. Published on: the poses that the protocol's published numbers rest on;"
-    " on others its number is another one."
+    "95 %: bootstrap interval over the queries. Published on: poses of the published numbers of the protocol;"
+    " scores on other poses differ."
 )
 
 
 def results_section(results: Sequence[Result]) -> Section:
-    """The table of one method: rule, score, interval, counts and poses of every protocol."""
+    """Table of one method: rule, score, interval, counts and poses of every protocol."""
     rows = [(*cells(result), result.published_on) for result in results]
     table = html_table((*COLUMNS, "published on"), rows, numbers=("score", "95 %", "rests on"))
     return Section("Results", f"{table}\n<p class='about'>{INTERVALS}</p>")
 
 
 def comparison_section(methods: Mapping[str, Sequence[Result]]) -> Section:
-    """One row per protocol, one column per method: a page is longer than wide."""
+    """Table of scores with one row per protocol and one column per method."""
     of_each = zip(*methods.values(), strict=True)
     rows = [(results[0].name, *map(format_score, results)) for results in of_each]
     return Section("Methods side by side", html_table(("protocol", *methods), rows, numbers=list(methods)))
 
 
 def published_section(rows: Sequence[tuple[str, ...]]) -> Section:
-    """Table 1's numbers for the sequence, apart from ours: they come from real KITTI and from several protocols."""
+    """Table of the numbers of table 1 for the sequence.
+
+    It is separate from our results, because the numbers come from real KITTI and from several protocols.
+    """
     table = html_table(PUBLISHED_COLUMNS, rows, numbers=PUBLISHED_COLUMNS[1:2])
     return Section("Published numbers", f"{table}\n<p class='about'>{escape(PUBLISHED_NOTE)}</p>")
 
 
 def curves_section(plots: Plots, *, drawn: bool) -> Section:
-    """Figure 5."""
-    nothing = missing("No protocol asked for has a curve here." if drawn else NO_MATPLOTLIB)
+    """Precision-recall curves (figure 5)."""
+    nothing = missing("No protocol of this evaluation has a curve." if drawn else NO_MATPLOTLIB)
     body = "\n".join(figure_html(plot, "precision over recall") for plot in plots.values())
     return Section("Precision and recall", body or nothing)
 
 
 def trajectory_section(plots: Plots, *, drawn: bool) -> Section:
-    """Figure 6: red found, black missed, blue nothing to find."""
+    """Trajectory coloured by decision (figure 6): red is found, black is missed, blue has no revisit."""
     needs = "Decisions along the recording: add --poses, and a protocol that answers queries (--protocol top1-f1max)."
     nothing = missing(needs if drawn else NO_MATPLOTLIB)
-    body = "\n".join(figure_html(plot, "every frame by what became of it") for plot in plots.values())
+    body = "\n".join(figure_html(plot, "every frame, coloured by its decision") for plot in plots.values())
     return Section("Trajectory", body or nothing)
 
 
 def false_positives_section(
     judged: Result | None, worst: Sequence[FalsePositive], images: Mapping[int, np.ndarray]
 ) -> Section:
-    """The wrong answers that the method is surest of, as pairs of pictures where there are any."""
+    """Wrong answers with the smallest descriptor distance, as pairs of images if these are given."""
     title = "Worst false positives"
     if judged is None:
         return Section(
-            title, missing("Wrong answers: add a protocol that puts a threshold on them (--protocol top1-f1max).")
+            title, missing("Wrong answers: add a protocol that applies a threshold (--protocol top1-f1max).")
         )
     if not worst:
         return Section(title, f"<p>{escape(judged.name)}: none at the threshold of the highest F1.</p>")
@@ -84,7 +87,7 @@ def _pair(found: FalsePositive, images: Mapping[int, np.ndarray]) -> str:
 
 
 def semantic_section(found: Mapping[str, SemanticPicture] | str) -> Section:
-    """Figure 7."""
+    """Semantic maps (figure 7)."""
     if isinstance(found, str):
         return Section("Semantic maps", missing(found))
     return Section("Semantic maps", "\n".join(_semantic(frame, one) for frame, one in found.items()))
@@ -98,10 +101,10 @@ def _semantic(frame: str, one: SemanticPicture) -> str:
 
 
 def heat_section(found: Mapping[str, HeatPicture] | str) -> Section:
-    """Figure 8."""
+    """Feature heat maps (figure 8)."""
     if isinstance(found, str):
         return Section("Feature heat maps", missing(found))
-    about = "<p>How strongly the features of each layer answer: root mean square over the channels.</p>\n"
+    about = "<p>Activation strength of each layer: root mean square over the channels.</p>\n"
     return Section("Feature heat maps", about + "\n".join(_heat(frame, one) for frame, one in found.items()))
 
 

@@ -1,4 +1,4 @@
-"""An evaluation on disk: its numbers, its plots and its page in one folder."""
+"""Writes the numbers, plots and page of an evaluation to a folder."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,10 +17,17 @@ PAGE = "report.html"
 
 
 def write_evaluation(found: Evaluation, folder: Path, pictures: Pictures | None = None) -> list[Path]:
-    """Write numbers, plots and the page; without matplotlib no plots. Returns the paths written.
+    """Write numbers, plots and page to `folder`. Without matplotlib no plots are written.
 
-    `pictures` are what a dataset and a model have to show, by frame. Plots that an earlier evaluation has left in the
-    folder are removed.
+    Plots of an earlier evaluation in the folder are removed.
+
+    Arguments:
+      found: Results to write.
+      folder: Output folder. It is created if needed.
+      pictures: Images of a dataset and a model, by frame.
+
+    Returns:
+      The paths written.
     """
     curves, trajectory = (draw_curves(found), draw_trajectory(found)) if figures.can_draw() else ({}, {})
     html = page(found, curves=curves, trajectory=trajectory, pictures=pictures or Pictures())
@@ -28,12 +35,12 @@ def write_evaluation(found: Evaluation, folder: Path, pictures: Pictures | None 
 
 
 def write_sessions(found: AcrossSessions, folder: Path) -> list[Path]:
-    """Write numbers and the page of an evaluation across sessions; else as `write_evaluation`."""
+    """Write numbers and page of an evaluation across sessions. Otherwise as `write_evaluation`."""
     return _write(folder, found.to_json(), {}, sessions_page(found))
 
 
 def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) -> list[Path]:
-    """Write all of an evaluation in place of an earlier one. Returns the paths written."""
+    """Replace an earlier evaluation in the folder. Returns the paths written."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in _earlier_plots(folder) - set(plots):
         (folder / name).unlink(missing_ok=True)
@@ -45,8 +52,8 @@ def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) ->
 
 
 def _earlier_plots(folder: Path) -> set[str]:
-    """Return the names that the plots of the evaluation in a folder may have; none where its numbers are of no such."""
+    """Return the possible file names of plots in an evaluation folder. Empty if it has no evaluation results."""
     try:
         return plot_names([result["protocol"] for result in read_json(folder / NUMBERS)["results"]])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # none there, damaged, or of another command
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):  # missing, damaged, or from another command
         return set()

@@ -1,7 +1,7 @@
-"""The protocols: what a method says of a recording becomes a number, each by its own published rule.
+"""Protocols: published rules that compute one score from the output of a method on a recording.
 
-The same descriptors score very differently under different protocols, so every result carries its rule and the counts
-it rests on. A new protocol is one file here and its name in the list.
+The same descriptors score very differently under different protocols. Every result therefore has its rule and counts.
+To add a protocol, add a file to this package and its name to `PROTOCOLS`.
 """
 
 import difflib
@@ -45,16 +45,16 @@ PROTOCOLS: Mapping[str, Protocol] = {
         POINTNETVLAD_RECALL,
     )
 }
-"""Every protocol, by the name that a command line takes, in the order of tables."""
+"""All protocols by their names on the command line, in the order of tables."""
 
 
 def protocols_taking(kind: Kind) -> dict[str, Protocol]:
-    """Return by name the protocols that score what is of this kind."""
+    """Return the protocols that score this kind of input, by name."""
     return {name: protocol for name, protocol in PROTOCOLS.items() if kind in protocol.takes}
 
 
 def protocol_named(name: str, among: Mapping[str, Protocol] = PROTOCOLS) -> Protocol:
-    """Return a protocol by its name; ValueError with the nearest name where there is none."""
+    """Return a protocol by name. Raises ValueError with the nearest name if the protocol does not exist."""
     if name not in among:
         nearest = difflib.get_close_matches(name, among, n=1, cutoff=0)
         raise ValueError(f"no protocol {name!r}; did you mean {nearest[0]!r}? There are {', '.join(among)}")

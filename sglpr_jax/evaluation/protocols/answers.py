@@ -1,4 +1,4 @@
-"""Top-1 retrieval: every query is answered with its nearest frame, and a threshold accepts or rejects the answer."""
+"""Top-1 retrieval: the nearest frame answers each query, and a threshold accepts or rejects the answer."""
 
 from dataclasses import dataclass, replace
 
@@ -15,26 +15,36 @@ from sglpr_jax.revisits import Near, has_near
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """One answer to each of q queries, and what it is by the protocol's rule."""
+    """Answers to q queries and their labels according to a protocol."""
 
     queries: Int[np.ndarray, " q"]
+    """Frames of the queries."""
     nearest: Int[np.ndarray, " q"]
-    """The frame answered with; -1 where there is none."""
+    """Frame of each answer, -1 without an answer."""
     distance: Float[np.ndarray, " q"]
-    """Of the descriptors; infinite where there is no answer."""
+    """Descriptor distance of each answer, infinite without an answer."""
     right: Bool[np.ndarray, " q"]
+    """Whether the answer is a true positive once accepted."""
     wrong: Bool[np.ndarray, " q"]
-    """An answer may be neither: then it counts for nothing once accepted."""
+    """Whether the answer is a false positive once accepted. Accepted answers that are neither are not counted."""
     revisited: Bool[np.ndarray, " q"]
-    """Whether there was a right answer to find: then to reject is to miss."""
+    """Whether the database has a right answer. If so, a rejected query is a false negative."""
 
 
 def score_top1_by_distance(
     source: Source, result: Result, ends: Int[np.ndarray, " n"], *, right: Near, wrong: Near, seed: int
 ) -> Result:
-    """Complete `result` with the top-1 answers among the first `ends` frames (0: no query), judged by their distance.
+    """Complete `result` with top-1 answers that are right or wrong according to their distance in metres.
 
     A query is a revisit if a frame of its database would be a right answer.
+
+    Arguments:
+      source: Descriptors or a top-k list with scores.
+      result: Result to complete. Its `dimensions` are those of the distances.
+      ends: For each frame, the number of first frames that are its database. A frame with 0 is not a query.
+      right: Whether an answer at this distance is right.
+      wrong: Whether an answer at this distance is wrong.
+      seed: Seed of the bootstrap interval.
     """
     positions = positions_of(source, result.dimensions or 3)
     queries = np.flatnonzero(ends)
@@ -47,12 +57,13 @@ def score_top1_by_distance(
 
 
 def score_answers(source: Source, result: Result, answers: Answers, *, seed: int) -> Result:
-    """Complete `result` with counts, and where there is a revisit with F1max, its curve, interval and decisions.
+    """Complete `result` with counts and decisions and, if there is a revisit, with F1max, its curve and interval.
 
-    Recall@1 stands beside it: the share of revisits whose answer is right, with no threshold to reject it.
+    Recall@1 is added: the share of revisits with a right answer, without a threshold. Raises ValueError for a top-k
+    list without scores.
     """
     if isinstance(source, TopK) and source.scores is None:
-        raise ValueError(f"{result.name}: expected a list with scores to put a threshold on, found none")
+        raise ValueError(f"{result.name}: expected a list with scores for the threshold, found no scores")
     queries, revisited = answers.queries, answers.revisited
     decisions = np.full(len(source), Decision.NOT_A_QUERY, dtype=np.int8)
     decisions[queries] = Decision.TRUE_NEGATIVE
@@ -76,14 +87,14 @@ def score_answers(source: Source, result: Result, answers: Answers, *, seed: int
 
 
 def _whole_sequence(n: int, answers: Answers) -> dict[str, np.ndarray]:
-    """Return the answers and their distances for every frame, as `Result` has them."""
+    """Return answers and distances for every frame, as fields of `Result`."""
     nearest, distance = np.full(n, -1, dtype=np.int64), np.full(n, np.inf)
     nearest[answers.queries], distance[answers.queries] = answers.nearest, answers.distance
     return {"answers": nearest, "answer_distances": distance}
 
 
 def older_by(n: int, frames: int) -> Int[np.ndarray, " {n}"]:
-    """Return for each of n frames how many are at least so many frames older: these are its database."""
+    """Return, for each of n frames, the number of frames that are at least `frames` older. They are its database."""
     return np.maximum(np.arange(n) - frames + 1, 0)
 
 

@@ -1,4 +1,4 @@
-"""The protocol of BEVPlace++ on one recording: Recall@1 on a fixed split."""
+"""Protocol of BEVPlace++ on one recording: Recall@1 on a fixed split."""
 
 from sglpr_jax.evaluation.protocols.bevplace_split import SPLITS, recall_on_split
 from sglpr_jax.evaluation.protocols.protocol import RETRIEVAL, Protocol
@@ -9,12 +9,12 @@ from sglpr_jax.evaluation.protocols.source import Source
 def bevplace_recall_at_1(source: Source, *, seed: int = 0) -> Result:
     """Score Recall@1 on BEVPlace++'s split: the first part of the recording is the database, 5 m in 3-D.
 
-    A query counts if the database has a frame less than 5 m away; it is found if the nearest descriptor is such a
-    frame. The split is the published one where name and number of frames are those of a KITTI sequence that has one.
-    Elsewhere the database is the first 60 % of the frames, and the queries begin where the recording is first 20 m from
-    the database's last frame: what lies between are neighbours, and no revisits.
-    Published on the LiDAR-frame poses that come with the images (zjuluolun/BEVPlace2, kitti_dataset.py); of sequence 08
-    the published code takes every fifth frame, here all count. The interval resamples the queries that count.
+    A query counts if the database has a frame less than 5 m away. It is found if the frame of the nearest descriptor is
+    less than 5 m away. The published split is used if name and number of frames are those of a KITTI sequence with a
+    published split. For other recordings the database is the first 60 % of the frames. Their queries begin at the first
+    frame 20 m from the last frame of the database, because frames in between are neighbours and no revisits.
+    Published on the LiDAR-frame poses that come with the images (zjuluolun/BEVPlace2, kitti_dataset.py). The published
+    code uses every fifth frame of sequence 08; here all frames are used. The interval resamples the queries that count.
     """
     return recall_on_split(source, "Recall@1", "BEVPlace++", SPLITS, dimensions=3, numbers=(1,), seed=seed)
 

@@ -1,4 +1,4 @@
-"""The split of a recording by BEVPlace and BEVPlace++: a first part is the database, a later one the queries."""
+"""Split of a recording by BEVPlace and BEVPlace++: the first part is the database, a later part the queries."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,8 +13,9 @@ from sglpr_jax.evaluation.protocols.source import Source, positions_of
 from sglpr_jax.revisits import has_near
 
 POSITIVE_M = 5.0
+"""Distance below which two frames show the same place, in metres."""
 FRAMES = {"00": 4541, "02": 4661, "05": 2761, "06": 1101, "08": 4071}
-"""How many frames a KITTI sequence has: a sequence of another length is another sequence."""
+"""Number of frames of each KITTI sequence. The published splits apply only to recordings of this length."""
 SPLITS = {
     "00": (3000, 3200, 4541),
     "02": (3400, 3600, 4661),
@@ -22,14 +23,17 @@ SPLITS = {
     "06": (600, 800, 1101),
     "08": (1000, 1200, 4071),
 }
-"""BEVPlace++: where the database ends, where the queries start and where they end."""
+"""BEVPlace++: end of the database, start of the queries and end of the queries, by sequence."""
 V1_SPLITS = {"00": SPLITS["00"], "02": SPLITS["02"], "05": (1000, 1200, 2751), "06": SPLITS["06"]}
-"""BEVPlace: ten queries fewer in 05, and no 08."""
+"""BEVPlace: the same without 08 and with ten queries fewer in 05."""
 DATABASE_SHARE = 0.6
-"""The part of any other recording that is the database."""
+"""Fraction of the frames that is the database, for other recordings."""
 SEAM_M = 20.0
-"""There the queries begin so far from the database's last frame: frames across the seam are neighbours, no revisits.
-The published splits leave 200 frames, which a short recording does not have."""
+"""Distance between the last frame of the database and the first query, in metres, for other recordings.
+
+Closer frames are neighbours, not revisits. The published splits skip 200 frames, which are too many for a short
+recording.
+"""
 
 
 def recall_on_split(
@@ -42,9 +46,16 @@ def recall_on_split(
     numbers: Sequence[int],
     seed: int,
 ) -> Result:
-    """Score Recall@N where the first frames of a recording are the database and later ones the queries.
+    """Score Recall@N with the first frames of a recording as the database and later frames as queries.
 
-    `splits` has by sequence where the database ends, where the queries start and where they end.
+    Arguments:
+      source: Descriptors or a top-k list.
+      name: Name of the result.
+      paper: Name of the method that published the splits.
+      splits: End of the database, start of the queries and end of the queries, by sequence.
+      dimensions: Dimensions of the distances between frames, 2 or 3.
+      numbers: The numbers N, increasing.
+      seed: Seed of the bootstrap interval.
     """
     positions = positions_of(source, dimensions)
     end, first, last, split = _split(source, positions, paper, splits)
@@ -71,7 +82,7 @@ def _split(
     paper: str,
     splits: Mapping[str, tuple[int, int, int]],
 ) -> tuple[int, int, int, str]:
-    """Return how many frames are the database, the first query, the end of the queries, and the split in words."""
+    """Return the end of the database, the start and the end of the queries, and the split in words."""
     n = len(source)
     if source.sequence in splits and FRAMES[source.sequence] == n:
         end, first, last = splits[source.sequence]
@@ -84,5 +95,5 @@ def _split(
 
 
 def near(apart: Float[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
-    """Return whether frames so many metres apart are of one place."""
+    """Return whether frames at these distances, in metres, show the same place."""
     return apart < POSITIVE_M

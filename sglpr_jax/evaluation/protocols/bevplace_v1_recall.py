@@ -1,4 +1,4 @@
-"""The protocol of BEVPlace on one recording: Recall@N on a fixed split."""
+"""Protocol of BEVPlace on one recording: Recall@N on a fixed split."""
 
 from sglpr_jax.evaluation.protocols.bevplace_split import V1_SPLITS, recall_on_split
 from sglpr_jax.evaluation.protocols.protocol import RETRIEVAL, Protocol
@@ -7,7 +7,7 @@ from sglpr_jax.evaluation.protocols.source import Source
 
 
 def bevplace_v1_recall(source: Source, *, seed: int = 0) -> Result:
-    """Score Recall@1, 5, 10 and 20 on BEVPlace's split: as `bevplace_recall_at_1`, but 5 m in x and y.
+    """Score Recall@1, 5, 10 and 20 on BEVPlace's split, as `bevplace_recall_at_1` but with 5 m in x and y.
 
     Published on the LiDAR-frame poses that come with the images (zjuluolun/BEVPlace). The interval of Recall@1
     resamples the queries that count.

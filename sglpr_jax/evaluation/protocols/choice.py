@@ -1,4 +1,4 @@
-"""Which protocols score a source: those that are named, all that fit it, or the headlines."""
+"""Choice of the protocols for a source: named protocols, all that fit, or the default ones."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from sglpr_jax.evaluation.protocols import (
 )
 
 ALL = "all"
-"""Stands for every protocol that fits."""
+"""Name that selects every protocol that fits."""
 _IN_WORDS: dict[Kind, str] = {
     "top-k list": "a top-k list without scores",
     "scored top-k list": "a top-k list",
@@ -21,20 +21,20 @@ _IN_WORDS: dict[Kind, str] = {
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise ValueError, with the nearest name, unless all are protocols of one recording or `all`."""
+    """Raise ValueError if a name is neither a protocol of one recording nor `all`. The message has the nearest name."""
     across_sessions = protocols_taking("sessions")
     for name in names:
         if name in across_sessions:
-            raise ValueError(f"expected --database, a descriptor file to search, for protocol {name}; found none")
+            raise ValueError(f"expected --database with a descriptor file for protocol {name}, found none")
         if name != ALL:
             protocol_named(name, {other: PROTOCOLS[other] for other in PROTOCOLS if other not in across_sessions})
 
 
 def chosen_protocols(source: Source | ScoredPairs, names: Sequence[str]) -> list[str]:
-    """Return the protocols asked for: no name stands for the headlines that fit `source`, `all` for all that do.
+    """Return the names of the protocols that score `source`.
 
-    Where no headline fits, all that do are meant. Raises ValueError where `source` cannot be scored by one that is
-    named.
+    Without names, the default protocols (`Protocol.headline`) that fit are returned. If none of them fits, or for the
+    name `all`, every protocol that fits is returned. Raises ValueError if a named protocol does not fit.
     """
     kind = kind_of(source)
     known = protocols_taking(kind)

@@ -1,4 +1,4 @@
-"""The protocol of Contour Context."""
+"""Protocol of Contour Context."""
 
 from sglpr_jax.evaluation.protocols.answers import older_by, score_top1_by_distance
 from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
@@ -6,18 +6,19 @@ from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import Source
 
 POSITIVE_M = 5.0
+"""Distance below which an answer is right, in metres."""
 GAP = 150
-"""A frame of the database is more frames than this older."""
+"""Frames of the database are more than this number of frames older than the query."""
 
 
 def contour_context_f1max(source: Source, *, seed: int = 0) -> Result:
     """Score top-1 retrieval as Contour Context does: 5 m in 3-D, a gap of 150 frames.
 
-    The database of frame i is frames 0 to i - 151. Accepted, an answer less than 5 m away is a true positive, any other
-    a false positive. Rejected, it is a false negative if the database has a frame less than 5 m away, else a true
-    negative. Every distinct score is a threshold. The published code (lewisjiang/contour-context, scripts/pr_mpe.py)
-    applies the gap to false negatives alone and leaves it to the method to answer with older frames. Published on its
-    own file of KITTI 08's sensor poses. The interval resamples queries.
+    The database of frame i is frames 0 to i - 151. An accepted answer is a true positive if it is less than 5 m away,
+    else a false positive. A rejected answer is a false negative if the database has a frame less than 5 m away, else a
+    true negative. Every distinct score is a threshold. The published code (lewisjiang/contour-context,
+    scripts/pr_mpe.py) applies the gap only to false negatives and expects the method to answer with older frames.
+    Published on its own file of sensor poses of KITTI 08. The interval resamples queries.
     """
     result = Result(
         name="Contour Context F1max",

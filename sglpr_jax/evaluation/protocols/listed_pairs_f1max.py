@@ -1,4 +1,4 @@
-"""The protocol of pairs that come with a score: a published list, or of a method that gives no descriptors."""
+"""Protocol of listed pairs with scores, for published lists and for methods without descriptors."""
 
 from dataclasses import replace
 
@@ -17,17 +17,17 @@ from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 def score_listed_pairs(
     file: DescriptorFile, pairs: Int[np.ndarray, "p 2"], labels: Bool[np.ndarray, " p"] | None = None
 ) -> ScoredPairs:
-    """Return listed pairs of rows of a descriptor file with the negated distances of their descriptors."""
+    """Score pairs of rows of a descriptor file by the negated distances of their descriptors."""
     check_frames("pairs of", pairs, 0, len(file))
     return ScoredPairs(pairs, -pair_distances(file, pairs.T), labels, file.positions, file.pose_source)
 
 
 def listed_pairs_f1max(listed: ScoredPairs, *, seed: int = 0) -> Result:
-    """Score listed pairs by F1max: with SSC's published lists (`neg_100`), the numbers of SSC's and RINet's tables.
+    """Score listed pairs by F1max. SSC's published lists (`neg_100`) give the scores in the tables of SSC and RINet.
 
-    Pairs without labels are labelled as `pairs_f1max` would: positive less than 3 m and more than 50 frames apart,
-    negative more than 20 m apart, in x and y; what is neither is left out. The interval resamples the first frames
-    of the pairs.
+    Pairs without labels are labelled as in `pairs_f1max`, with distances in x and y. A pair is positive if its frames
+    are less than 3 m and more than 50 frames apart, and negative if they are more than 20 m apart. Other pairs are
+    ignored. The interval resamples the first frames of the pairs.
     """
     result = Result(
         name="listed pairs F1max",
@@ -38,7 +38,7 @@ def listed_pairs_f1max(listed: ScoredPairs, *, seed: int = 0) -> Result:
     )
     if listed.labels is not None:
         return score_pairs(result, listed.pairs.T, listed.scores, listed.labels, seed=seed)
-    assert listed.positions is not None  # `ScoredPairs` has seen to it
+    assert listed.positions is not None  # checked by `ScoredPairs`
     positive, negative = _label(listed.pairs, listed.positions[:, :2])
     rule = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m, pairs as listed"
     result = replace(result, rule=rule, dimensions=2, pose_source=listed.pose_source)
@@ -49,7 +49,7 @@ def listed_pairs_f1max(listed: ScoredPairs, *, seed: int = 0) -> Result:
 def _label(
     pairs: Int[np.ndarray, "p 2"], positions: Float[np.ndarray, "n 2"]
 ) -> tuple[Bool[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-    """Return which pairs are positive and which are negative; a pair may be neither."""
+    """Return which pairs are positive and which are negative. A pair may be neither."""
     i, j = pairs.T
     apart = np.linalg.norm(positions[i] - positions[j], axis=1)
     return (apart < POSITIVE_M) & (np.abs(i - j) > GAP), apart > NEGATIVE_M

@@ -1,4 +1,4 @@
-"""Retrieval: which frames a query is answered with, and which of the answers is the first right one."""
+"""Retrieval of the nearest frames of each query, and the rank of the first right answer."""
 
 from collections.abc import Callable
 
@@ -10,14 +10,16 @@ from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.revisits import Near
 
 BLOCK = 512
-"""Queries whose descriptors are compared with the whole database at a time."""
+"""Number of queries compared with the whole database at a time."""
 
 
 def nearest_frames(
     source: Source, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], *, k: int = 1
 ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-    """Return for each query the best k among the first `ends` frames, best first, and the descriptor distance of the
-    best. -1 fills a row that has fewer; without any the distance is infinite."""
+    """Return the best k of the first `ends` frames for each query, best first, and the distance of the best.
+
+    Rows with fewer than k frames are padded with -1. The distance is infinite for a query without an answer.
+    """
     if isinstance(source, TopK):
         return source.lookup(queries, ends, k)
     return nearest_descriptors(source.descriptors[queries], source.descriptors, ends, k=k, distance=source.distance)
@@ -31,9 +33,9 @@ def nearest_descriptors(
     k: int = 1,
     distance: str = "l2",
 ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-    """Return for each query the nearest k of the first `ends` >= 1 descriptors, and the distance of the nearest.
+    """Return the nearest k of the first `ends` >= 1 descriptors for each query, and the distance of the nearest.
 
-    `distance` is the name of one (`distances.DISTANCES`). -1 fills a row that has fewer than k.
+    `distance` is a name in `distances.DISTANCES`. Rows with fewer than k descriptors are padded with -1.
     """
     compare = _ranking(database, distance)
     nearest, best = np.full((len(queries), k), -1, dtype=np.int64), np.zeros(len(queries))
@@ -49,11 +51,11 @@ def nearest_descriptors(
 
 
 def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of queries that ranks the database as the named distance does."""
+    """Return a function of queries whose values order the database as the named distance does."""
     if distance != "l2":
         compare = distance_function(distance)
         return lambda queries: compare(queries, database)
-    # |q - d|^2 without |q|^2, which is the same for a whole row; in float64, for far from zero the two terms cancel.
+    # |q - d|^2 without |q|^2, which is constant in a row. In float64, because the terms cancel far from zero.
     exact = database.astype(np.float64)
     norms = np.sum(exact**2, axis=1)
     return lambda queries: norms[None, :] - 2 * queries.astype(np.float64) @ exact.T
@@ -62,11 +64,11 @@ def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.
 def first_hits(
     queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
 ) -> Int[np.ndarray, " q"]:
-    """Return for each query the rank, from 0, of its first answer that is near; k where none is."""
+    """Return the rank, from 0, of the first answer of each query that is near, or k if no answer is near."""
     apart = np.linalg.norm(queries[:, None] - database[nearest], axis=2)
     return first_true(near(apart) & (nearest >= 0))
 
 
 def first_true(flags: Bool[np.ndarray, "q k"]) -> Int[np.ndarray, " q"]:
-    """Return the first true column of each row; k where none is."""
+    """Return the first true column of each row, or k if no column is true."""
     return np.where(flags.any(axis=1), np.argmax(flags, axis=1), flags.shape[1])

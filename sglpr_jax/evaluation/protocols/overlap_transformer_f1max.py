@@ -1,4 +1,4 @@
-"""The protocol of OverlapTransformer."""
+"""Protocol of OverlapTransformer."""
 
 from dataclasses import replace
 
@@ -14,11 +14,11 @@ from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import Source, check_frames, positions_of
 
 GAP = 100
-"""A frame of the database is more frames than this older."""
+"""Frames of the database are more than this number of frames older than the query."""
 FIRST_THRESHOLDED = 150
-"""The first query of F1max; those of Recall@N start as soon as there is a database."""
+"""First query of F1max. Queries of Recall@N begin with the first frame that has a database."""
 STAND_IN_M = 15.0
-"""Stands for overlap where none is given: the distance the same authors take in CVTNet."""
+"""Distance that replaces missing overlaps, in metres. The same authors use it in CVTNet."""
 NUMBERS = (1, 5, 10, 20)
 
 
@@ -27,14 +27,18 @@ def overlap_transformer_f1max(
 ) -> Result:
     """Score top-1 retrieval and Recall@N as OverlapTransformer does: an overlap above 0.3, a gap of 100 frames.
 
-    `overlapping` lists the pairs (query, older frame) whose range images overlap by more than 0.3. The overlap is
-    that of the scans, no distance: without the list, frames less than 15 m apart in x and y stand for it, which is not
-    the published number. The database of frame i is frames 0 to i - 101; the last frame is no query. F1max, from frame
-    150 on: accepted, an overlapping answer is a true positive, any other a false positive; rejected, it is a false
-    negative if the database has an overlapping frame, else a true negative. Every distinct distance is a threshold; the
-    published code takes 10,000 up to a squared distance of 1. Recall@1, 5, 10, 20 and 1 % of all frames: over all
-    queries with an overlapping frame. Published on KITTI 00 with overlaps from its poses (haomo-ai/OverlapTransformer,
-    test/test_kitti00_PR.py). The interval resamples the queries of F1max.
+    The database of frame i is frames 0 to i - 101. The last frame is not a query. Queries of F1max begin at frame 150.
+    An accepted answer is a true positive if it overlaps with the query, else a false positive. A rejected answer is a
+    false negative if the database has an overlapping frame, else a true negative. Every distinct distance is a
+    threshold; the published code uses 10,000 thresholds up to a squared distance of 1. Recall@1, 5, 10, 20 and 1 % of
+    all frames are over all queries with an overlapping frame. Published on KITTI 00 with overlaps from its poses
+    (haomo-ai/OverlapTransformer, test/test_kitti00_PR.py). The interval resamples the queries of F1max.
+
+    Arguments:
+      source: Descriptors or a top-k list with scores.
+      overlapping: Pairs (query, older frame) whose range images overlap by more than 0.3. If None, frames less than
+        15 m apart in x and y replace them. The result is then not the published score.
+      seed: Seed of the bootstrap interval.
     """
     n = len(source)
     ends = older_by(n, GAP + 1)
@@ -61,7 +65,7 @@ def overlap_transformer_f1max(
 
 
 def _overlaps(source: Source, overlapping: Int[np.ndarray, "listed 2"] | None) -> tuple[Int[np.ndarray, " pairs"], str]:
-    """Return the pairs (i, j) of a query and a right answer in its database, as i * n + j, and in words."""
+    """Return the pairs (i, j) of a query and a right answer in its database as i * n + j, and the rule in words."""
     if overlapping is None:
         near = frame_pairs(positions_of(source, 2), lambda apart, gap: (apart < STAND_IN_M) & (gap > GAP))
         return near, f"{STAND_IN_M:g} m in place of overlaps"

@@ -1,4 +1,4 @@
-"""Pairs of frames, each positive or negative: drawn from a sequence, or listed with scores."""
+"""Positive and negative pairs of frames, drawn from a sequence or listed with scores."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -14,14 +14,14 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 
 BLOCK = 32
-"""Frames compared with all others at a time."""
+"""Number of frames compared with all others at a time."""
 PAIR_BLOCK = 1 << 10
-"""Pairs compared at a time: so few that their descriptors stay in the cache."""
+"""Number of pairs compared at a time. Their descriptors fit into the cache."""
 PARTNERS = 64
-"""Partners of a frame are compared a multiple of so many at a time."""
+"""The number of partners of a frame is padded to a multiple of this number."""
 
 Keep = Callable[[Float[np.ndarray, "i j"], Int[np.ndarray, "i j"]], Bool[np.ndarray, "i j"]]
-"""Which pairs of frames (i, j) are meant: from their distance in metres and i - j, how many frames i is the later."""
+"""Selects pairs of frames (i, j), given their distance in metres and the number of frames i - j between them."""
 
 
 def score_pairs(
@@ -32,15 +32,15 @@ def score_pairs(
     *,
     seed: int,
 ) -> Result:
-    """Complete `result` with counts, and where a pair is positive with F1max, its curve and interval.
+    """Complete `result` with counts and, if a pair is positive, with F1max, its curve and interval.
 
-    The interval resamples the first frame of the pairs: all pairs of a query frame are drawn or left out together.
+    The interval resamples the first frames. The pairs of a first frame are drawn or omitted together.
     """
     counts = {"positive pairs": int(positive.sum()), "negative pairs": int((~positive).sum())}
     result = replace(result, counts=counts)
     if not positive.any():
         return result
-    # Between two positive pairs only precision falls: a curve of the millions of negative scores would say no more.
+    # Between the scores of two positive pairs only precision falls, so the millions of negative scores are not needed.
     curve = metrics.classification_curve(scores, positive, thresholds=np.unique(scores[positive]))
     interval = f1_max_interval(
         scores,
@@ -54,16 +54,16 @@ def score_pairs(
 
 
 def frame_pairs(positions: Float[np.ndarray, "n d"], keep: Keep) -> Int[np.ndarray, " pairs"]:
-    """Return every ordered pair (i, j) that `keep` keeps, as i * n + j, rising."""
+    """Return every ordered pair (i, j) that `keep` selects as i * n + j, in increasing order."""
     return np.concatenate([first + np.flatnonzero(kept) for first, kept in _kept_in_blocks(positions, keep)])
 
 
 def drawn_frame_pairs(
     positions: Float[np.ndarray, "n d"], keep: Keep, *, most: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " pairs"]:
-    """Return `most` of `frame_pairs`, or all where there are fewer, drawn without replacement; rising.
+    """Draw up to `most` pairs of `frame_pairs` without replacement, in increasing order.
 
-    They are those that `rng.choice` takes from a list of all, which is never made.
+    The result equals `rng.choice` on all pairs, but the list of all pairs is never stored.
     """
     ends = np.cumsum([np.count_nonzero(kept) for _, kept in _kept_in_blocks(positions, keep)])
     ranks = np.sort(rng.choice(ends[-1], min(most, ends[-1]), replace=False))
@@ -75,7 +75,7 @@ def drawn_frame_pairs(
 def _kept_in_blocks(
     positions: Float[np.ndarray, "n d"], keep: Keep
 ) -> Iterator[tuple[int, Bool[np.ndarray, "block n"]]]:
-    """Yield for blocks of frames i the number of the first pair (i, j), and which pairs `keep` keeps."""
+    """Yield the number of the first pair (i, j) and the selected pairs, for blocks of frames i."""
     n = len(positions)
     for start in range(0, n, BLOCK):
         gap = np.arange(start, min(start + BLOCK, n))[:, None] - np.arange(n)[None, :]
@@ -83,7 +83,7 @@ def _kept_in_blocks(
 
 
 def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
-    """Return the distance between the descriptors of each pair, by the file's own distance."""
+    """Return the distance between the descriptors of each pair, by the distance of the file."""
     if file.distance != "l2":
         return _distances_by_row(file, pairs)
     apart = np.empty(pairs.shape[1])
@@ -94,12 +94,12 @@ def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> F
 
 
 def _distances_by_row(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
-    """Return the same where a distance is known between sets only: those of each first frame to all its partners."""
+    """Same as `pair_distances` for distances between sets: each first frame is compared with all its partners."""
     compare, apart = distance_function(file.distance), np.empty(pairs.shape[1])
     order = np.argsort(pairs[0], kind="stable")
     starts = np.flatnonzero(np.diff(pairs[0][order], prepend=-1))
     for of_one in np.split(order, starts[1:]):
-        # Partners are repeated to a round number: a distance that is compiled is then compiled for few shapes.
+        # Partners are repeated up to a multiple of `PARTNERS`, so that a jitted distance compiles for few shapes.
         partners = np.resize(pairs[1, of_one], -(-len(of_one) // PARTNERS) * PARTNERS)
         found = compare(file.descriptors[pairs[0, of_one[:1]]], file.descriptors[partners])
         apart[of_one] = found[0, : len(of_one)]
@@ -114,7 +114,7 @@ def score_drawn_pairs(
     *,
     seed: int,
 ) -> Result:
-    """Complete `result` with pairs that `frame_pairs` found."""
+    """Complete `result` with pairs from `frame_pairs`, scored by the descriptors of the file."""
     pairs = np.stack(np.divmod(np.concatenate([positive, negative]), len(file)))
     is_positive = np.arange(pairs.shape[1]) < len(positive)
     scores = -pair_distances(file, pairs) if len(positive) else np.zeros(pairs.shape[1])

@@ -1,4 +1,4 @@
-"""The protocol of SSC and RINet: F1max over pairs of frames."""
+"""Protocol of SSC and RINet: F1max over pairs of frames."""
 
 from functools import partial
 
@@ -13,17 +13,18 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 GAP = 50
-"""Frames no farther apart than so many are neighbours, not a revisit."""
+"""Frames at most this number of frames apart are neighbours, not revisits."""
 
 
 def pairs_f1max(file: DescriptorFile, *, negatives_per_positive: int | None = 100, seed: int = 0) -> Result:
     """Score pairs of frames as SSC and RINet do (`neg_100`): 3 m / 20 m in x and y, 100 negatives per positive.
 
-    Positive: every pair less than 3 m and more than 50 frames apart. Negative: pairs more than 20 m apart, drawn
-    without replacement, or all of them where there are not enough or `negatives_per_positive` is None. The lists
-    published were drawn from an unknown seed; another seed moves the score by .001 to .004. Published on KITTI's own
-    poses (lilin-hitcrt/SSC, script/gen_pairs.py; lists with 1, 10, 20, 50 and 100 negatives, tables from the last). The
-    interval resamples the later frames of the pairs, and the negatives stay as drawn.
+    Positive pairs are all pairs less than 3 m and more than 50 frames apart. Negative pairs are more than 20 m apart
+    and drawn without replacement. All negative pairs are used if there are too few, or with
+    `negatives_per_positive=None`. The seed of the published lists is unknown; another seed changes the score by .001 to
+    .004. Published on KITTI's own poses (lilin-hitcrt/SSC, script/gen_pairs.py). The published lists have 1, 10, 20, 50
+    and 100 negatives; the tables use 100. The interval resamples the later frames of the pairs and does not redraw the
+    negatives.
     """
     positions = positions_of(file, 2)
     positive = positive_pairs(positions)
@@ -44,12 +45,12 @@ def pairs_f1max(file: DescriptorFile, *, negatives_per_positive: int | None = 10
 
 
 def are_negative(apart: Float[np.ndarray, "i j"], gap: Int[np.ndarray, "i j"]) -> Bool[np.ndarray, "i j"]:
-    """Which pairs show two places, each pair once."""
+    """Return which pairs (i, j) show different places. Only pairs with i > j are selected, so each pair occurs once."""
     return (apart > NEGATIVE_M) & (gap > 0)
 
 
 def positive_pairs(positions: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " pairs"]:
-    """Return every positive pair (i, j) of SSC's lists, as i * n + j: less than 3 m, and i - j more than 50 frames."""
+    """Return every positive pair (i, j) of SSC's lists as i * n + j: less than 3 m apart and i - j > 50."""
     return frame_pairs(positions, lambda apart, gap: (apart < POSITIVE_M) & (gap > GAP))
 
 
@@ -59,8 +60,14 @@ _PAIRS = partial(
     takes=("descriptors",),
     returns="F1max",
 )
-_RULE = "pairs of frames more than 50 apart: same place below 3 m, different beyond 20 m, in x and y; negatives drawn "
-PAIRS_F1MAX = _PAIRS("pairs-f1max", pairs_f1max, rule=_RULE + "100 to each positive", headline=True)
-PAIRS_10_F1MAX = _PAIRS("pairs-10-f1max", partial(pairs_f1max, negatives_per_positive=10), rule=_RULE + "10 to each")
-PAIRS_1_F1MAX = _PAIRS("pairs-1-f1max", partial(pairs_f1max, negatives_per_positive=1), rule=_RULE + "1 to each")
-PAIRS_ALL_F1MAX = _PAIRS("pairs-all-f1max", partial(pairs_f1max, negatives_per_positive=None), rule=_RULE + "not")
+_RULE = "pairs of frames more than 50 apart: same place below 3 m, different beyond 20 m, in x and y; "
+PAIRS_F1MAX = _PAIRS("pairs-f1max", pairs_f1max, rule=_RULE + "100 negatives drawn for each positive", headline=True)
+PAIRS_10_F1MAX = _PAIRS(
+    "pairs-10-f1max", partial(pairs_f1max, negatives_per_positive=10), rule=_RULE + "10 negatives for each"
+)
+PAIRS_1_F1MAX = _PAIRS(
+    "pairs-1-f1max", partial(pairs_f1max, negatives_per_positive=1), rule=_RULE + "1 negative for each"
+)
+PAIRS_ALL_F1MAX = _PAIRS(
+    "pairs-all-f1max", partial(pairs_f1max, negatives_per_positive=None), rule=_RULE + "all negatives"
+)

@@ -1,4 +1,4 @@
-"""The protocol of PointNetVLAD, used on Oxford RobotCar by MinkLoc3D and many others: Recall@1 % across sessions."""
+"""Protocol of PointNetVLAD, used on Oxford RobotCar by MinkLoc3D and many others: Recall@1 % across sessions."""
 
 import itertools
 from collections.abc import Sequence
@@ -17,18 +17,19 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_metho
 from sglpr_jax.revisits import has_near
 
 POSITIVE_M = 25.0
+"""Largest distance at which two frames show the same place, in metres."""
 NEIGHBOURS = 25
-"""So many frames are retrieved: Recall@1 % looks no further, however large the database."""
+"""Number of retrieved frames. Recall@1 % uses at most this number, even for larger databases."""
 
 
 def pointnetvlad_recall(*sessions: DescriptorFile, seed: int = 0) -> Result:
-    """Score the mean Recall@1 % over every ordered pair of sessions, two or more, as PointNetVLAD does: 25 m.
+    """Score the mean Recall@1 % over every ordered pair of two or more sessions as PointNetVLAD does: 25 m.
 
-    Of each pair one session is the database, the other has the queries. A query counts if the database has a frame no
-    farther than 25 m in x and y; it is found if one is among the first max(round(n / 100), 1) of a database of n
-    frames, 25 at most. The score is the mean over the pairs that have such a query, and so is Recall@N. Published on
-    Oxford RobotCar's positions (mikacuy/pointnetvlad, evaluate.py). The interval resamples, in each pair, the queries
-    that count.
+    The first session of a pair is the database, and the second has the queries. A query counts if the database has a
+    frame at most 25 m away in x and y. It is found if such a frame is among the first max(round(n / 100), 1) answers,
+    at most 25, for a database of n frames. Score and Recall@N are means over the pairs that have a query that counts.
+    Published on Oxford RobotCar's positions (mikacuy/pointnetvlad, evaluate.py). The interval resamples the queries
+    that count, in each pair.
     """
     if len(sessions) < 2:
         raise ValueError(f"expected at least two sessions, found {len(sessions)}")
@@ -52,7 +53,7 @@ def pointnetvlad_recall(*sessions: DescriptorFile, seed: int = 0) -> Result:
 def _retrieve(
     database: DescriptorFile, queries: DescriptorFile
 ) -> tuple[Int[np.ndarray, " q"], Bool[np.ndarray, " q"], int]:
-    """Return the rank of each query's first right answer, which queries count, and how many answers are 1 %."""
+    """Return the rank of each query's first right answer, which queries count, and the number of answers for 1 %."""
     check_same_method(database, queries)
     there, here = positions_of(database, 2), positions_of(queries, 2)
     ends = np.full(len(here), len(there))
@@ -64,7 +65,7 @@ def _retrieve(
 
 
 def _score(result: Result, answered: Sequence[tuple[Int[np.ndarray, " _"], int]], seed: int) -> Result:
-    """Complete `result` with the means over the pairs of sessions."""
+    """Complete `result` with means over the pairs of sessions."""
     rng = np.random.default_rng(seed)
     recalls = [recall_at(ranks, range(1, NEIGHBOURS + 1)) for ranks, _ in answered]
     found = [ranks < one_percent for ranks, one_percent in answered]

@@ -1,4 +1,4 @@
-"""What a protocol is: a published rule that makes one number of what a method says of a recording."""
+"""Type of a protocol: a published rule that computes one score from the output of a method."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,35 +8,36 @@ from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import ScoredPairs, Source, TopK
 
 Kind = Literal["descriptors", "top-k list", "scored top-k list", "scored pairs", "sessions"]
-"""What a method hands in: a descriptor file; retrieved frames, without or with scores; pairs of frames with scores;
-or descriptor files of several sessions, of which the first is the database."""
+"""Kind of input: a descriptor file, retrieved frames without or with scores, pairs of frames with scores, or descriptor
+files of several sessions. The first session is the database."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to score, by which results of different papers can be compared."""
+    """Protocol for scoring a method."""
 
     name: str
-    """As a command line takes it."""
+    """Name on the command line."""
     score: Callable[..., Result]
-    """From a source of one of the kinds of `takes` (sessions: several files) and a `seed` to the result."""
+    """Function of a source (several files for sessions) and a `seed` that returns the result."""
     rule: str
-    """In words: which answers are right, and what is counted."""
+    """Rule in words: which answers are right and what is counted."""
     source: str
-    """The publication, with the file of its code that the rule was read from."""
+    """Publication, with the file of its code that defines the rule."""
     takes: tuple[Kind, ...]
+    """Kinds of input that the protocol accepts."""
     returns: Literal["F1max", "recall"]
-    """F1max: the highest F1 over all thresholds. Recall: the share of queries with a right answer among the first N."""
+    """Score: the highest F1 over all thresholds, or the share of queries with a right answer among the first N."""
     headline: bool = False
-    """Whether it is used where no protocol is named."""
+    """Whether the protocol is used by default, if no protocol is named."""
 
     def __call__(self, *sources: Source | ScoredPairs, seed: int = 0) -> Result:
-        """Score one source, or several sessions. Raises ValueError where positions are missing."""
+        """Score one source or several sessions. Raises ValueError if positions are missing."""
         return self.score(*sources, seed=seed)
 
 
 def kind_of(source: Source | ScoredPairs) -> Kind:
-    """Return what `source` is."""
+    """Return the kind of `source`."""
     if isinstance(source, ScoredPairs):
         return "scored pairs"
     if isinstance(source, TopK):
@@ -45,6 +46,6 @@ def kind_of(source: Source | ScoredPairs) -> Kind:
 
 
 RETRIEVAL: tuple[Kind, ...] = ("descriptors", "top-k list", "scored top-k list")
-"""What a recall can be had from."""
+"""Kinds of input that a recall needs."""
 SCORED_RETRIEVAL: tuple[Kind, ...] = ("descriptors", "scored top-k list")
-"""What answers with scores can be had from, so that a threshold can accept or reject them."""
+"""Kinds of input with scored answers, which a threshold can accept or reject."""

@@ -1,4 +1,4 @@
-"""Recall@N: the share of queries that have a right answer among their first N."""
+"""Recall@N: the share of queries with a right answer among their first N answers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +11,7 @@ from sglpr_jax.evaluation.protocols.result import Decision, Result
 
 
 def recall_at(ranks: Int[np.ndarray, " q"], numbers: Sequence[int]) -> dict[int, float]:
-    """Return Recall@N for each N, from the rank of each query's first right answer (from 0)."""
+    """Return Recall@N for each N, given the rank (from 0) of the first right answer of each query."""
     return {n: float(np.mean(ranks < n)) for n in numbers}
 
 
@@ -23,9 +23,9 @@ def score_recall(
     numbers: Sequence[int] = (1,),
     seed: int,
 ) -> Result:
-    """Complete `result` with counts, and where there is a revisit with recalls; the score is the first of them.
+    """Complete `result` with counts and, if there is a revisit, with recalls. The score is the first recall.
 
-    A query counts where it is `revisited`: only there is something to find.
+    Only queries that are `revisited` count.
     """
     result = replace(result, counts={"queries": len(ranks), "revisits": int(revisited.sum())})
     if not revisited.any():
@@ -39,7 +39,7 @@ def score_recall(
 def recall_decisions(
     n: int, queries: Int[np.ndarray, " q"], ranks: Int[np.ndarray, " q"], revisited: Bool[np.ndarray, " q"]
 ) -> np.ndarray:
-    """Return a `Decision` (n,) int8 for every frame by its first answer; a query without a revisit is not counted."""
+    """Return the `Decision` of each frame by its first answer, (n,) int8. Queries without a revisit are not counted."""
     decisions = np.full(n, Decision.NOT_A_QUERY, dtype=np.int8)
     found = np.where(ranks == 0, Decision.TRUE_POSITIVE, Decision.FALSE_NEGATIVE)
     decisions[queries] = np.where(revisited, found, Decision.UNCOUNTED)

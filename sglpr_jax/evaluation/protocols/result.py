@@ -1,4 +1,4 @@
-"""What a protocol returns: a number, and all that says what the number is."""
+"""Result of a protocol: a score with its rule, counts and details."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -10,7 +10,7 @@ from sglpr_jax.metrics import PrecisionRecallCurve
 
 
 class Decision(IntEnum):
-    """What became of one frame as a query, at the threshold of F1max."""
+    """Decision for one frame as a query, at the threshold of F1max."""
 
     NOT_A_QUERY = 0
     TRUE_POSITIVE = 1
@@ -18,34 +18,35 @@ class Decision(IntEnum):
     FALSE_NEGATIVE = 3
     TRUE_NEGATIVE = 4
     UNCOUNTED = 5
-    """A query that the protocol counts for nothing, such as one answered with a frame 3 to 20 m away."""
+    """Query that the protocol does not count, for example a query answered with a frame 3 to 20 m away."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One protocol's number for one descriptor file, with all that says what the number is."""
+    """Score of one input by one protocol, with the rule and counts that define it."""
 
     name: str
     rule: str
-    """The protocol in words, with its distances."""
+    """Rule of the protocol in words, with its distances."""
     dimensions: int | None
-    """2: distances in x and y. 3: in x, y and z. None: no distances, the truth was given."""
+    """Dimensions of distances between frames: 2 for x and y, 3 for x, y and z, None if labels were given instead."""
     pose_source: str | None
+    """Source of the poses, in words."""
     published_on: str
-    """The poses that the protocol's published numbers rest on: on others its number is another one."""
+    """Poses of the published numbers of the protocol. Scores on other poses differ."""
     counts: dict[str, int] = field(default_factory=dict)
-    """What the score rests on: queries and revisits, or pairs."""
+    """Numbers of queries and revisits, or of pairs."""
     score: float = np.nan
-    """NaN where the sequence has no revisit, so that there is nothing to find."""
+    """Score, NaN for a sequence without a revisit."""
     interval: tuple[float, float] | None = None
-    """The 95 % bootstrap interval of the score; None where there is no score."""
+    """95 % bootstrap interval of the score, or None without a score."""
     curve: PrecisionRecallCurve | None = None
-    """Its thresholds are negated descriptor distances. None for a recall, and where there is no revisit."""
+    """Curve with negated descriptor distances as thresholds. None for a recall and without a revisit."""
     recalls: dict[int, float] = field(default_factory=dict)
-    """Recall@N by N, where the protocol has it."""
+    """Recall@N by N, if the protocol defines it."""
     decisions: Int8[np.ndarray, " n"] | None = None
-    """A `Decision` for every frame. None for pairs and across sessions."""
+    """`Decision` of each frame. None for pairs and across sessions."""
     answers: Int64[np.ndarray, " n"] | None = None
-    """The frame that each query was answered with, -1 elsewhere. None where answers meet no threshold."""
+    """Answer to each frame, -1 for frames without an answer. None if the protocol applies no threshold."""
     answer_distances: Float64[np.ndarray, " n"] | None = None
-    """The descriptor distances of `answers`, infinite where there is none."""
+    """Descriptor distance of each answer, infinite for frames without an answer."""

@@ -1,4 +1,4 @@
-"""The protocol of Scan Context's evaluator."""
+"""Protocol of Scan Context's evaluator."""
 
 from sglpr_jax.evaluation.protocols.answers import older_by, score_top1_by_distance
 from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
@@ -6,18 +6,19 @@ from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import Source
 
 POSITIVE_M = 5.0
+"""Distance below which an answer is right, in metres."""
 GAP = 50
-"""The last so many frames, the query among them, are left out but for the oldest, as the published code counts."""
+"""Number of the last frames, including the query. As in the published code, all but the oldest of them are excluded."""
 
 
 def scan_context_f1max(source: Source, *, seed: int = 0) -> Result:
     """Score top-1 retrieval as Scan Context's evaluator does: 5 m in x and y, a gap of 50 frames.
 
-    The database of frame i is frames 0 to i - 49; the last frame is no query. Accepted, an answer less than 5 m away is
-    a true positive, any other a false positive. Rejected, it is a false negative if the database has a frame less than
-    5 m away, else a true negative. The published code (gisbi-kim/scancontext, fast_evaluator/main.m) looks at 50
-    candidates by ring key alone and at 100 thresholds; here all frames are compared and every distinct distance is a
-    threshold. Published on the pose files it ships, a sequence each. The interval resamples queries.
+    The database of frame i is frames 0 to i - 49. The last frame is not a query. An accepted answer is a true positive
+    if it is less than 5 m away, else a false positive. A rejected answer is a false negative if the database has a
+    frame less than 5 m away, else a true negative. The published code (gisbi-kim/scancontext, fast_evaluator/main.m)
+    compares 50 candidates chosen by ring key, at 100 thresholds. Here all frames are compared and every distinct
+    distance is a threshold. Published on the pose files of that code, one per sequence. The interval resamples queries.
     """
     result = Result(
         name="Scan Context F1max",

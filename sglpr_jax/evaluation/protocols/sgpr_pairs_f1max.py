@@ -1,4 +1,4 @@
-"""The protocol of SGPR."""
+"""Protocol of SGPR."""
 
 import numpy as np
 
@@ -10,17 +10,17 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 NEGATIVE_SHARE = 0.005
-"""The part of the negative pairs that is kept."""
+"""Fraction of the negative pairs that is kept."""
 
 
 def sgpr_pairs_f1max(file: DescriptorFile, *, seed: int = 0) -> Result:
     """Score pairs of frames as SGPR does: 3 m / 20 m in x and y, without a gap, 0.5 % of the negatives.
 
-    Positive: every pair no farther than 3 m apart; neighbouring frames are among them, and each frame with itself.
-    Negative: pairs more than 20 m apart, each kept with a probability of .005. So most positives are easy ones, and
-    even a recording without a revisit has a score. Published on KITTI's own poses (kxhit/SG_PR,
-    data_process/gen_sem_kitti_graph_pairs.py), where scans with few objects are left out; here none are. The interval
-    resamples the later frames of the pairs, and the negatives stay as drawn.
+    Positive pairs are all pairs at most 3 m apart, including neighbouring frames and each frame with itself. Negative
+    pairs are more than 20 m apart, and each is kept with a probability of .005. Most positive pairs are therefore easy,
+    and even a recording without a revisit has a score. Published on KITTI's own poses (kxhit/SG_PR,
+    data_process/gen_sem_kitti_graph_pairs.py). The published code skips scans with few objects; here all scans are
+    used. The interval resamples the later frames of the pairs and does not redraw the negatives.
     """
     positions = positions_of(file, 2)
     positive = frame_pairs(positions, lambda apart, gap: (apart <= POSITIVE_M) & (gap >= 0))

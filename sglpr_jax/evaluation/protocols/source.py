@@ -1,4 +1,4 @@
-"""What a method hands in: descriptors, frames that it retrieved, or pairs that it scored."""
+"""Inputs of protocols: descriptors, retrieved frames or scored pairs."""
 
 from dataclasses import dataclass
 
@@ -10,30 +10,34 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 @dataclass(frozen=True, eq=False)
 class TopK:
-    """A top-k list: for some frames of a sequence, the frames that a method retrieved for them, best first.
+    """Top-k list: the frames that a method retrieved for some frames of a sequence, best first.
 
-    A frame that is not listed has no answer: where it is a query, it is missed. Raises ValueError where a frame is out
-    of range or listed twice, numbers of rows differ, or a value is not finite.
+    A query that is not listed has no answer and counts as missed. Raises ValueError if a frame is out of range, if a
+    query is listed twice, if numbers of rows differ, or if a value is not finite.
     """
 
     sequence: str
+    """Name of the sequence."""
     positions: Float[np.ndarray, "_n 3"]
-    """Metres, z up, of every frame."""
+    """Position of every frame in metres, z up."""
     times: Float[np.ndarray, "_n"] | None
-    """Seconds, or None."""
+    """Time of every frame in seconds, or None."""
     pose_source: str | None
+    """Source of the poses, in words."""
     queries: Int[np.ndarray, "_q"]
-    """The frames listed."""
+    """Listed query frames."""
     nearest: Int[np.ndarray, "_q _k"]
-    """The frames retrieved; -1 fills a row that has fewer."""
+    """Retrieved frames of each query. Shorter rows are padded with -1."""
     scores: Float[np.ndarray, "_q _k"] | None = None
-    """Higher is closer. F1max cannot be had without."""
+    """Score of each retrieved frame. Higher means closer. F1max needs scores."""
 
     def __post_init__(self):
         if len(self.queries) == 0:
             raise ValueError("expected a list with at least one query, found none")
         if self.positions.shape != (len(self), 3) or not np.isfinite(self.positions).all():
-            raise ValueError(f"expected finite positions (n, 3), found others in {self.positions.shape}")
+            raise ValueError(
+                f"expected finite positions (n, 3), found shape {self.positions.shape} or values that are not finite"
+            )
         if self.times is not None and self.times.shape != (len(self),):
             raise ValueError(f"expected {len(self)} times, one for each position, found {self.times.shape}")
         if self.nearest.ndim != 2 or len(self.nearest) != len(self.queries) or self.nearest.shape[1] == 0:
@@ -45,7 +49,7 @@ class TopK:
         if self.scores is not None and (
             self.scores.shape != self.nearest.shape or not np.isfinite(self.scores[self.nearest >= 0]).all()
         ):
-            raise ValueError("expected a finite score for every retrieved frame, found others")
+            raise ValueError("expected a finite score for every retrieved frame, found missing or non-finite scores")
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -53,7 +57,7 @@ class TopK:
     def lookup(
         self, queries: Int[np.ndarray, " q"], ends: Int[np.ndarray, " q"], k: int
     ) -> tuple[Int[np.ndarray, "q {k}"], Float[np.ndarray, " q"]]:
-        """Return what `nearest.nearest_frames` returns. Listed frames outside a query's database are passed over."""
+        """Same as `nearest.nearest_frames`. Listed frames outside the database of a query are ignored."""
         row = np.full(len(self), -1)
         row[self.queries] = np.arange(len(self.queries))
         row = row[queries]
@@ -69,29 +73,33 @@ class TopK:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPairs:
-    """Pairs of frames of a sequence, each with a score and perhaps a label.
+    """Pairs of frames of a sequence with scores and optional labels.
 
-    Raises ValueError where the list is empty, a frame is out of range, or the numbers of rows differ.
+    Raises ValueError if the list is empty, if a frame is out of range, if the numbers of rows differ, or if both labels
+    and positions are missing.
     """
 
     pairs: Int[np.ndarray, "_p 2"]
-    """Two frames, the query first."""
+    """Frames of each pair, the query first."""
     scores: Float[np.ndarray, "_p"]
-    """Higher is closer."""
+    """Score of each pair. Higher means closer."""
     labels: Bool[np.ndarray, "_p"] | None = None
-    """One place or not. None: the positions tell."""
+    """Whether the frames of each pair show the same place. If None, labels are computed from the positions."""
     positions: Float[np.ndarray, "_n 3"] | None = None
-    """Metres, z up, of every frame. Needed where there are no labels."""
+    """Position of every frame in metres, z up. Required without labels."""
     pose_source: str | None = None
+    """Source of the poses, in words."""
 
     def __post_init__(self):
         p = len(self.pairs)
         if p == 0:
             raise ValueError("expected a list with at least one pair, found none")
         if self.pairs.shape != (p, 2) or len(self.scores) != p or (self.labels is not None and len(self.labels) != p):
-            raise ValueError(f"expected {p} pairs of frames, with a score each and a label each or none, found others")
+            raise ValueError(
+                f"expected {p} pairs of frames with {p} scores, and {p} labels or none, found other numbers of rows"
+            )
         if self.labels is None and self.positions is None:
-            raise ValueError("expected labels, or positions to tell them from, found neither")
+            raise ValueError("expected labels, or positions to compute them from, found neither")
         n = np.iinfo(np.int64).max if self.positions is None else len(self.positions)
         check_frames("pairs of", self.pairs, 0, n)
 
@@ -100,14 +108,14 @@ Source = DescriptorFile | TopK
 
 
 def positions_of(source: Source, dimensions: int = 3) -> Float[np.ndarray, "n {dimensions}"]:
-    """Return the positions, in x and y alone for 2 dimensions; ValueError where there are none."""
+    """Return the positions, only x and y for 2 dimensions. Raises ValueError if positions are missing."""
     if source.positions is None:
         raise ValueError(f"expected positions to score sequence {source.sequence} against, found none")
     return source.positions[:, :dimensions]
 
 
 def check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) -> None:
-    """Raise ValueError unless all frames are `first` to n - 1, naming the first row in which one is not."""
+    """Raise ValueError if a frame is not in the range from `first` to n - 1. The message names the first such row."""
     outside = np.argwhere((frames < first) | (frames >= n))
     if outside.size:
         row = outside[0, 0]
@@ -116,5 +124,5 @@ def check_frames(what: str, frames: Int[np.ndarray, "..."], first: int, n: int) 
 
 
 def pose_sources(*files: DescriptorFile) -> str | None:
-    """Return every pose source of the files once, as one text; None where none is named."""
+    """Return the distinct pose sources of the files, separated by commas, or None if no file names a source."""
     return ", ".join(dict.fromkeys(file.pose_source for file in files if file.pose_source)) or None

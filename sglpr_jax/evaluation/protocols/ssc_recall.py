@@ -1,4 +1,4 @@
-"""The protocol of SSC and RINet: Recall@N."""
+"""Protocol of SSC and RINet: Recall@N."""
 
 from dataclasses import replace
 
@@ -15,17 +15,18 @@ from sglpr_jax.evaluation.protocols.source import Source, TopK, positions_of
 from sglpr_jax.revisits import has_near
 
 RECALL_M = 5.0
+"""Largest distance at which two frames show the same place, in metres."""
 NUMBERS = tuple(range(1, 26))
 
 
 def ssc_recall(source: Source, *, seed: int = 0) -> Result:
     """Score Recall@1 to 25 as SSC and RINet do: 5 m in x and y, a gap of 50 frames.
 
-    The database of frame i is frames 0 to i - 51. A frame is a query if its database has a frame no farther than 5 m;
-    it is found at N if such a frame is among the first N. Of a top-k list every row is a query and counts: a list says
-    itself what was asked. So SSC's own lists give the numbers published, though on these poses one or two rows of some
-    sequences have nothing to find. Published on SemanticKITTI's poses (lilin-hitcrt/SSC, script/recall.py). The
-    interval of Recall@1 resamples queries.
+    The database of frame i is frames 0 to i - 51. A frame is a query if its database has a frame at most 5 m away. It
+    is found at N if such a frame is among the first N answers. Every row of a top-k list is a query and counts. With
+    this rule SSC's own lists give the published numbers, although one or two rows of some sequences have no revisit on
+    these poses. Published on SemanticKITTI's poses (lilin-hitcrt/SSC, script/recall.py). The interval of Recall@1
+    resamples queries.
     """
     positions = positions_of(source, 2)
     ends = older_by(len(source), GAP + 1)
@@ -55,7 +56,7 @@ def _count(
     revisited: Bool[np.ndarray, " q"],
     seed: int,
 ) -> Result:
-    """Complete `result`: all queries count, whether revisits or not."""
+    """Complete `result`. All queries count, even without a revisit."""
     every = np.ones(len(queries), dtype=bool)
     scored = score_recall(result, ranks, every, numbers=NUMBERS, seed=seed)
     counts = {"queries": len(queries), "revisits": int(revisited.sum())}

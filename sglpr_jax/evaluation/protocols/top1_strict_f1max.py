@@ -1,4 +1,4 @@
-"""The protocol of LoGG3D-Net and Locus without the answers that count for nothing."""
+"""Protocol of LoGG3D-Net and Locus in which every accepted answer counts."""
 
 from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
 from sglpr_jax.evaluation.protocols.result import Result
@@ -8,10 +8,10 @@ from sglpr_jax.same_place import POSITIVE_M
 
 
 def top1_strict_f1max(source: Source, *, seed: int = 0) -> Result:
-    """Score top-1 retrieval like `top1_f1max`, but an accepted answer 3 to 20 m away is a false positive too.
+    """Score top-1 retrieval as `top1_f1max`, except that accepted answers 3 to 20 m away are false positives.
 
-    It leaves no answer uncounted, so a method cannot win by near misses. Nobody publishes it; its number beside
-    that of `top1_f1max` says how much of the latter rests on them. The interval resamples queries.
+    Every accepted answer counts, so answers that are slightly too far away lower the score. No paper uses this
+    protocol. The difference from `top1_f1max` shows the effect of these answers. The interval resamples queries.
     """
     rule = f"{METRES}, in between false, {excluded(source)}"
     return score_top1(source, "top-1 strict F1max", rule, lambda apart: apart > POSITIVE_M, seed)

@@ -1,6 +1,6 @@
-"""Methods that need no training: each file has a pure function and declares what it takes.
+"""Methods without training. Each file contains a pure function and declares its inputs.
 
-A new one is a file here, an entry of the list, and its name in `methods/names.py`.
+A new method needs a file here, an entry in the list below, and its name in `methods/names.py`.
 """
 
 from sglpr_jax.methods.handcrafted.lidar_iris import LIDAR_IRIS
@@ -16,4 +16,4 @@ from sglpr_jax.methods.method import HandcraftedMethod
 HANDCRAFTED: dict[str, HandcraftedMethod] = {
     method.name: method for method in (SCAN_CONTEXT, M2DP, LIDAR_IRIS, SSC, SSC_24, SOLID, POLAR_FFT, THUMBNAIL, RANDOM)
 }
-"""Every handcrafted method, by the name that a command line takes."""
+"""All handcrafted methods by their names on the command line."""

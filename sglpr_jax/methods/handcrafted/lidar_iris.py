@@ -1,4 +1,5 @@
-"""LiDAR Iris (Wang et al., 2020): the scan as an iris, its texture as bits, compared by a shifted Hamming distance."""
+"""LiDAR Iris (Wang et al., 2020): the scan as an iris image with a binary texture, compared by a shifted Hamming
+distance."""
 
 from typing import NamedTuple
 
@@ -15,28 +16,30 @@ COLUMNS = 360
 RING_M = 1.0
 HEIGHT_BITS = 8
 LOWEST_DEG = -24.0
-"""Elevation at which the first of the height bits begins: the HDL-64E's; a 16-beam sensor's would be -15."""
+"""Elevation at which the first height bit begins, for the HDL-64E. A 16-beam sensor would need -15."""
 BIT_DEG = 4.0
 NUMBERS = RINGS * COLUMNS
 
 WAVELENGTHS = tuple(18 * 1.6**scale for scale in range(4))
-"""In columns, of the four log-Gabor filters."""
+"""Wavelengths of the four log-Gabor filters, in columns."""
 SIGMA = 0.75
-"""Width of a filter: its standard deviation over its frequency."""
+"""Width of a filter: its standard deviation divided by its frequency."""
 FAINT = 1e-4 / COLUMNS
-"""Responses below it have no certain sign. The published 1e-4 is that of an inverse transform without 1 / columns."""
+"""Amplitude below which the sign of a response is unreliable. The published 1e-4 belongs to an inverse transform
+without the factor 1 / columns."""
 NEAR = 2
-"""Columns that are tried to either side of each alignment."""
+"""Number of columns to either side of each alignment that are also compared."""
 
 BLOCK = 128
 
 
 def lidar_iris(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "28800"]:
-    """Return the LiDAR-Iris image, 80 rings of 1 m x 360 degrees, flat: whole numbers 0 to 255.
+    """Return the LiDAR-Iris image, 80 rings of 1 m x 360 degrees, flattened: integers from 0 to 255.
 
-    Bit k of a pixel is set where it has a point (metres, z up) with floor((elevation + 24 degrees) / 4 degrees) = k;
-    lower and higher elevations count for the first and the last bit, points from 79 m on for the last ring. Columns are
-    degrees from the back, rounded to the nearest; what is nearest to 360 counts for column 359, not for 0.
+    Bit k of a pixel is set if the pixel has a point (metres, z up) with floor((elevation + 24 degrees) / 4 degrees) =
+    k. Lower elevations count in the first bit, higher ones in the last, and points from 79 m on in the last ring.
+    Columns are degrees from the back, rounded to the nearest. Azimuths that round to 360 count in column 359, not in
+    column 0.
     """
     x, y, z = points.astype(np.float64).T
     radius, azimuth = np.hypot(x, y), 180 + np.degrees(np.arctan2(y, x))
@@ -50,7 +53,7 @@ def lidar_iris(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "28800
 
 
 class _Iris(NamedTuple):
-    """What is compared of n images. The words of a column hold its bits of all rings, filters and parts."""
+    """Prepared data of n images. The words of a column hold its bits of all rings, filters and parts."""
 
     spectra: Spectra
     bits: UInt64[np.ndarray, "n 360 words"]
@@ -60,11 +63,11 @@ class _Iris(NamedTuple):
 def lidar_iris_distance(
     queries: Float32[np.ndarray, "q 28800"], database: Float32[np.ndarray, "n 28800"]
 ) -> Float32[np.ndarray, "q n"]:
-    """Return the smallest Hamming distance, 0 to 1, over the shifts within 2 columns of an alignment.
+    """Return the smallest Hamming distance, from 0 to 1, over the shifts within 2 columns of an alignment.
 
-    D = min over shifts of |(q xor d) and not m| / |not m|, over the bits of 80 x 360 pixels x 4 filters x 2 parts: the
-    signs of the real and of the imaginary part of the log-Gabor response. m marks bits that are faint in either image.
-    It is 1 where all are. There are two alignments, by `phase_correlation.column_shifts`.
+    D = min over shifts of |(q xor d) and not m| / |not m|. The bits are the signs of the real and the imaginary part of
+    the log-Gabor response: 80 x 360 pixels x 4 filters x 2 parts. m marks bits that are faint in either image. If all
+    bits are faint, the distance is 1. `phase_correlation.column_shifts` gives two alignments.
     """
 
     def compare(queries, database):
@@ -79,7 +82,7 @@ def lidar_iris_distance(
 def responses(image: Float64[np.ndarray, "80 360"]) -> Complex128[np.ndarray, "filters 80 360"]:
     """Return the complex log-Gabor responses of every ring.
 
-    A filter of wavelength w has the gain exp(-ln(f w)^2 / (2 ln(sigma)^2)) at the frequency f > 0, and 0 elsewhere.
+    A filter of wavelength w has the gain exp(-ln(f w)^2 / (2 ln(sigma)^2)) at frequencies f > 0, and 0 elsewhere.
     """
     frequency = np.fft.fftfreq(COLUMNS)
     positive = frequency > 0
@@ -96,14 +99,14 @@ def _prepare(rows: Float32[np.ndarray, "n 28800"]) -> _Iris:
 
 
 def _encode(image: Float32[np.ndarray, "80 360"]) -> tuple[UInt64[np.ndarray, "360 words"], ...]:
-    """Return the signs of an image's responses, and which of them are faint."""
+    """Return the signs of an image's responses, and a mask of the faint ones."""
     found = responses(image.astype(np.float64))
     faint = np.abs(found) < FAINT
     return _pack(np.stack([np.real(found) > 0, np.imag(found) > 0])), _pack(np.stack([faint, faint]))
 
 
 def _pack(bits: Bool[np.ndarray, "parts filters 80 360"]) -> UInt64[np.ndarray, "360 words"]:
-    """Return the bits of every column as words of 64."""
+    """Return the bits of every column as words of 64 bits."""
     by_column = bits.reshape(-1, COLUMNS).T
     return np.ascontiguousarray(np.packbits(by_column, axis=-1)).view(np.uint64)
 
@@ -114,9 +117,9 @@ def _hamming(
     database: _Iris,
     shifts: Int[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance of one image to each of the database, at the best shift near its alignments.
+    """Return the distance of one image to each image of the database, at the best shift near its alignments.
 
-    These are mostly a column apart: most shifts near the one are near the other, and count once.
+    The two alignments are mostly one column apart, so most shifts occur twice and are compared once.
     """
     near = np.sort((shifts[..., None] + np.arange(-NEAR, NEAR + 1)).reshape(len(shifts), -1) % COLUMNS, axis=1)
     best = np.ones(len(shifts))

@@ -1,4 +1,4 @@
-"""M2DP (He, Wang and Zhang, 2016): how the points lie on many planes, as the first singular vectors of the counts."""
+"""M2DP (He, Wang and Zhang, 2016): point counts on many planes, summarised by their first singular vectors."""
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -17,7 +17,7 @@ NUMBERS = PLANES + BINS
 def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
     """Return [u1; v1], 64 + 128 numbers, of `signature(points)` = U S V^T. No points give zeros.
 
-    The signature is nowhere negative, so neither need u1 and v1 be: that settles their signs.
+    The signature has no negative values, so u1 and v1 can be chosen without negative values. This fixes their signs.
     """
     if not len(points):
         return np.zeros(NUMBERS, np.float32)
@@ -26,12 +26,13 @@ def m2dp(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "192"]:
 
 
 def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128"]:
-    """Return for every plane the share of the points in each of its 8 rings x 16 sectors; n is at least 1.
+    """Return for every plane the fraction of the points in each of its 8 rings x 16 sectors. At least one point is
+    needed.
 
-    The points (metres) are moved to their mean and rotated into their principal axes. Plane (theta, phi) goes through
-    the mean with the normal (cos theta cos phi, cos theta sin phi, sin theta), for 16 elevations theta from 0 to 90
-    degrees and 4 azimuths phi from -90 to 90; its axes are those of `plane_axes`. The rings end at (k sqrt(rho) / 8)^2,
-    rho being the farthest point's distance.
+    The points (metres) are centred and rotated into their principal axes. Plane (theta, phi) contains the mean and has
+    the normal (cos theta cos phi, cos theta sin phi, sin theta), for 16 elevations theta from 0 to 90 degrees and 4
+    azimuths phi from -90 to 90 degrees. Its axes are those of `plane_axes`. The outer radius of ring k is (k sqrt(rho)
+    / 8)^2, where rho is the distance of the farthest point.
     """
     aligned = np.ascontiguousarray(_align(points.astype(np.float64)).T, np.float32)
     farthest = np.sqrt(np.max(np.sum(aligned**2, axis=0)))
@@ -40,10 +41,10 @@ def signature(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "64 128
 
 
 def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
-    """Return for each plane its axes p_x = e_x - (e_x . n) n and p_y = n x p_x, n being its normal.
+    """Return the axes p_x = e_x - (e_x . n) n and p_y = n x p_x of each plane with normal n.
 
-    They are as long as the x axis of space, seen from the normal: from 1 down to 1/2. The published code leaves them
-    so: the more a plane is oblique to x, the nearer to its centre points are counted.
+    The length of both axes is that of the projected x axis: between 1/2 and 1. The published code does not normalise
+    them. Points on planes oblique to x are therefore counted nearer to the centre.
     """
     phi, theta = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, AZIMUTHS), np.linspace(0, np.pi / 2, ELEVATIONS), indexing="ij"
@@ -54,10 +55,10 @@ def plane_axes() -> Float32[np.ndarray, "64 2 3"]:
 
 
 def _align(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Return the points about their mean, in their principal axes, the longest first.
+    """Return the centred points in their principal axes, the longest axis first.
 
-    An axis is known but for its sign. The first two point to where the third moment is positive, which rotates with
-    the scan; the third makes them right-handed.
+    The sign of a principal axis is ambiguous. The first two axes get the sign that makes the third moment positive,
+    which does not depend on the scan's rotation. The third axis makes the system right-handed.
     """
     centred = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
@@ -66,7 +67,7 @@ def _align(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
 
 
 def _count(projected: Float32[np.ndarray, "2 n"], farthest: np.float32) -> Float64[np.ndarray, "128"]:
-    """Return how many points lie in each bin of a plane, ring by ring; the last ring has its outer border too."""
+    """Return the number of points in each bin of a plane, ring by ring. The last ring includes its outer border."""
     x, y = projected
     share = np.hypot(x, y) / max(farthest, np.finfo(np.float32).tiny)
     ring = np.minimum(np.sqrt(share) * RINGS, RINGS - 1).astype(np.int32)

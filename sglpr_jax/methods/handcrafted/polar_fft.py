@@ -1,4 +1,4 @@
-"""Polar-FFT: a training-free descriptor of a BEV image that a rotation of the scan hardly changes."""
+"""Polar-FFT: a descriptor of a BEV image without training, nearly invariant to rotation of the scan."""
 
 from functools import partial
 
@@ -12,7 +12,7 @@ RINGS = 20
 SECTORS = 60
 FREQUENCIES = 16
 READY_MADE_RADIUS = 62.0
-"""Pixels from the centre to which the ready-made images of KITTI have content."""
+"""Distance from the centre up to which the ready-made images of KITTI have content, in pixels."""
 
 
 def polar_fft(
@@ -24,10 +24,14 @@ def polar_fft(
 ) -> Float32[np.ndarray, "n 320"]:
     """Return one unit-length descriptor per image of point counts. An image without points gives zeros.
 
-    The counts are summed in 20 rings x 60 sectors about `centre` (row, column; the middle of the image unless given),
-    `radius` pixels and farther (half the shorter side unless given) left out. Of log(1 + scale * sum) each ring keeps
-    the magnitudes of its 16 lowest frequencies along the sectors, which a shift of the sectors leaves as they are.
-    `scale` brings counts of 0 to 10 to the grey values 0 to 255 of BEVPlace's images.
+    The counts are summed in 20 rings x 60 sectors and become log(1 + scale * sum). Each ring keeps the magnitudes of
+    its 16 lowest frequencies along the sectors, which a shift of the sectors does not change.
+
+    Arguments:
+      images: Images of point counts.
+      centre: Row and column of the centre. None: the middle of the image.
+      radius: Outer radius in pixels; cells at this distance or beyond are ignored. None: half the shorter side.
+      scale: Factor of the sums. The default maps counts of 0 to 10 to the grey values 0 to 255 of BEVPlace's images.
     """
     height, width = images.shape[1:]
     bins = _polar_bins(
@@ -46,7 +50,7 @@ def polar_fft(
 def _polar_bins(
     height: int, width: int, *, centre: tuple[float, float], radius: float
 ) -> Int[np.ndarray, "{height} {width}"]:
-    """Return for every pixel ring * SECTORS + sector, -1 from `radius` on."""
+    """Return ring * SECTORS + sector for every pixel, or -1 at `radius` and beyond."""
     rows, columns = np.indices((height, width))
     down, right = rows - centre[0], columns - centre[1]
     distance = np.hypot(down, right)

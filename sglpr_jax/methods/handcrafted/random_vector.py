@@ -1,4 +1,4 @@
-"""Random vectors: what any method must beat, for they know nothing of the place."""
+"""Random vectors, the lower baseline: they contain no information about the place."""
 
 import zlib
 
@@ -12,7 +12,7 @@ NUMBERS = 256
 
 
 def random_vector(images: Num[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n 256"]:
-    """Return one random direction per image. The seed is the image itself: equal images have equal descriptors."""
+    """Return one random direction per image. The image is the seed, so equal images have equal descriptors."""
     seeds = [zlib.crc32(np.ascontiguousarray(image).tobytes()) for image in images]
     return unit_length(np.stack([np.random.default_rng(seed).normal(size=NUMBERS) for seed in seeds]))
 

@@ -1,4 +1,4 @@
-"""Scan Context (Kim and Kim, 2018): the greatest height in every cell of a polar grid, compared over all rotations."""
+"""Scan Context (Kim and Kim, 2018): the maximum height in every cell of a polar grid, compared over all rotations."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -10,17 +10,18 @@ RINGS = 20
 SECTORS = 60
 RADIUS_M = 80.0
 LIDAR_HEIGHT_M = 2.0
-"""Added to z, so that the ground is near 0 and heights are positive."""
+"""Height added to z, in metres, so that the ground is near 0 and heights are positive."""
 NUMBERS = RINGS * SECTORS
 
 BLOCK = 256
 
 
 def scan_context(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "1200"]:
-    """Return the matrix I of 20 rings x 60 sectors, flat: I[i, j] = max of z + 2 m over the points of a cell, else 0.
+    """Return the matrix I of 20 rings x 60 sectors, flattened: I[i, j] = max of z + 2 m over the points of a cell, else
+    0.
 
-    Points (metres, x forward, y left, z up) farther than 80 m are left out. A cell holds the far and the
-    counter-clockwise border, not the near one: ring = ceil(20 r / 80 m), sector = ceil(60 theta / 360 degrees), from 1.
+    Points are in metres: x forward, y left, z up. Points farther than 80 m are ignored. A cell includes its outer and
+    its counter-clockwise border: ring = ceil(20 r / 80 m), sector = ceil(60 theta / 360 degrees), from 1.
     """
     x, y, z = points.astype(np.float64).T
     radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
@@ -37,9 +38,10 @@ def scan_context_distance(
 ) -> Float32[np.ndarray, "q n"]:
     """Return the column-wise cosine distance at the best of all 60 rotations (the paper's equations 6 and 7).
 
-    D = min over shifts s of 1 - (1 / N_s) sum over j of cos(q_j, d_{j + s}), where q_j are the columns (sectors) and
-    the sum is over the N_s that are empty in neither. It is 1 where there are none. The published search tries only the
-    shifts near the best one of a coarse key, and only ten candidates; here every shift of every scan is tried.
+    D = min over shifts s of 1 - (1 / N_s) sum over j of cos(q_j, d_{j + s}). Here q_j are the columns (sectors), and
+    the sum is over the N_s columns that are nonempty in both scans. Without such columns, D is 1. The published search
+    tries only shifts near the best one of a coarse key, and only ten candidates. Here every shift of every scan is
+    tried.
     """
 
     def compare(queries, database):
@@ -53,7 +55,7 @@ def scan_context_distance(
 def _unit_columns(
     rows: Float32[np.ndarray, "n 1200"],
 ) -> tuple[Float32[np.ndarray, "n 20 60"], Float32[np.ndarray, "n 1 60"]]:
-    """Return the columns divided by their lengths, and 1 for each that is not empty."""
+    """Return the columns divided by their lengths, and a mask of the nonempty columns."""
     columns = rows.reshape(-1, RINGS, SECTORS)
     lengths = np.linalg.norm(columns, axis=1, keepdims=True)
     unit = np.divide(columns, lengths, out=np.zeros_like(columns), where=lengths > 0)

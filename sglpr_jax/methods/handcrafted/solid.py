@@ -1,4 +1,4 @@
-"""SOLiD (Kim et al., 2024): how many points lie at each range, those at busy elevations counting more."""
+"""SOLiD (Kim et al., 2024): number of points at each range. Elevations with more points have a higher weight."""
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -16,13 +16,15 @@ VOXEL_M = 0.4
 
 
 def solid(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "40"]:
-    """Return R w, at unit length: the range part of SOLiD, which no rotation about z changes. No points give zeros.
+    """Return R w with length 1: the range part of SOLiD, which is invariant to rotation about z. No points give zeros.
 
-    R (40 x 32) counts the points in ranges of 2 m, to 80 m, and elevations between -24.8 and 2 degrees; what is beyond
-    counts for the nearest bin. w is the sum of R over the ranges, brought to 0 to 1: (n - min n) / (max n - min n).
-    Points (metres, z up) nearer than 3 m or beyond 80 m in space are left out, and those of a voxel of 0.4 m are one,
-    their mean. The 60 numbers of the angular part tell the yaw between two scans and take no part in the search, so
-    they are not here.
+    R (40 x 32) counts the points in ranges of 2 m, up to 80 m, and in elevations between -24.8 and 2 degrees. Points
+    outside these limits count in the nearest bin. w is the sum n of R over the ranges, scaled to 0 to 1: (n - min n) /
+    (max n - min n).
+
+    Points are in metres with z up. Points nearer than 3 m or beyond 80 m are ignored, and the points of each voxel of
+    0.4 m are replaced by their mean. The 60 numbers of the angular part estimate the yaw between two scans. They are
+    not used for retrieval and are left out.
     """
     near = np.linalg.norm(points.astype(np.float64), axis=1)
     x, y, z = _voxel_means(points[(near >= NEAREST_M) & (near <= FARTHEST_M)]).T
@@ -37,7 +39,7 @@ def solid(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "40"]:
 
 
 def _voxel_means(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "voxels 3"]:
-    """Return the mean of the points of each voxel that has any."""
+    """Return the mean of the points of each occupied voxel."""
     cells = np.floor(points / VOXEL_M).astype(np.int64)
     _, voxel, counts = np.unique(cells @ [1 << 40, 1 << 20, 1], return_inverse=True, return_counts=True)
     sums = [np.bincount(voxel, weights=axis, minlength=len(counts)) for axis in points.T]

@@ -1,4 +1,4 @@
-"""SSC (Li et al., 2021): semantic classes on a polar grid, compared after one scan is laid onto the other."""
+"""SSC (Li et al., 2021): semantic classes on a polar grid, compared after alignment of the scans."""
 
 import functools
 import math
@@ -17,66 +17,69 @@ from sglpr_jax.methods.pairwise import in_blocks
 
 FARTHEST_M = 50.0
 STRONGER = (17, 9, 10, 11, 12, 15, 13, 14, 16, 18, 19)
-"""The classes that count (`labels.CATEGORIES`), each before those that take a cell from it. The others are left out."""
+"""The classes that are used (`labels.CATEGORIES`), in rising order of priority in a cell. Other classes are ignored."""
 LANDMARKS = (13, 14, 16, 18, 19)
-"""Building, fence, trunk, pole and traffic sign: the classes whose outlines are laid on each other."""
+"""Building, fence, trunk, pole and traffic sign: the classes whose outlines are aligned."""
 
 FINER = 3
-"""A scan is kept in cells of a third of a ring and of a sector: those are what is moved."""
+"""A scan is stored in cells of a third of a ring and a third of a sector. The alignment moves these cells."""
 FINE_SECTORS = FINER * SECTORS
 RANK_BITS = 4
 PACKED = 6
-"""Cells in one number of a descriptor: float32 holds whole numbers of 24 bits exactly."""
+"""Cells per number of a descriptor: float32 represents integers of 24 bits exactly."""
 
 ARCTAN = (0.0068117896, -0.033604209, 0.079623658, -0.13233341, 0.19807815, -0.33317368, 0.99999611)
-"""Of arctan(t) / t in t^2, from 0 to 1: the polynomial whose greatest error is least, 3e-7 radians."""
+"""Coefficients of arctan(t) / t in t^2, for t from 0 to 1: the minimax polynomial, with a maximum error of 3e-7
+radians."""
 
 BLOCK = 64
 WIDTH_STEP = 8192
-"""Lists of occupied cells are filled up to a multiple of it, so that few lengths are compiled."""
+"""Lists of occupied cells are padded to a multiple of this length, so that few lengths are compiled."""
 
 
 @dataclass(frozen=True)
 class PolarGrid:
-    """The rings that two scans are compared in: from `nearest_m` to 50 m."""
+    """Rings in which two scans are compared, from `nearest_m` to 50 m."""
 
     rings: int
     nearest_m: float
 
     @property
     def fine_m(self) -> float:
-        """The width of the rings that a scan is kept in; they begin at the sensor."""
+        """Width of the stored rings, in metres. They begin at the sensor."""
         return (FARTHEST_M - self.nearest_m) / self.rings / FINER
 
     @property
     def inner(self) -> int:
-        """How many fine rings lie before `nearest_m`: a move may bring them in."""
+        """Number of stored rings within `nearest_m`. A translation may move them beyond it."""
         return round(self.nearest_m / self.fine_m)
 
     @property
     def fine_rings(self) -> int:
-        """As far out as a move may bring cells in from."""
+        """Number of stored rings. They reach as far out as a translation may bring cells in from."""
         return math.ceil((FARTHEST_M + math.sqrt(2) * FARTHEST_MOVE_M) / self.fine_m)
 
     @property
     def numbers(self) -> int:
-        """Of a descriptor."""
+        """Length of a descriptor."""
         return self.fine_rings * FINE_SECTORS // PACKED + 2 * SECTORS
 
 
 PAPER = PolarGrid(50, 0.0)
-"""Of the version that the authors name for the paper."""
+"""Grid of the version that the authors name for the paper."""
 NEWEST = PolarGrid(24, 5.0)
-"""Of their last version."""
+"""Grid of the authors' last version."""
 
 
 def ssc(
     points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"], grid: PolarGrid = PAPER
 ) -> Float32[np.ndarray, " d"]:
-    """Return the strongest class of every fine cell, six to a number, then x (360) and y (360) of the landmarks.
+    """Return the strongest class of every stored cell, six to a number, followed by x (360) and y (360) of the
+    landmarks.
 
-    Points are metres, x forward, y left, z up; classes are those of `labels.to_classes`. Sectors are degrees from the
-    back. A sector's landmark is the last in the order of the points, at any range but 0; x = y = 0: it has none.
+    Points are in metres: x forward, y left, z up. Classes are those of `labels.to_classes`. Sectors are degrees from
+    the back. The landmark of a sector is its last landmark point in the order of the points, at any nonzero range. A
+    sector without a landmark has x = y = 0.
     """
     x, y = points[:, :2].astype(np.float64).T
     radius, degrees = np.hypot(x, y), 180 + np.degrees(np.arctan2(y, x))
@@ -86,28 +89,28 @@ def ssc(
     np.maximum.at(cells, (ring * FINE_SECTORS + sector)[inside], _ranks()[classes[inside]])
     landmarks = np.flatnonzero(np.isin(classes, LANDMARKS) & (radius > 0) & (sector < FINE_SECTORS))
     outline = np.zeros((2, SECTORS))
-    outline[:, sector[landmarks] // FINER] = x[landmarks], y[landmarks]  # of equal sectors the last one stays
+    outline[:, sector[landmarks] // FINER] = x[landmarks], y[landmarks]  # in each sector, the last landmark wins
     packed = cells.reshape(-1, PACKED) @ (1 << RANK_BITS * np.arange(PACKED))
     return np.concatenate([packed, *outline]).astype(np.float32)
 
 
 @functools.cache
 def _ranks() -> Int[np.ndarray, "20"]:
-    """Return by class its place in `STRONGER`, from 1; 0: left out."""
+    """Return the position of each class in `STRONGER`, from 1, or 0 for ignored classes."""
     ranks = np.zeros(len(CATEGORIES), np.int64)
     ranks[list(STRONGER)] = 1 + np.arange(len(STRONGER))
     return ranks
 
 
 class _Still(NamedTuple):
-    """What is compared of the n scans that stay as they are."""
+    """Prepared data of the n scans that are not moved."""
 
     outlines: Float32[np.ndarray, "n 2 360"]
     cells: Int32[np.ndarray, "n rings 360"]
 
 
 class _Moved(NamedTuple):
-    """What is compared of the n scans that are laid onto the others: the centres of their fine cells."""
+    """Prepared data of the n scans that are aligned with the others: the centres of their stored cells."""
 
     outlines: Float32[np.ndarray, "n 2 360"]
     centres: Float32[np.ndarray, "n 2 occupied"]
@@ -117,10 +120,11 @@ class _Moved(NamedTuple):
 def ssc_distance(
     queries: Float32[np.ndarray, "q d"], database: Float32[np.ndarray, "n d"], grid: PolarGrid = PAPER
 ) -> Float32[np.ndarray, "q n"]:
-    """Return 1 - (cells of equal class) / (cells occupied in either), after alignment; 1 where no cell is occupied.
+    """Return 1 - (cells of equal class) / (cells occupied in either scan), after alignment; 1 if no cell is occupied.
 
-    The scan of the database is turned and moved onto the query (`outline_alignment`). The published method then divides
-    its points into cells anew; here, where no points are kept, the centres of its occupied fine cells.
+    The scan of the database is rotated and moved onto the query (`outline_alignment`). The published method then sorts
+    its points into cells again. Here no points are stored, so the centres of its occupied stored cells are sorted
+    instead.
     """
     compare = functools.partial(_compare, grid)
     ways = {"prepare": functools.partial(_still, grid), "prepare_database": functools.partial(_moved, grid)}
@@ -142,7 +146,7 @@ def _moved(grid: PolarGrid, rows: Float32[np.ndarray, "n d"]) -> _Moved:
 def _unpacked(
     grid: PolarGrid, rows: Float32[np.ndarray, "n d"]
 ) -> tuple[UInt8[np.ndarray, "n rings sectors"], Float32[np.ndarray, "n 2 360"]]:
-    """Return the rank of every fine cell, and the outlines."""
+    """Return the rank of every stored cell, and the outlines."""
     if rows.shape[1] != grid.numbers:
         raise ValueError(f"expected rows of {grid.numbers} numbers ({grid.rings} rings), found {rows.shape[1]}")
     packed, outlines = rows[:, : -2 * SECTORS].astype(np.int32), rows[:, -2 * SECTORS :].reshape(-1, 2, SECTORS)
@@ -155,7 +159,7 @@ def _unpacked(
 def _occupied(
     grid: PolarGrid, fine: UInt8[np.ndarray, "n rings sectors"]
 ) -> tuple[Float32[np.ndarray, "n 2 occupied"], Int32[np.ndarray, "n occupied"]]:
-    """Return x and y of the middle of every occupied cell, and its rank; filled up with ranks of 0."""
+    """Return x and y of the centre of every occupied cell, and its rank. The lists are padded with rank 0."""
     scan, ring, sector = np.nonzero(fine)
     counts = np.bincount(scan, minlength=len(fine))
     place = np.arange(len(scan)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -169,7 +173,8 @@ def _occupied(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compare(grid: PolarGrid, queries: _Still, database: _Moved) -> Float[Array, "q n"]:
-    """Return the distances of all pairs, one at a time: it stays in the cache, and takes the steps that it needs."""
+    """Return the distances of all pairs. One pair at a time stays in the cache and runs only the iterations that it
+    needs."""
 
     def distance(query, other):
         shift, move = align(query.outlines, other.outlines)
@@ -180,7 +185,7 @@ def _compare(grid: PolarGrid, queries: _Still, database: _Moved) -> Float[Array,
 
 
 def _cells_of(grid: PolarGrid, points: Float[Array, "2 n"], ranks: Int[Array, " n"]) -> Int[Array, "rings 360"]:
-    """Return the greatest rank in every cell."""
+    """Return the highest rank in every cell."""
     x, y = points
     ring = jnp.floor((jnp.sqrt(x**2 + y**2) - grid.nearest_m) / (FINER * grid.fine_m)).astype(jnp.int32)
     sector = jnp.floor(180 + jnp.degrees(_angle(x, y))).astype(jnp.int32)
@@ -190,7 +195,8 @@ def _cells_of(grid: PolarGrid, points: Float[Array, "2 n"], ranks: Int[Array, " 
 
 
 def _angle(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return the angle of (x, y) in radians, to 1e-6: on a CPU in a tenth of `jnp.arctan2`'s time."""
+    """Return the angle of (x, y) in radians, with an error of 1e-6. On a CPU it takes a tenth of the time of
+    `jnp.arctan2`."""
     low, high = jnp.minimum(jnp.abs(x), jnp.abs(y)), jnp.maximum(jnp.abs(x), jnp.abs(y))
     octant = low / jnp.maximum(high, jnp.finfo(x.dtype).tiny)
     quadrant = octant * jnp.polyval(jnp.asarray(ARCTAN), octant**2)
@@ -200,7 +206,7 @@ def _angle(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def similarity(a: Int[Array, "rings 360"], b: Int[Array, "rings 360"]) -> Float[Array, ""]:
-    """Return the share of equal cells among those occupied in either; 0 where there are none."""
+    """Return the fraction of equal cells among the cells occupied in either scan; 0 without occupied cells."""
     either = (a > 0) | (b > 0)
     return jnp.sum(either & (a == b)) / jnp.maximum(either.sum(), 1)
 

@@ -1,1 +1,1 @@
-"""From the image to feature maps."""
+"""Backbones: networks from the image to feature maps."""

@@ -1,6 +1,6 @@
 """Attention inside windows of an image, with a learned bias for each relative position.
 
-All arrays keep rank 5 or less, so that `vmap` over a model stays within what XLA's CPU backend supports.
+All arrays have rank 5 or less, so that `vmap` over a model stays within the limits of XLA's CPU backend.
 """
 
 from functools import cache
@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 from sglpr_jax.models.layers import Linear, weight
 
 BLOCKED = -100.0
-"""Added to the score of two tokens that are neighbours only because the image was rolled."""
+"""Value added to the score of two tokens that are neighbours only because the image was rolled."""
 
 
 @cache
 def relative_position_index(window: int) -> Int[np.ndarray, "t t"]:
-    """Row of the bias table for each (query, key) of a window, t = window**2, tokens row-major.
+    """Row of the bias table for each (query, key) of a window with t = window**2 tokens, row-major.
 
     index[p, q] = (yp - yq + window - 1) * (2 * window - 1) + (xp - xq + window - 1)
     """
@@ -33,10 +33,10 @@ def relative_position_index(window: int) -> Int[np.ndarray, "t t"]:
 def shift_mask(
     height: int, width: int, window: int, shift: int | tuple[int, int], *, circular: bool = False
 ) -> Bool[np.ndarray, "n t t"]:
-    """True where two tokens of a window may not see each other in an image rolled by `-shift` (rows, columns).
+    """Mask of the token pairs that must not see each other in an image rolled by `-shift` (rows, columns).
 
-    The roll brings opposite borders together in the last windows; n = (height / window) * (width / window).
-    In a `circular` image the left and right borders really are neighbours, and nothing is blocked across them.
+    The roll brings opposite borders together in the last windows; n = (height / window) * (width / window). In a
+    `circular` image the left and right borders are neighbours, so the mask blocks nothing across them.
     """
     down, right = (shift, shift) if isinstance(shift, int) else shift
     columns = np.zeros(width, np.int64) if circular else _strip(width, window, right)
@@ -47,20 +47,20 @@ def shift_mask(
 
 
 def _strip(size: int, window: int, shift: int) -> Int[np.ndarray, " size"]:
-    """Label 0, 1 or 2 for each row (or column): untouched windows, the last window's own part, the rolled-in part."""
+    """Label of each row or column: 0 in other windows, 1 in the last window's own part, 2 in its rolled-in part."""
     place = np.arange(size)
     return (place >= size - window).astype(np.int64) + (place >= size - shift)
 
 
 def split_windows(image: Float[Array, "b h w c"], window: int) -> Float[Array, "n t c"]:
-    """Cuts images into windows: n = b * (h / window) * (w / window), images slowest; t = window**2, row-major."""
+    """Cut images into windows: n = b * (h / window) * (w / window), images slowest; t = window**2, row-major."""
     b, h, w, c = image.shape
     strips = image.reshape(b * h // window, window, w // window, window * c)
     return strips.transpose(0, 2, 1, 3).reshape(-1, window**2, c)
 
 
 def join_windows(windows: Float[Array, "n t c"], height: int, width: int) -> Float[Array, "b h w c"]:
-    """Puts windows back into images of height x width: the inverse of `split_windows`."""
+    """Join windows to images of height x width: the inverse of `split_windows`."""
     _, tokens, c = windows.shape
     window = round(tokens**0.5)
     strips = windows.reshape(-1, width // window, window, window * c)
@@ -76,7 +76,7 @@ class WindowAttention(nn.Module):
     def __call__(
         self, windows: Float[Array, "n t c"], blocked: Bool[np.ndarray, "m t t"] | None = None
     ) -> Float[Array, "n t c"]:
-        """`blocked` is the shift mask of one image's m windows; n is then a multiple of m."""
+        """`blocked` is the shift mask for the m windows of one image; n must be a multiple of m."""
         n, t, c = windows.shape
         qkv = Linear(3 * c, name="qkv")(windows)
         q, k, v = (part.reshape(n, t, self.heads, -1) for part in jnp.split(qkv, 3, axis=-1))
@@ -90,7 +90,7 @@ class WindowAttention(nn.Module):
         return Linear(c, name="projection")(mixed.reshape(n, t, c))
 
     def _position_bias(self, tokens: int) -> Float[Array, "heads t t"]:
-        """Looks the table up by a product with one-hot rows: its gradient is a product too, not a slow scatter."""
+        """Looks up the table by a product with one-hot rows, whose gradient is a product instead of a slow scatter."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
         table = weight(self, "position_bias", nn.initializers.normal(0.02), (rows, self.heads))

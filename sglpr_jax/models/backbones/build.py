@@ -1,4 +1,4 @@
-"""Which layers a backbone's configuration stands for; it does not say so itself, for it is read without JAX."""
+"""Maps the configuration of a backbone to its layers. Configurations do not import layers, which require JAX."""
 
 from sglpr_jax.models.backbones.interface import Backbone
 from sglpr_jax.models.backbones.rings import RingBackbone
@@ -11,7 +11,7 @@ from sglpr_jax.models.config import BackboneConfig
 
 
 def build(config: BackboneConfig, *, circular: bool) -> Backbone:
-    """The layers; in a `circular` image the first column is the last one's neighbour."""
+    """Return the layers of a backbone. With `circular=True` the first and last columns of the image are neighbours."""
     match config:
         case SwinConfig():
             return SwinBackbone(config, circular)

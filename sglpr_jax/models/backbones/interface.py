@@ -1,8 +1,11 @@
-"""What a backbone is: a configuration, and two calls, from an image to features and back to pixels.
+"""Interface of a backbone: a configuration, and two calls, from images to features and back to pixels.
 
-A backbone is two files of this folder: NAME_config.py has a frozen configuration with what `BackboneConfig` lists, and
-imports no JAX, so that a command line can name its fields at once; NAME.py a class with the two calls of `Backbone`.
-`models/config.py` names the configuration in its union, `build.py` the class, and nothing else has to know of them.
+A backbone consists of two files in this folder. NAME_config.py has a frozen configuration with the properties of
+`BackboneConfig`. It imports no JAX, so a command line can list its fields quickly. NAME.py has a class with the two
+calls of `Backbone`.
+
+To add a backbone, add its configuration to the union in `models/config.py` and its class to `build.py`. No other code
+depends on it.
 """
 
 from collections.abc import Mapping
@@ -12,41 +15,41 @@ from jaxtyping import Array, Float
 
 
 class Seen(NamedTuple):
-    """What a backbone makes of images."""
+    """Output of a backbone for a batch of images."""
 
     features: Float[Array, "b p q c"]
-    """What the place head reads, and what the decoder begins with."""
+    """Input of the place head and of the decoder."""
     finer: list[Array]
-    """The maps on the way that the decoder looks at again, finest first."""
+    """Intermediate maps that the decoder uses again, finest first."""
     named: dict[str, Array]
-    """Every map by name, for pictures and tests."""
+    """All maps by name, for pictures and tests."""
 
 
 @runtime_checkable
 class Backbone(Protocol):
-    """The layers. They belong to the Flax module in whose `__call__` they are called, and are named there."""
+    """Layers of a backbone. They belong to the Flax module that calls them, and get their names there."""
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """The features of images; `train` switches stochastic depth on."""
+        """Computes the features of images. `train` enables stochastic depth."""
         ...
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """The pixels that the segmentation head reads, and a place head with the tap `pixels`. Call it once."""
+        """Computes pixels for the segmentation head and for a place head with the tap `pixels`. Call it only once."""
         ...
 
 
 @runtime_checkable
 class BackboneConfig(Protocol):
-    """A backbone as plain values. All sizes are in pixels of the image that the backbone sees: rows, columns."""
+    """Configuration of a backbone. All sizes are (rows, columns) in pixels of the image that the backbone sees."""
 
     @property
     def kind(self) -> str:
-        """Its name, by which config.json tells one backbone from another."""
+        """Name that identifies the backbone in config.json."""
         ...
 
     @property
     def token(self) -> tuple[int, int]:
-        """How large a patch of the image one of the features stands for."""
+        """Size of the image patch that one feature represents."""
         ...
 
     @property
@@ -61,10 +64,10 @@ class BackboneConfig(Protocol):
 
     @property
     def needs_polar(self) -> bool:
-        """Whether it works on a polar image only."""
+        """Whether the backbone requires a polar image."""
         ...
 
     @property
     def pictures(self) -> Mapping[str, str]:
-        """Of which maps heat maps are drawn: what a picture is called, and the map's name in `Seen.named`."""
+        """Maps to draw as heat maps: from the title of each picture to the name of its map in `Seen.named`."""
         ...

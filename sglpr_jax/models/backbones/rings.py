@@ -1,8 +1,8 @@
-"""A backbone of convolutions on the polar image that go around: a rotation of the scan shifts its features, no more.
+"""Backbone of circular convolutions on the polar image: a rotation of the scan only shifts its features.
 
-Along the radius the image may shrink by strides, for a rotation moves nothing in that direction; along the sectors it
-shrinks by means, which leave no sector out. So a rotation by a whole number of the last map's sectors is a shift of
-that map, exact up to the resampling of the image.
+Along the radius, strides reduce the image, because a rotation moves nothing in this direction. Along the sectors,
+average pooling reduces it, because pooling skips no sector. A rotation by a whole number of the last map's sectors is
+therefore a shift of that map. It is exact up to the resampling of the image.
 """
 
 import dataclasses
@@ -21,47 +21,47 @@ from sglpr_jax.models.layers import LayerNorm, Linear
 
 @dataclasses.dataclass(frozen=True)
 class RingBackbone:
-    """The ring net and its decoder: layers `rings` and `decoder`."""
+    """Ring net and its decoder: layers `rings` and `decoder`."""
 
     config: RingConfig
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """The last map is the features; there is no stochastic depth."""
+        """Computes the features: the last map. There is no stochastic depth."""
         maps = RingNet(self.config, name="rings")(image)
         return Seen(maps[-1], maps[:-1], {f"ring_block{i}": seen for i, seen in enumerate(maps[1:])})
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """A pixel for each pixel of the averaged image."""
+        """Computes a pixel for each pixel of the averaged image."""
         return RingDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
 
 
 class RingBlock(nn.Module):
-    """Convolution around the sectors, layer norm, ReLU; added to its input where both have the same shape."""
+    """Circular convolution, layer norm, ReLU. If input and output have the same shape, the input is added."""
 
     features: int
     stride: int = 1
-    """Along the radius."""
+    """Stride along the radius."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b r s c"]) -> Float[Array, "b _ s {self.features}"]:
-        """A map of the same sectors."""
+        """Computes a map with the same number of sectors."""
         convolution = Convolution(self.features, strides=(self.stride, 1), circular=True, name="convolution")
         y = nn.relu(LayerNorm(name="norm")(convolution(x)))
         return x + y if x.shape == y.shape else y
 
 
 class RingNet(nn.Module):
-    """From the polar image to the features of the place head, and to every map on the way.
+    """Network from the polar image to the features of the place head and all intermediate maps.
 
-    Means lose what is smaller than their squares. So fine blocks go beside the others at the full number of sectors,
-    and their maps are averaged to the size of those that they join.
+    Average pooling loses details that are smaller than its blocks. Therefore, fine blocks run beside the others at the
+    full number of sectors. Their maps are averaged to the size of the maps that they join.
     """
 
     config: RingConfig
 
     @nn.compact
     def __call__(self, polar: Float[Array, "b p q c"]) -> list[Float[Array, "b _ _ _"]]:
-        """The averaged image and the map of each block, with what joins it; the last one is the features."""
+        """Returns the averaged image and the map of each block, with the fine maps. The last map is the features."""
         config, fine = self.config, polar
         maps = [block_means(polar, config.average, config.average)]
         for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
@@ -74,14 +74,14 @@ class RingNet(nn.Module):
 
 
 class RingDecoder(nn.Module):
-    """From the features back to the resolution of the averaged image, looking at every finer map on the way."""
+    """Decoder from the features to the resolution of the averaged image. It uses every finer map again."""
 
     widths: tuple[int, ...]
-    """Of the blocks that made the maps."""
+    """Channels of the blocks that made the maps."""
 
     @nn.compact
     def __call__(self, maps: list[Array]) -> Float[Array, "b p q _"]:
-        """As many channels as the first block has."""
+        """Returns pixels with the channels of the first block."""
         finer = [i for i, (fine, coarse) in enumerate(itertools.pairwise(maps)) if fine.shape[:3] != coarse.shape[:3]]
         x = maps[-1]
         for i, of_map in enumerate(reversed(finer)):
@@ -93,7 +93,7 @@ class RingDecoder(nn.Module):
 
 
 def block_means(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
-    """The means of blocks of so many radii and sectors, one direction after the other: no array has six axes."""
+    """Average blocks of `radii` x `sectors` pixels, one direction after the other, so that no array has six axes."""
     b, r, s, c = x.shape
     rows = _means_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
     blocks = _means_of_parts(rows.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
@@ -101,7 +101,7 @@ def block_means(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[A
 
 
 def _means_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _"]:
-    """The mean of so many equal parts of each row: a sum, for XLA's CPU backend is slow at reducing a few numbers."""
+    """Averages equal parts of each row. It adds them, because XLA's CPU backend reduces a few numbers slowly."""
     if parts == 1:
         return x
     return functools.reduce(jnp.add, jnp.split(x, parts, axis=-1)) * (1 / parts)

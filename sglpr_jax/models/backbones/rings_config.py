@@ -1,4 +1,4 @@
-"""The ring net as plain values."""
+"""Configuration of the ring net."""
 
 import dataclasses
 import math
@@ -9,19 +9,21 @@ from sglpr_jax.fields import Size, Sizes, check_fields
 
 @dataclasses.dataclass(frozen=True)
 class RingConfig:
-    """Convolutions that go around the polar image, a block of them for each width."""
+    """Circular convolutions on the polar image, with one block for each width."""
 
     kind: Literal["rings"] = "rings"
     average: Size = 2
-    """Edge of the squares of polar pixels whose means the first block sees: without, the resampling skips cells."""
+    """Edge of the squares of polar pixels that are averaged before the first block. Without averaging, the resampling
+    skips cells."""
     fine: Sizes = ()
-    """Channels of more blocks, which see the polar pixels themselves: the i-th joins what the i-th of `widths` sees."""
+    """Channels of additional blocks at the full number of sectors. The output of the i-th joins the input of the i-th
+    block of `widths`."""
     widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
     """Channels of each block."""
     strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
-    """Of each block, along the radius."""
+    """Stride of each block along the radius."""
     means: Sizes = (1, 1, 2, 1, 2, 1, 1)
-    """How many neighbouring sectors become one after each block."""
+    """Number of neighbouring sectors that are averaged into one after each block."""
 
     def __post_init__(self):
         check_fields(self)
@@ -29,17 +31,17 @@ class RingConfig:
             raise ValueError("widths: expected at least one block, found ()")
         if not len(self.widths) == len(self.strides) == len(self.means):
             raise ValueError(
-                "expected as many strides and means as widths of the ring net, found "
+                "expected equal numbers of widths, strides and means of the ring net, found "
                 f"widths {self.widths}, strides {self.strides}, means {self.means}"
             )
         if len(self.fine) > len(self.widths):
             raise ValueError(
-                f"fine: expected no more than the widths of the ring net, {self.widths}, found {self.fine}"
+                f"fine: expected at most one value for each width of the ring net, {self.widths}, found {self.fine}"
             )
 
     @property
     def token(self) -> tuple[int, int]:
-        """Rows and columns of the polar image that one pixel of the last map stands for."""
+        """Rows and columns of the polar image that one pixel of the last map represents."""
         return self.average * math.prod(self.strides), self.average * math.prod(self.means)
 
     @property
@@ -49,16 +51,16 @@ class RingConfig:
 
     @property
     def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this: one pixel of the last map."""
+        """The image's rows and columns must be a multiple of this, the size of one pixel of the last map."""
         return self.token
 
     @property
     def needs_polar(self) -> bool:
-        """Its convolutions go around."""
+        """Always True: the convolutions are circular."""
         return True
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Which maps are drawn: of the first, the middle and the last block."""
+        """Maps to draw as heat maps: those of the first, the middle and the last block."""
         last = len(self.widths) - 1
         return {f"block {i + 1}": f"ring_block{i}" for i in sorted({0, last // 2, last})}

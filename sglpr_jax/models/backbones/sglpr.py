@@ -1,8 +1,8 @@
-"""The paper's Swin-Unet on tokens that a rotation of the scan shifts: its patches are seen by circular convolutions.
+"""The paper's Swin-Unet on tokens of circular convolutions, which a rotation of the scan only shifts.
 
-A patch of eight sectors feels a rotation by less than its size, a convolution does not; so the stem shrinks the polar
-image as the ring net does, and the windows work on what is left. A rotation by a whole number of windows of the
-coarsest map is a shift of the tokens; other rotations are learnt.
+A patch of eight sectors changes under rotations smaller than its size; a convolution follows them. Therefore the stem
+reduces the polar image like the ring net, and the attention windows use the resulting tokens. A rotation by a whole
+number of windows of the coarsest map is a shift of the tokens. Other rotations must be learnt.
 """
 
 import dataclasses
@@ -18,27 +18,27 @@ from sglpr_jax.models.backbones.swin_unet import SwinUnet
 
 @dataclasses.dataclass(frozen=True)
 class SglprBackbone:
-    """The Swin-Unet with its stem, and the way back past the stem's maps: layers `backbone` and `decoder`."""
+    """Swin-Unet with a stem, and a decoder that uses the stem's maps: layers `backbone` and `decoder`."""
 
     config: SglprConfig
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """The tokens, and the maps of the stem but its last, whose place they take."""
+        """Computes the tokens and the maps of the stem. The tokens replace the last map."""
         return RingSwin(self.config, name="backbone")(image, train=train)
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """A pixel for each pixel of the averaged image."""
+        """Computes a pixel for each pixel of the averaged image."""
         return RingDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
 
 
 class RingSwin(nn.Module):
-    """From the polar image to a token for each pixel of the stem's last map."""
+    """Network from the polar image to a token for each pixel of the stem's last map."""
 
     config: SglprConfig
 
     @nn.compact
     def __call__(self, polar: Float[Array, "b p q c"], *, train: bool = False) -> Seen:
-        """Tokens as features; maps are named as those of the ring net and of the Swin-Unet are."""
+        """Returns the tokens as features. The maps are named as in the ring net and the Swin-Unet."""
         config = self.config
         maps = RingNet(config.stem, name="stem")(polar)
         tokens, named = SwinUnet(

@@ -1,4 +1,4 @@
-"""The Swin-Unet on the tokens of the ring net, as plain values."""
+"""Configuration of the Swin-Unet on the tokens of the ring net."""
 
 import dataclasses
 from typing import Literal
@@ -10,22 +10,23 @@ from sglpr_jax.models.backbones.swin_config import check_stages
 
 @dataclasses.dataclass(frozen=True)
 class SglprConfig:
-    """A Swin-Unet whose tokens come from convolutions that go around the polar image."""
+    """Swin-Unet whose tokens come from circular convolutions on the polar image."""
 
     kind: Literal["sglpr"] = "sglpr"
     stem: RingConfig = RingConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
-    """Its last map has a pixel for each token."""
+    """Ring net that makes the tokens. Its last map has one pixel for each token."""
     embed_dim: Size = 64
     depths: Depths = (2, 2)
-    """Blocks of each stage."""
+    """Number of blocks of each stage."""
     heads: Sizes = (2, 4)
-    """Attention heads of each stage."""
+    """Number of attention heads of each stage."""
     window: Size = 4
     """Edge of an attention window, in tokens."""
     mlp_ratio: Size = 2
-    """Of the hidden layer of a block's MLP to its channels; 4 in the paper."""
+    """Hidden units of a block's MLP per channel; 4 in the paper."""
     drop_path: Share = 0.0
-    """Stochastic depth: the share of samples for which training leaves the last block out; 0 for the first block."""
+    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
+    block."""
 
     def __post_init__(self):
         check_fields(self)
@@ -33,7 +34,7 @@ class SglprConfig:
 
     @property
     def token(self) -> tuple[int, int]:
-        """Rows and columns of the polar image that one token stands for."""
+        """Rows and columns of the polar image that one token represents."""
         return self.stem.token
 
     @property
@@ -43,19 +44,19 @@ class SglprConfig:
 
     @property
     def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this: one token of the coarsest stage."""
+        """The image's rows and columns must be a multiple of this, the size of one token of the coarsest stage."""
         rows, columns = self.token
         coarsest = 2 ** (len(self.depths) - 1)
         return rows * coarsest, columns * coarsest
 
     @property
     def needs_polar(self) -> bool:
-        """Its convolutions and windows go around."""
+        """Always True: the convolutions and windows wrap around."""
         return True
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Which maps are drawn: of the stem, the first and last stage of the encoder, and the decoder."""
+        """Maps to draw as heat maps: the stem, the first and last stage of the encoder, and the decoder."""
         stem, last = len(self.stem.widths) - 1, len(self.depths) - 1
         return {
             "stem": f"ring_block{stem}",

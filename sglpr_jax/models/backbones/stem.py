@@ -1,7 +1,7 @@
-"""Convolutions in front of the Swin-Unet, and the way back from its tokens past them to pixels.
+"""Convolutions in front of the Swin-Unet, and a decoder from its tokens to pixels that uses their maps.
 
-A linear patch embedding must guess the shape of a car's side from one layer; convolutions see it step by step. What
-they see on the way is lost in the tokens, so that the segmentation head looks at it again.
+A linear patch embedding must recognise the side of a car in one layer; convolutions recognise it step by step. The
+tokens lose the detail of the intermediate maps, so the segmentation head uses these maps again.
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from sglpr_jax.models.layers import LayerNorm
 
 
 class Stem(nn.Module):
-    """Two 3 x 3 convolutions at each resolution, the first of `widths` channels at the image's own."""
+    """3 x 3 convolutions with `widths` channels: one at the resolution of the image, two at each coarser resolution."""
 
     widths: tuple[int, ...]
     circular: bool = False
 
     @nn.compact
     def __call__(self, image: Float[Array, "b h w c"]) -> list[Float[Array, "b _ _ _"]]:
-        """The map of each resolution, finest first."""
+        """Returns the map of each resolution, finest first."""
         x, maps = image, []
         for level, width in enumerate(self.widths):
             stride = 2 if level else 1
@@ -37,14 +37,14 @@ class Stem(nn.Module):
 
 
 class StemDecoder(nn.Module):
-    """From tokens to pixels, past the stem's maps: double the resolution, look at the map there, convolve."""
+    """Decoder from tokens to pixels: at each level it expands the map, joins the stem's map and convolves."""
 
     patch: int
     circular: bool = False
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "b h w c"], maps: Sequence[Array]) -> Float[Array, "b _ _ _"]:
-        """`patch` is the edge of a token in pixels of the coarsest map. As many channels as the finest map has."""
+        """Returns pixels with the finest map's channels. `patch` is a token's edge in pixels of the coarsest map."""
         x, factor = tokens, self.patch
         for level in reversed(range(len(maps))):
             width = maps[level].shape[-1]

@@ -1,4 +1,4 @@
-"""The paper's backbone: a Swin-Unet (section 4.1.1), if asked for with convolutions in front."""
+"""The paper's backbone: a Swin-Unet (section 4.1.1), optionally with convolutions in front."""
 
 import dataclasses
 
@@ -13,13 +13,13 @@ from sglpr_jax.models.backbones.swin_unet import SwinUnet
 
 @dataclasses.dataclass(frozen=True)
 class SwinBackbone:
-    """The Swin-Unet, with or without a stem; layers `stem`, `backbone`, and `expand` or `decoder`."""
+    """Swin-Unet with or without a stem: layers `stem`, `backbone`, and `expand` or `decoder`."""
 
     config: SwinConfig
     circular: bool
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
-        """The tokens, and the maps of the stem."""
+        """Computes the tokens and the maps of the stem."""
         config = self.config
         finer = Stem(config.stem, self.circular, name="stem")(image) if config.stem else []
         swin_unet = SwinUnet(
@@ -36,7 +36,7 @@ class SwinBackbone:
         return Seen(tokens, finer, named)
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
-        """A pixel for each pixel of the image: by a linear layer, or past the maps of the stem."""
+        """Computes a pixel for each pixel of the image, by a linear layer or, with a stem, by its decoder."""
         if self.config.stem:
             return StemDecoder(self.config.stem_patch, self.circular, name="decoder")(seen.features, seen.finer)
         return FinalPatchExpand(self.config.patch, name="expand")(seen.features)

@@ -1,4 +1,4 @@
-"""The paper's Swin-Unet as plain values."""
+"""Configuration of the paper's Swin-Unet."""
 
 import dataclasses
 from typing import Literal
@@ -8,36 +8,37 @@ from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
 
 @dataclasses.dataclass(frozen=True)
 class SwinConfig:
-    """A Swin-Unet. The default is the paper's; stage i has `embed_dim` * 2**i channels."""
+    """Swin-Unet with the paper's values as defaults. Stage i has `embed_dim` * 2**i channels."""
 
     kind: Literal["swin"] = "swin"
     patch: Size = 4
     """Edge of a token's patch, in pixels of the image."""
     stem: Sizes = ()
-    """Widths of convolutions before the patch embedding, the second and later ones at half the resolution of the one
-    before; the segmentation head sees each of them again. (): none, as in the paper."""
+    """Channels of convolutions before the patch embedding. Each entry after the first halves the resolution. The
+    segmentation head uses each map again. (): no convolutions, as in the paper."""
     embed_dim: Size = 96
     depths: Depths = (2, 2, 2, 2)
-    """Blocks of each stage."""
+    """Number of blocks of each stage."""
     heads: Sizes = (3, 6, 12, 24)
-    """Attention heads of each stage."""
+    """Number of attention heads of each stage."""
     window: Size = 7
     """Edge of an attention window, in tokens."""
     drop_path: Share = 0.2
-    """Stochastic depth: the share of samples for which training leaves the last block out; 0 for the first block."""
+    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
+    block."""
 
     def __post_init__(self):
         check_fields(self)
         check_stages(self.embed_dim, self.depths, self.heads)
         if self.patch % self._stem_pixel:
             raise ValueError(
-                f"expected a patch made of the stem's pixels of {self._stem_pixel} cells ({len(self.stem)} widths), "
-                f"found patch {self.patch}"
+                f"patch: expected a multiple of {self._stem_pixel}, the pixel of a stem with {len(self.stem)} widths, "
+                f"found {self.patch}"
             )
 
     @property
     def token(self) -> tuple[int, int]:
-        """Rows and columns of the image that one token stands for."""
+        """Rows and columns of the image that one token represents."""
         return self.patch, self.patch
 
     @property
@@ -47,23 +48,23 @@ class SwinConfig:
 
     @property
     def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this: one token of the coarsest stage."""
+        """The image's rows and columns must be a multiple of this, the size of one token of the coarsest stage."""
         return (self.patch * 2 ** (len(self.depths) - 1),) * 2
 
     @property
     def needs_polar(self) -> bool:
-        """Windows fit any image."""
+        """Always False: windows fit any image."""
         return False
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Which maps are drawn; a normalised one would be as strong everywhere."""
+        """Maps to draw as heat maps. Normalised maps are left out, because they have the same strength everywhere."""
         last = len(self.depths) - 1
         return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
 
     @property
     def stem_patch(self) -> int:
-        """Edge of a token's patch in pixels of the map that it is cut from: the image, or the stem's last map."""
+        """Edge of a token's patch, in pixels of its source map: the image, or the stem's last map."""
         return self.patch // self._stem_pixel
 
     @property
@@ -72,13 +73,13 @@ class SwinConfig:
 
 
 def check_stages(embed_dim: int, depths: tuple[int, ...], heads: tuple[int, ...]) -> None:
-    """Raise ValueError unless there are as many numbers of heads as of blocks, and heads that share a stage's channels.
+    """Raises ValueError unless each stage has blocks and a number of heads that divides its channels.
 
     Stage i has `embed_dim` * 2**i channels.
     """
     if not depths or len(depths) != len(heads):
         raise ValueError(
-            f"expected a stage at least, and a number of heads for each, found depths {depths}, heads {heads}"
+            f"expected at least one stage, and a number of heads for each, found depths {depths}, heads {heads}"
         )
     for i, number in enumerate(heads):
         if embed_dim * 2**i % number:

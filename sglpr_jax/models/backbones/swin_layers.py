@@ -1,4 +1,4 @@
-"""The layers of a Swin transformer: patch embedding, blocks of window attention, merging and expanding of patches."""
+"""Layers of a Swin transformer: patch embedding, blocks of window attention, patch merging and patch expansion."""
 
 import math
 
@@ -11,21 +11,21 @@ from sglpr_jax.models.backbones.attention import WindowAttention, join_windows, 
 from sglpr_jax.models.layers import LayerNorm, Linear, gelu, torch_uniform
 
 MLP_RATIO = 4
-"""Of the hidden layer of a block's MLP to its channels, in the paper."""
+"""Hidden units of a block's MLP per channel, in the paper."""
 
 
 class PatchEmbed(nn.Module):
-    """One token for each patch of the image: a convolution whose stride is its kernel, then layer norm."""
+    """One token for each patch of the image: a convolution with stride equal to its kernel, then layer norm."""
 
     channels: int
     patch: tuple[int, int] = (4, 4)
-    """Its rows and columns."""
+    """Rows and columns of a patch."""
 
     @nn.compact
     def __call__(
         self, image: Float[Array, "b h w c"]
     ) -> Float[Array, "b h//{self.patch[0]} w//{self.patch[1]} {self.channels}"]:
-        """`c` input channels to `channels`; height and width shrink by the patch's."""
+        """Maps `c` input channels to `channels` and divides height and width by those of the patch."""
         bound = (math.prod(self.patch) * image.shape[-1]) ** -0.5
 
         def bias_init(key, shape, dtype):
@@ -46,16 +46,16 @@ class PatchEmbed(nn.Module):
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: in training drops a whole branch per sample and scales kept ones by 1 / (1 - rate).
+    """Stochastic depth: training drops a whole branch per sample and scales kept branches by 1 / (1 - rate).
 
-    Draws from the random stream `drop_path`.
+    It draws from the random stream `drop_path`.
     """
 
     rate: float
 
     @nn.compact
     def __call__(self, branch: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w c"]:
-        """Off when `train` is False or the rate is 0."""
+        """Returns the branch unchanged if `train` is False or the rate is 0."""
         if not train or self.rate == 0:
             return branch
         keep = 1 - self.rate
@@ -64,11 +64,11 @@ class DropPath(nn.Module):
 
 
 class SwinBlock(nn.Module):
-    """x + attention(norm(x)), then x + mlp(norm(x)); attention inside windows, shifted by half a window if asked.
+    """x + attention(norm(x)), then x + mlp(norm(x)). With `shifted`, the windows are shifted by half a window.
 
-    An image no larger than the window is one window of its own size, and is not shifted. In a `circular` image the last
-    column is the first one's neighbour. `shift_each_way`: an image that a window spans in one direction only is still
-    shifted in the other; Swin leaves it where it is.
+    An image no larger than the window is one window of its own size and is not shifted. With `circular`, the first and
+    last columns of the image are neighbours. With `shift_each_way`, an image that a window spans in one direction only
+    is still shifted in the other direction. Swin does not shift it.
     """
 
     heads: int
@@ -81,7 +81,11 @@ class SwinBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> Float[Array, "b h w c"]:
-        """Keeps the shape; `train` switches stochastic depth on. Raises ValueError where windows do not fit."""
+        """Returns a map of the same shape. `train` enables stochastic depth.
+
+        Raises:
+          ValueError: If windows do not tile the map.
+        """
         attended = self._attend(LayerNorm(name="attention_norm")(x))
         x = x + DropPath(self.drop_path)(attended, train=train)
         hidden = gelu(Linear(self.mlp_ratio * x.shape[-1], name="mlp_in")(LayerNorm(name="mlp_norm")(x)))
@@ -101,14 +105,14 @@ class SwinBlock(nn.Module):
         return jnp.roll(join_windows(mixed, h, w), (down, right), (1, 2))
 
     def _shift(self, h: int, w: int, window: int) -> tuple[int, int]:
-        """By how many rows and columns the image is rolled."""
+        """Numbers of rows and columns by which the image is rolled."""
         if not self.shifted or (min(h, w) <= self.window and not self.shift_each_way):
             return 0, 0
         return (window // 2 if h > window else 0), (window // 2 if w > window else 0)
 
 
 class SwinStage(nn.Module):
-    """Blocks at one resolution, every second one shifted; `drop_paths` has a rate for each block."""
+    """Blocks at one resolution, every second one shifted. `drop_paths` has a rate for each block."""
 
     heads: int
     window: int
@@ -119,7 +123,7 @@ class SwinStage(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], *, train: bool = False) -> list[Float[Array, "b h w c"]]:
-        """The output of every block, the stage's own output last."""
+        """Returns the outputs of all blocks. The last one is the output of the stage."""
         outputs = []
         for i, rate in enumerate(self.drop_paths):
             block = SwinBlock(
@@ -154,25 +158,25 @@ class PatchExpand(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c//2"]:
-        """Each token becomes 2 x 2 tokens."""
+        """Expands each token to 2 x 2 tokens."""
         return _expand(x, factor=2, channels=x.shape[-1] // 2)
 
 
 class FinalPatchExpand(nn.Module):
-    """From patches back to pixels."""
+    """Expansion of patches to pixels."""
 
     patch: int = 4
     channels: int | None = None
-    """None: as many as before."""
+    """Output channels. None: the channels of the input."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b {self.patch}*h {self.patch}*w _"]:
-        """Each token becomes patch x patch pixels."""
+        """Expands each token to patch x patch pixels."""
         return _expand(x, factor=self.patch, channels=self.channels or x.shape[-1])
 
 
 def _expand(x: Float[Array, "b h w c"], *, factor: int, channels: int) -> Float[Array, "b _ _ _"]:
-    """Linear layer, its outputs read as (row offset, column offset, channel), then norm: layers of the caller."""
+    """Linear layer with outputs in the order (row offset, column offset, channel), then norm: layers of the caller."""
     b, h, w, _ = x.shape
     tokens = Linear(factor**2 * channels, use_bias=False, name="expand")(x)
     strips = tokens.reshape(b * h, w, factor, factor * channels).transpose(0, 2, 1, 3)

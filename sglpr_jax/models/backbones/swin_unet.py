@@ -10,17 +10,17 @@ from sglpr_jax.models.layers import LayerNorm, Linear
 
 
 def drop_path_rates(depths: tuple[int, ...], rate: float) -> list[tuple[float, ...]]:
-    """Rates of stochastic depth for each encoder stage: from 0 in the first block to `rate` in the last."""
+    """Return the rates of stochastic depth for each encoder stage, from 0 in the first block to `rate` in the last."""
     rates = np.linspace(0, rate, sum(depths))
     ends = np.cumsum(depths)
     return [tuple(rates[end - depth : end].tolist()) for depth, end in zip(depths, ends, strict=True)]
 
 
 class SwinUnet(nn.Module):
-    """Image to one token per patch, before the last expansion to pixels.
+    """Network from the image to one token per patch, before the last expansion to pixels.
 
-    Stage i has embed_dim * 2**i channels. The decoder mirrors the encoder, its depths, heads and drop path included. A
-    `circular` image's left and right borders are neighbours, as those of a polar image are.
+    Stage i has embed_dim * 2**i channels. The decoder mirrors the encoder, including its depths, heads and drop path.
+    With `circular`, the left and right borders of the image are neighbours, as in a polar image.
     """
 
     embed_dim: int
@@ -38,7 +38,7 @@ class SwinUnet(nn.Module):
     def __call__(
         self, image: Float[Array, "b h w c"], *, train: bool = False
     ) -> tuple[Float[Array, "b h//{self.patch} w//{self.patch} {self.embed_dim}"], dict[str, Float[Array, "b _ _ _"]]]:
-        """Tokens, and the intermediates by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
+        """Returns the tokens, and the intermediate maps by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
         stages = [
             {
                 "heads": heads,
@@ -68,7 +68,7 @@ class SwinUnet(nn.Module):
         return x
 
     def _decode(self, x, stages: list[dict], seen: dict, train: bool):
-        """Decoder stage i works at the resolution of encoder stage `level`; stage 0 only expands the bottleneck."""
+        """Decoder stage i has the resolution of encoder stage `level`. Stage 0 only expands the bottleneck."""
         for i, level in enumerate(reversed(range(len(stages)))):
             if i > 0:
                 x = jnp.concatenate([x, seen[f"skip{level}"]], axis=-1)

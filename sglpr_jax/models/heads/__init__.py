@@ -1,1 +1,1 @@
-"""From feature maps to a descriptor, or to classes."""
+"""Heads: networks from feature maps to a descriptor or to classes."""

@@ -1,4 +1,4 @@
-"""CBAM: re-weights a feature map by channel, then by place (Woo et al. 2018)."""
+"""CBAM: weights a feature map by channel, then by position (Woo et al. 2018)."""
 
 import functools
 
@@ -15,10 +15,10 @@ ROUNDING = 1e-6
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def largest(x: Float[Array, "*dims"], axes: tuple[int, ...]) -> Float[Array, "*rest"]:
-    """The maximum over some axes, whose gradient all entries within rounding of it share.
+    """Maximum over some axes. All entries within rounding of the maximum share its gradient.
 
-    The gradient of `jnp.max` goes to the entries equal to the maximum. XLA may compute `x` once more for it and round
-    differently; then none is equal, and the gradient is 0 / 0.
+    The gradient of `jnp.max` goes to the entries equal to the maximum. XLA may compute `x` again for the gradient and
+    round it differently. Then no entry is equal, and the gradient is 0 / 0.
     """
     return x.max(axes)
 
@@ -38,7 +38,7 @@ class ChannelGate(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-        """The MLP's hidden layer has max(1, c // reduction) units."""
+        """The hidden layer of the MLP has max(1, c // reduction) units."""
         c = x.shape[-1]
         pooled = jnp.stack([x.mean((1, 2)), largest(x, (1, 2))], axis=1)
         hidden = nn.relu(Linear(max(1, c // self.reduction), name="mlp_in")(pooled))
@@ -49,28 +49,28 @@ class ChannelGate(nn.Module):
 class SpatialGate(nn.Module):
     """x * sigmoid(convolution of [maximum, mean] over channels), 7 x 7.
 
-    The convolution has a bias in place of the original's batch norm, which folds into it. In a `circular` map it goes
-    around the columns.
+    The convolution has a bias instead of the original's batch norm, which can be folded into it. With `circular=True`
+    the columns wrap around.
     """
 
     circular: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-        """One weight per pixel."""
+        """Applies one weight per pixel."""
         pooled = jnp.stack([largest(x, (-1,)), x.mean(-1)], axis=-1)
         convolution = Convolution(1, 7, circular=self.circular, kernel_init=torch_uniform, name="convolution")
         return x * nn.sigmoid(convolution(pooled))
 
 
 class CBAM(nn.Module):
-    """The channel gate, then the spatial gate."""
+    """Channel gate, then spatial gate."""
 
     reduction: int = 16
     circular: bool = False
-    """The left and right borders of the map are neighbours."""
+    """Whether the left and right borders of the map are neighbours."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
-        """The map re-weighted; there is no residual connection."""
+        """Returns the weighted map. There is no residual connection."""
         return SpatialGate(self.circular, name="spatial")(ChannelGate(self.reduction, name="channel")(x))

@@ -1,4 +1,4 @@
-"""The image itself beside the features, for the segmentation head alone."""
+"""Adds the image to the features of the segmentation head."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -9,20 +9,20 @@ from sglpr_jax.models.layers import Linear, gelu
 
 _INIT = nn.initializers.lecun_normal()
 _LOCAL = ((5, 16), (3, 16))
-"""Cells and channels of the convolutions: together they see what lies within three cells."""
+"""Kernel size in cells, and channels, of the convolutions. Together they reach three cells in each direction."""
 
 
 class Detail(nn.Module):
-    """Mix the features of every cell with what the image shows around it.
+    """Mixes the features of every cell with the image around it.
 
-    A patch's token cannot say which of its many cells held how many points; here the head is told.
+    A patch's token cannot tell which of its many cells held how many points. This layer restores these counts.
     """
 
     width: int
 
     @nn.compact
     def __call__(self, features: Float[Array, "b h w c"], image: Float[Array, "b h w i"]) -> Float[Array, "b h w d"]:
-        """The mixed features, `width` numbers for each cell."""
+        """Returns the mixed features, with `width` numbers for each cell."""
         image = image.astype(features.dtype)
         for i, (cells, channels) in enumerate(_LOCAL):
             image = nn.relu(Convolution(channels, cells, kernel_init=_INIT, name=f"local{i}")(image))

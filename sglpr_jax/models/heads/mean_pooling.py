@@ -1,4 +1,4 @@
-"""Global average pooling: what stands in for NetVLAD where it is left out (table 4)."""
+"""Global average pooling, which replaces NetVLAD in an ablation (table 4)."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -8,12 +8,12 @@ from sglpr_jax.models.layers import Linear
 
 
 class MeanPooling(nn.Module):
-    """The mean of a set of local features, then a linear layer."""
+    """Mean of a set of local features, then a linear layer."""
 
     output: int
 
     @nn.compact
     def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
-        """The vector before its L2 normalisation."""
+        """Returns the vector before its L2 normalisation."""
         weights_init = nn.initializers.normal(features.shape[-1] ** -0.5)
         return Linear(self.output, kernel_init=weights_init, name="linear")(features.astype(jnp.float32).mean(1))

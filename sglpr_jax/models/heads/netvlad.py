@@ -8,13 +8,15 @@ from sglpr_jax.models.layers import Linear, l2_normalize, weight
 
 
 class NetVLAD(nn.Module):
-    """Soft assignment of features to clusters, residuals summed per cluster, then a linear layer and context gating.
+    """Soft assignment of features to clusters, sums of residuals per cluster, a linear layer and context gating.
 
         a[n, k] = softmax over k of (x W + bias)
+
         vlad[d, k] = sum over n of a[n, k] * (x[n, d] - centre[d, k]), L2-normalised over d, then as a whole
+
         y = vlad * hidden + bias;  output = y * sigmoid(y G + bias)
 
-    Biases stand where PointNetVLAD has batch norm, so that an output never depends on the rest of its batch.
+    Biases replace PointNetVLAD's batch norm, so that an output does not depend on the rest of its batch.
     """
 
     clusters: int
@@ -23,7 +25,10 @@ class NetVLAD(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b n d"]) -> Float[Array, "b {self.output}"]:
-        """The vector before its final L2 normalisation; float32, as all that follows the sums over the features is."""
+        """Returns the vector before its final L2 normalisation.
+
+        The sums over the features and all later steps are float32.
+        """
         d = features.shape[-1]
         weights_init = nn.initializers.normal(d**-0.5)
         logits = Linear(self.clusters, kernel_init=weights_init, name="assignment")(features)

@@ -1,4 +1,4 @@
-"""The place head: from the backbone's feature map to a descriptor (section 4.1.2)."""
+"""Place head: from the backbone's feature map to a descriptor (section 4.1.2)."""
 
 import flax.linen as nn
 from jaxtyping import Array, Float
@@ -15,17 +15,17 @@ from sglpr_jax.models.layers import LayerNorm, l2_normalize
 
 
 class PlaceHead(nn.Module):
-    """CBAM, convolutions that shrink the map and widen its channels, NetVLAD, L2 normalisation (table 4: or less)."""
+    """CBAM, convolutions that reduce the map and add channels, NetVLAD, L2 normalisation. Table 4 leaves out parts."""
 
     config: HeadConfig
     circular: bool = False
-    """The left and right borders of the map are neighbours."""
+    """Whether the left and right borders of the map are neighbours."""
 
     @nn.compact
     def __call__(
         self, features: Float[Array, "b h w c"]
     ) -> tuple[Float[Array, "b {self.config.descriptor_size}"], dict[str, Float[Array, "b _ _ _"]]]:
-        """Descriptors of length 1, and the maps on the way by name."""
+        """Returns descriptors of length 1, and the intermediate maps by name."""
         x, seen = features, {}
         if self.config.cbam:
             x = seen["cbam"] = CBAM(self.config.cbam_reduction, bool(self.config.means), name="cbam")(x)
@@ -35,7 +35,7 @@ class PlaceHead(nn.Module):
         return Whitening(name="whiten")(descriptor) if self.config.whiten else descriptor, seen
 
     def _convolve(self, x: Float[Array, "b h w c"], i: int) -> Float[Array, "b _ _ _"]:
-        """The i-th convolution, its layer norm and ReLU."""
+        """Applies the i-th convolution, its layer norm and ReLU."""
         config = self.config
         channels, kernel, stride = config.channels[i], config.kernels[i], config.strides[i]
         if config.means:

@@ -1,4 +1,4 @@
-"""What a place head without a backbone reads (table 6: RB, RS and RB+RS)."""
+"""Input of a place head without a backbone (table 6: RB, RS and RB+RS)."""
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,11 @@ from sglpr_jax.models.input_image import backbone_view
 def raw_input(
     image: Float[Array, "b h w c"], labels: Int[Array, "b h w"] | None, config: ModelConfig
 ) -> Float[Array, "b p q _"]:
-    """Planes of point counts, of labels (one for each class), or both, in place of features.
+    """Return planes of point counts, of labels (one plane for each class), or of both, in place of features.
 
-    A polar model resamples the planes bilinearly, so that a polar pixel holds the share of each class. A head made for
-    tokens reads them through a patch embedding, a layer of the module that calls this; one made for pixels as they are.
+    For a polar model the planes are resampled bilinearly, so a polar pixel holds the fraction of each class. A head
+    with the tap `tokens` reads the planes through a patch embedding, a layer of the calling module. With the tap
+    `pixels` it reads them directly.
     """
     planes = [image] if config.head.reads_counts else []
     if config.head.reads_labels:

@@ -1,4 +1,4 @@
-"""The segmentation head, which only training and pictures need (section 4.1.3)."""
+"""Segmentation head, which is used only in training and for pictures (section 4.1.3)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,10 +12,10 @@ from sglpr_jax.models.polar import from_polar
 def segmentation_head(
     pixels: Float[Array, "b p q c"], image: Float[Array, "b h w i"], config: ModelConfig
 ) -> Float[Array, "b h w {config.classes}"]:
-    """Logits on the grid, from the decoder's pixels and the prepared image: layers of the module that calls it.
+    """Compute logits on the grid from the decoder's pixels and the prepared image.
 
-    Few channels cross from the polar image to the grid: a linear layer comes first. What is resampled is float32, as
-    the logits are.
+    The layers belong to the calling module. A linear layer comes first, so that few channels are resampled from the
+    polar image to the grid. The resampling and the logits are float32.
     """
     to_logits = Linear(config.classes, use_bias=False, kernel_init=torch_uniform, name="segmentation_head")
     crossing = Linear(config.detail, name="narrow")(pixels) if config.detail else to_logits(pixels)

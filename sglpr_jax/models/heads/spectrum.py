@@ -1,4 +1,4 @@
-"""Pooling by the amplitudes of a map's Fourier transform along its sectors, which a rotation leaves as they are."""
+"""Pooling by the amplitudes of a map's Fourier transform along its sectors, which a rotation does not change."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -8,20 +8,23 @@ from jaxtyping import Array, Float
 from sglpr_jax.models.layers import Linear
 
 FLOOR = 1e-6
-"""Added to squared amplitudes: the gradient of a root at zero is not finite."""
+"""Added to squared amplitudes, because the gradient of a square root at zero is not finite."""
 
 
 class Spectrum(nn.Module):
-    """Fewer channels, the amplitudes of the lowest `frequencies` of each, a linear layer."""
+    """Reduction of the channels, amplitudes of the lowest `frequencies` of each channel, a linear layer."""
 
     output: int
     channels: int = 256
-    """Of what is transformed: linear combinations of all channels at all radii."""
+    """Number of transformed channels: linear combinations of all channels at all radii."""
     frequencies: int = 32
 
     @nn.compact
     def __call__(self, features: Float[Array, "b r s c"]) -> Float[Array, "b {self.output}"]:
-        """The vector before its L2 normalisation; from the transform on float32. Frequency 0 is the mean."""
+        """Returns the vector before its L2 normalisation.
+
+        The transform and all later steps are float32. Frequency 0 is the mean.
+        """
         b, radii, sectors, c = features.shape
         columns = features.swapaxes(1, 2).reshape(b, sectors, radii * c)
         columns = Linear(self.channels, kernel_init=nn.initializers.he_normal(), name="narrow")(columns)
@@ -31,7 +34,10 @@ class Spectrum(nn.Module):
 
 
 def amplitudes(columns: Float[Array, "b s c"], frequencies: int) -> Float[Array, "b {frequencies} c"]:
-    """|DFT| over the sectors, unitary, of so many frequencies from 0: as two products, which a GPU and a CPU like."""
+    """Return the amplitudes of the unitary DFT over the sectors, for `frequencies` frequencies from 0.
+
+    The transform is two matrix products, which are fast on GPU and CPU.
+    """
     sectors = columns.shape[1]
     angle = (2 * np.pi / sectors) * (np.outer(np.arange(frequencies), np.arange(sectors)) % sectors)
     waves = np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32) / np.float32(np.sqrt(sectors))

@@ -1,4 +1,4 @@
-"""The last layer of a place head whose descriptors spread along few directions; models/whitening.py fits it."""
+"""Whitening: an optional last layer of the place head, fitted by models/whitening.py."""
 
 import flax.linen as nn
 import jax
@@ -9,11 +9,11 @@ from sglpr_jax.models.layers import l2_normalize, weight
 
 
 class Whitening(nn.Module):
-    """A linear layer and L2 normalisation; the identity until it is fitted."""
+    """Linear layer and L2 normalisation. It is the identity until it is fitted."""
 
     @nn.compact
     def __call__(self, descriptor: Float[Array, "b d"]) -> Float[Array, "b d"]:
-        """Descriptors of length 1."""
+        """Returns descriptors of length 1."""
         d = descriptor.shape[-1]
         kernel = weight(self, "kernel", lambda key, shape: jnp.eye(*shape), (d, d))
         bias = weight(self, "bias", nn.initializers.zeros, (d,))

@@ -23,23 +23,27 @@ from sglpr_jax.sim.things import Range
 
 @dataclasses.dataclass(frozen=True)
 class Repeating:
-    """A scenery where places repeat, and how it is driven through."""
+    """Scenery where places repeat, and parameters of the drive through it."""
 
     site: Callable[[np.random.Generator, float, bool], Site]
-    """Draws the scenery around a line of this length in metres, closed or open."""
+    """Function of a random generator, the line's length in metres, and whether it is closed. It draws the scenery."""
     speed_mps: Range
+    """Range of the speed, in m/s."""
     rate_hz: float = 4.0
     """Scans per second."""
     other_m: float = 20.0
-    """Frames farther apart than this show different places. Without revisits, all frames 30 s apart are."""
+    """Distance above which two frames show different places, in metres.
+
+    Without revisits, all frames 30 s apart are farther apart than this.
+    """
     clearance_m: float = 1.2
-    """Minimum horizontal distance of standing things from the driven way."""
+    """Minimum horizontal distance of standing things from the path, in metres."""
     right_m: float = 0.4
-    """Distance of the way from the middle of the road or aisle, to the right."""
+    """Distance of the path to the right of the middle of the road or aisle, in metres."""
     sway_m: float = 0.3
-    """Maximum further distance, which varies along the way."""
+    """Maximum deviation from `right_m`, in metres. The deviation varies along the path."""
     height_m: float | None = None
-    """Height of the sensor over the ground; None for the sensor's own."""
+    """Height of the sensor above the ground, in metres. None uses the height of the given sensor."""
 
 
 _ROBOT = {"rate_hz": 2.0, "clearance_m": 0.4, "right_m": 0.2, "sway_m": 0.15, "height_m": 0.5}
@@ -58,4 +62,4 @@ REPEATING = {
     "row_houses": Repeating(row_houses, (6.0, 9.0), right_m=0.2, sway_m=0.2),
     "field": Repeating(field, (7.0, 12.0)),
 }
-"""By the names of `simulate_repeating`."""
+"""Sceneries by the names that `simulate_repeating` accepts."""

@@ -1,4 +1,4 @@
-"""An open car park: rows of parked cars along parallel aisles."""
+"""Open car park: rows of parked cars along parallel aisles."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from sglpr_jax.sim.sceneries.ways import rows
 from sglpr_jax.sim.vehicles import parked
 
 FREE_M = 6.0
-"""At both ends of an aisle."""
+"""Free length at both ends of an aisle, in metres."""
 MORE = 2
-"""Aisles beyond the first and the last one that is driven."""
+"""Number of aisles before the first and after the last driven aisle."""
 
 
 def car_park(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Aisles of one plan, 22 to 28 m apart, with parked cars on both sides and lamps between them."""
+    """Equal aisles, 22 to 28 m apart, with parked cars on both sides and lamps between the aisles."""
     pitch, stall, full = rng.uniform(22, 28), rng.uniform(2.5, 2.8), rng.uniform(0.8, 0.92)
     plan = rows(length_m, run_m=rng.uniform(60, 100), pitch_m=pitch, closed=closed, back_m=7.0, corner_m=2.5)
     aisles = pitch * np.arange(-MORE, plan.count + MORE)

@@ -1,4 +1,4 @@
-"""A corridor with doors at equal distances on both sides."""
+"""Corridor with doors at equal distances on both sides."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,12 +11,12 @@ from sglpr_jax.sim.things import Thing
 Place = Float[np.ndarray, "2"]
 DOOR_M = 1.0
 BEYOND_M = 40.0
-"""Length of the corridor before the first and after the last scan."""
+"""Length of the corridor before the first and after the last scan, in metres."""
 THICK_M = 0.6
 
 
 def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """One straight corridor, or four that meet at right angles around a core, with a door every 5 to 7 metres."""
+    """One straight corridor, or four corridors at right angles around a core, with a door every 5 to 7 m."""
     half, height, pitch, recess = rng.uniform(1.0, 1.4), rng.uniform(2.4, 3.0), rng.uniform(5, 7), rng.uniform(0.1, 0.3)
     line, corners = _around(rng, length_m) if closed else _straight(length_m)
     starts = corners if closed else corners[:1]
@@ -30,13 +30,13 @@ def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _straight(length_m: float) -> tuple[Line, Line]:
-    """A straight way, and the ends of its corridor."""
+    """Straight path, and the ends of its corridor."""
     x = np.arange(0, length_m, STEP_M)
     return np.stack([x, np.zeros(len(x))], axis=1), np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
 
 
 def _around(rng: np.random.Generator, length_m: float) -> tuple[Line, Line]:
-    """A closed way around a rectangular core, and the corners of its corridors."""
+    """Closed path around a rectangular core, and the corners of its corridors."""
     long = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
     wide = length_m / 2 - long
     corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
@@ -46,7 +46,7 @@ def _around(rng: np.random.Generator, length_m: float) -> tuple[Line, Line]:
 def _walls(
     start: Place, stop: Place, half: float, height: float, pitch: float, recess: float, closed: bool
 ) -> list[Spot]:
-    """Walls along one straight corridor. In a closed one the left wall is the core's, which is shorter."""
+    """Walls along one straight corridor. If `closed`, the left wall belongs to the core and is shorter."""
     length, ahead = float(np.linalg.norm(stop - start)), (stop - start) / np.linalg.norm(stop - start)
     heading = float(np.arctan2(ahead[1], ahead[0]))
     spots = []
@@ -62,7 +62,7 @@ def _walls(
 
 
 def _piece(each: float, half: float, height: float, recess: float, side: int) -> Thing:
-    """A piece of wall of this length with a door in its middle."""
+    """Piece of wall of length `each`, with a door in its middle."""
     away, part = half + THICK_M / 2, (each - DOOR_M) / 2
     return (
         block(BUILDING, part, THICK_M, height, part / 2, side * away),

@@ -1,4 +1,4 @@
-"""Open ground with few things, most of them far off."""
+"""Open ground with few things, most of them far away."""
 
 from collections.abc import Callable, Iterator
 
@@ -13,7 +13,7 @@ from sglpr_jax.sim.things import Range, Thing
 
 
 def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """A track through fields: posts or poles along it, a bush now and then, and single trees and sheds far off."""
+    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
     whole, driven = road(rng, length_m, closed)
     (every, thick, high), beside = ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)], rng.choice((-1, 1)) * 5.0
     posts = along(shifted(whole, beside), lambda: (post(POLE, thick, high),), every)
@@ -26,7 +26,7 @@ def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 def _scattered(
     rng: np.random.Generator, line: Line, every_m: float, away_m: Range, make: Callable[[], Thing]
 ) -> Iterator[Spot]:
-    """Yield things at random places beside a line, on average one every so many metres."""
+    """Yields things at random positions beside a line, on average one per `every_m` metres."""
     for _ in range(round(len(line) * STEP_M / every_m)):
         away = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
         row = int(rng.integers(1, len(line) - 1))
@@ -35,5 +35,5 @@ def _scattered(
 
 
 def _far(rng: np.random.Generator) -> Thing:
-    """A tree or, one time in four, a shed."""
+    """Tree or, with probability 0.25, a shed."""
     return garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else plants.tree(rng, (3.0, 7.0))

@@ -1,4 +1,4 @@
-"""A parking garage: floors of one plan with pillars and parked cars, joined by ramps."""
+"""Parking garage: equal floors with pillars and parked cars, joined by ramps."""
 
 import numpy as np
 
@@ -9,18 +9,18 @@ from sglpr_jax.sim.things import Part, Thing
 from sglpr_jax.sim.vehicles import car
 
 PITCH_M = 11.5
-"""From a floor's aisle to the ramp beside it, and from there to the next floor's aisle."""
+"""Distance from the aisle of a floor to the next ramp, and from a ramp to the aisle of the next floor, in metres."""
 HALF_M = 8.8
-"""From a floor's aisle to the walls along the floor."""
+"""Distance from the aisle of a floor to the walls along the floor, in metres."""
 TURN_M = 5.0
-"""Space for turns at the ends of floors and ramps."""
+"""Space for turning at the ends of floors and ramps, in metres."""
 THICK_M = 0.3
 
 
 def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Floors that lie side by side, each followed by a ramp: rows 0, 2, 4, ... are floors, the others ramps.
+    """Floors side by side, each followed by a ramp. Rows 0, 2, 4, ... are floors, and the other rows are ramps.
 
-    The ground has one height at each place, so floors above each other are not possible. Walls hide each floor from
+    The ground has one height at each position, so floors above each other are not possible. Walls hide each floor from
     the others.
     """
     run, height, full = rng.uniform(30, 40), rng.uniform(2.4, 3.0), rng.uniform(0.75, 0.92)
@@ -38,7 +38,7 @@ def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _shell(count: int, run_m: float, height: float, closed: bool) -> Thing:
-    """Ceiling, outer walls, and between each two rows a wall that is open at the end where the way passes."""
+    """Ceiling, outer walls, and a wall between each two rows. The wall is open at the end where the path passes."""
     low, high = -HALF_M, (count - 1) * PITCH_M + HALF_M
     left, right = -TURN_M, run_m + TURN_M
     walls = []
@@ -58,6 +58,6 @@ def _shell(count: int, run_m: float, height: float, closed: bool) -> Thing:
 
 
 def _wall(start: tuple[float, float], stop: tuple[float, float], height: float) -> Part:
-    """A wall along x or y."""
+    """Wall along x or y."""
     long, wide = (abs(b - a) + THICK_M for a, b in zip(start, stop, strict=True))
     return block(BUILDING, long, wide, height, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)

@@ -1,4 +1,4 @@
-"""A highway between guard rails and noise walls, with posts and gantries at equal distances, and traffic."""
+"""Highway between guard rails and noise walls, with posts and gantries at equal distances, and traffic."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ from sglpr_jax.sim.sceneries.ways import STEP_M, Line, road, shifted
 from sglpr_jax.sim.things import Thing
 
 LANE_M = 3.5
-"""There are four lanes; the vehicle drives on the inner ones, other traffic on the outer ones."""
+"""Width of each of the four lanes, in metres. The vehicle uses the inner lanes, other traffic the outer lanes."""
 PIECE_S = 1.5
-"""Duration of a straight piece of a vehicle's motion."""
+"""Duration of a straight piece of a vehicle's motion, in seconds."""
 
 
 def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Four lanes between rails with posts, walls of equal panels, lamps and gantries; hills at most 1.5 % steep."""
+    """Four lanes between rails with posts, walls of equal panels, lamps and gantries. Slopes are at most 1.5 %."""
     whole, driven = road(rng, length_m, closed)
     rail, wall, panel = rng.uniform(8, 9.5), rng.uniform(11, 17), rng.uniform(4, 5)
     fence = _both(block(FENCE, OVERLAP * panel, 0.2, rng.uniform(2.5, 5), y=wall), post(FENCE, 0.35, 5.2, y=wall - 0.1))
@@ -32,7 +32,7 @@ def highway(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _both(*parts) -> Thing:
-    """The parts and their mirror images."""
+    """Parts and their mirror images."""
     return *parts, *(part._replace(y=-part.y) for part in parts)
 
 
@@ -49,7 +49,7 @@ def _traffic(rng: np.random.Generator, line: Line, direction: int) -> list[Spot]
 
 
 def _drive(thing: Thing, lane: Line, start: float, speed: float) -> list[Spot]:
-    """A drive along the whole lane as pieces of straight motion."""
+    """Drive along the whole lane, as pieces of straight motion."""
     times = np.arange(start, start + len(lane) * STEP_M / speed, PIECE_S)
     at = ((times - start) * speed / STEP_M).astype(int).clip(0, len(lane) - 1)
     spots = []

@@ -1,4 +1,4 @@
-"""Rooms of one plan along a corridor, with equal furniture or with other furniture in each."""
+"""Equal rooms along a corridor, with the same or with different furniture."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from sglpr_jax.sim.sceneries.ways import STEP_M, Line, rounded
 from sglpr_jax.sim.things import Thing
 
 HALF_M = 1.0
-"""Half width of the corridor; rooms begin at THICK_M more."""
+"""Half width of the corridor, in metres. Rooms begin THICK_M farther out."""
 THICK_M = 0.2
 DOOR_M = 1.4
 SIDE_M = 0.25
-"""Distance of the ways into a room and out of it from the middle of the door."""
+"""Distance from the middle of a door to the paths into the room and out of it, in metres."""
 MORE = 2
-"""Rooms before the first and after the last that is visited."""
+"""Number of rooms before the first and after the last visited room."""
 
 
 def rooms_equal(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -23,13 +23,13 @@ def rooms_equal(rng: np.random.Generator, length_m: float, closed: bool) -> Site
 
 
 def rooms(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Rooms with other furniture in each."""
+    """Rooms with different furniture."""
     return _rooms(rng, length_m, closed, equal=False)
 
 
 def _rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: bool) -> Site:
     pitch, size, deep, height = rng.uniform(7.5, 8.5), *rng.uniform(4.7, 5.3, 2), rng.uniform(2.4, 3.0)
-    each = pitch + 2 * (HALF_M + 0.6 * deep) + (pitch if closed else 0.0)  # a closed way returns through the corridor
+    each = pitch + 2 * (HALF_M + 0.6 * deep) + (pitch if closed else 0.0)  # a closed path returns through the corridor
     count = max(2, round(length_m / each) if closed else int(np.ceil(length_m / each)))
     line = _tour(count, pitch, HALF_M + 0.6 * deep, closed)
     line = line if closed else line[: round(length_m / STEP_M)]
@@ -45,7 +45,7 @@ def _rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: bo
 
 
 def _tour(count: int, pitch: float, deep: float, closed: bool) -> Line:
-    """In and out of one room after the other; a closed one returns through the corridor, on its other side."""
+    """Path into and out of one room after another. A closed path returns on the other side of the corridor."""
     visit = np.array([(-SIDE_M, 0.0), (-SIDE_M, deep), (SIDE_M, deep), (SIDE_M, 0.0)])
     corners = [visit + np.array([k * pitch, 0.0]) for k in range(count)]
     start = [[(-pitch / 2, 0.0)]]
@@ -54,7 +54,7 @@ def _tour(count: int, pitch: float, deep: float, closed: bool) -> Line:
 
 
 def _shell(pitch: float, size: float, deep: float, height: float) -> Thing:
-    """The walls of a room whose door is at x = 0, and what fills the space up to the next room."""
+    """Walls of a room with its door at x = 0, and the block between it and the next room."""
     front, between, jamb = HALF_M + THICK_M / 2, pitch - size, (size - DOOR_M) / 2
     outer = (DOOR_M + jamb) / 2
     return (

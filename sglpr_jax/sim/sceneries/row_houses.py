@@ -1,4 +1,4 @@
-"""Row houses: one house with its garden, again and again along parallel streets."""
+"""Row houses: one house with its garden, repeated along parallel streets."""
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from sglpr_jax.sim.things import Part, Thing
 from sglpr_jax.sim.vehicles import parked
 
 ROAD_M, WALK_M = 3.8, 5.6
-"""Half widths of the carriageway, and of the street with its sidewalks."""
+"""Half width of the carriageway, and half width of the street with its sidewalks, in metres."""
 FREE_M = 12.0
-"""Length of a crossing at both ends of a street."""
+"""Length of a crossing at both ends of a street, in metres."""
 
 
 def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Streets 46 to 56 m apart, each house of which is the same; other cars are parked in front of them."""
+    """Streets of equal houses, 46 to 56 m apart. Different cars are parked in front of the houses."""
     pitch, wide = rng.uniform(46, 56), rng.uniform(5.5, 9)
     plan = rows(length_m, run_m=rng.uniform(110, 160), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
     streets = pitch * np.arange(-1, plan.count + 1)
@@ -30,12 +30,15 @@ def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _parked(rng: np.random.Generator, xs: np.ndarray, streets: np.ndarray, side: int) -> list[Spot]:
-    """A vehicle at the kerb in front of each house."""
+    """Parked vehicle at the kerb in front of each house."""
     return grid(xs, streets + side * (ROAD_M - 0.9), lambda: parked(rng))
 
 
 def _module(rng: np.random.Generator, wide: float) -> Thing:
-    """A house, its porch, front garden, shed and back fence; y leads from the middle of the street into it."""
+    """House with wing, porch, shed, and a front garden with fences and a tree.
+
+    The y axis points from the middle of the street to the house.
+    """
     garden, deep, high, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
     front, main = WALK_M + garden, rng.choice((1.0, 0.7)) * wide
     house = block(BUILDING, main, deep, high + 1, 0.0, front + deep / 2, bottom=-1.0, roughness=0.06, glass=0.2)
@@ -57,14 +60,14 @@ def _module(rng: np.random.Generator, wide: float) -> Thing:
 
 
 def _border(rng: np.random.Generator, length: float) -> Part:
-    """A hedge or a fence of this length."""
+    """Hedge or fence of this length."""
     if rng.random() < 0.5:
         return hedge(length, rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.6))[0]
     return block(FENCE, length, 0.1, rng.uniform(0.8, 1.2), porosity=0.4)
 
 
 def _small_tree(rng: np.random.Generator, x: float, y: float) -> Thing:
-    """A tree of a front garden."""
+    """Tree in a front garden."""
     crown = rng.uniform(1.5, 2.5)
     leaves = Part("ellipsoid", VEGETATION, (crown, crown, crown), x, y, 1.3, roughness=0.6, porosity=0.5)
     return post(TRUNK, 0.15, 2.0, x, y), leaves

@@ -1,4 +1,4 @@
-"""What a scenery consists of, helpers that place things in rows and along lines, and the world that results."""
+"""Elements of a scenery, functions that place things in rows and along lines, and construction of the world."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
@@ -17,16 +17,16 @@ from sglpr_jax.sim.things import Part, Thing
 from sglpr_jax.sim.world import World
 
 HEAD_ROOM_M = 2.0
-"""Parts that begin higher may be above the vehicle."""
+"""Minimum height of parts that may be above the vehicle, in metres."""
 FLAT = Relief(np.zeros(4), np.full((4, 2), 0.01), np.zeros(4))
 _ROLLING = dataclasses.replace(TOWN, steepest=0.015)
 OVERLAP = 1.25
-"""Length of a piece of wall over the distance to the next one: in curves, the outer wall is longer than the road."""
+"""Length of a piece of wall divided by the spacing. In curves, the outer wall is longer than the road."""
 _AROUND_M = 30.0
 
 
 class Spot(NamedTuple):
-    """A thing and its place in the world; with `side` -1 its y axis is mirrored."""
+    """Thing and its pose in the world. If `side` is -1, its y axis is mirrored."""
 
     thing: Thing
     x: float  # metres, at time 0
@@ -35,11 +35,11 @@ class Spot(NamedTuple):
     side: int = 1
     velocity: tuple[float, float] = (0.0, 0.0)  # m/s
     since: float = -np.inf  # seconds
-    until: float = np.inf
+    until: float = np.inf  # seconds
 
 
 class Site(NamedTuple):
-    """A scenery: the line that is driven, the things around it, and the ground."""
+    """Scenery: the driven line, the things around it, and the ground."""
 
     line: Line
     spots: list[Spot]
@@ -47,7 +47,10 @@ class Site(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """A strip of ground between two distances left of a line, in metres. With `dash_m`, every second piece of that."""
+    """Strip of ground between two distances to the left of a line, in metres.
+
+    With `dash_m`, the strip is dashed. Dashes and gaps have this length, in metres.
+    """
 
     line: Line
     low_m: float
@@ -57,17 +60,17 @@ class Strip(NamedTuple):
 
 
 def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
-    """A box whose middle is at x and y; `more` are fields of Part."""
+    """Box with its centre at x and y. `more` holds fields of Part."""
     return Part("box", label, (length, width, height), x, y, **more)
 
 
 def post(label: int, thick: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
-    """A cylinder whose axis is at x and y; `more` are fields of Part."""
+    """Cylinder with its axis at x and y. `more` holds fields of Part."""
     return Part("cylinder", label, (thick, thick, height), x, y, **more)
 
 
 def along(line: Line, make: Callable[[], Thing], every_m: float, *, first_m: float = 0.0) -> list[Spot]:
-    """Place a thing every so many metres of a line, its x axis along the line."""
+    """Places things every `every_m` metres along a line, with their x axes along the line."""
     rows = np.arange(first_m / STEP_M, len(line) - 1, every_m / STEP_M).astype(int)
     ahead = np.gradient(line, axis=0)[rows]
     places = zip(*line[rows].T.tolist(), np.arctan2(ahead[:, 1], ahead[:, 0]).tolist(), strict=True)
@@ -77,13 +80,16 @@ def along(line: Line, make: Callable[[], Thing], every_m: float, *, first_m: flo
 def grid(
     xs: Iterable[float], ys: Iterable[float], make: Callable[[], Thing], *, heading: float = 0.0, side: int = 1
 ) -> list[Spot]:
-    """Place a thing at every pair of x and y."""
+    """Places a thing at each combination of x and y."""
     ys = list(ys)
     return [Spot(make(), float(x), float(y), heading, side) for x in xs for y in ys]
 
 
 def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep: float = 1.0) -> list[Spot]:
-    """Keep a share of the spots, each moved by a normal distribution of this width and turned by up to 3 degrees."""
+    """Keeps the fraction `keep` of the spots, and shifts and rotates them at random.
+
+    The standard deviation of a shift is `metres` along x and y. Rotations are at most 3 degrees.
+    """
     kept = [spot for spot in spots if rng.random() < keep]
     moves = rng.normal(scale=metres, size=(len(kept), 2)).tolist()
     turns = np.radians(rng.uniform(-3, 3, len(kept))).tolist()
@@ -94,7 +100,7 @@ def jittered(rng: np.random.Generator, spots: list[Spot], metres: float, *, keep
 
 
 def rolling(rng: np.random.Generator) -> Relief:
-    """Gentle hills, at most 1.5 % steep."""
+    """Gentle hills with slopes of at most 1.5 %."""
     return draw_relief(rng, _ROLLING)
 
 
@@ -104,7 +110,7 @@ def even_ground(label: int, relief: Relief = FLAT) -> Ground:
 
 
 def striped_ground(base: int, strips: Sequence[Strip], relief: Relief = FLAT) -> Ground:
-    """Ground of label `base` with strips painted on it, later ones over earlier ones."""
+    """Ground of label `base` with painted strips. Later strips cover earlier strips."""
     points = np.concatenate([strip.line for strip in strips])
     origin, size = points.min(axis=0) - _AROUND_M, np.ptp(points, axis=0) + 2 * _AROUND_M
     label = np.full(np.ceil(size / CELL_M).astype(int)[::-1] + 1, base, np.uint8)
@@ -119,7 +125,7 @@ def striped_ground(base: int, strips: Sequence[Strip], relief: Relief = FLAT) ->
 
 
 def build(site: Site, driven: Line, *, clearance_m: float) -> World:
-    """Return the world of a site without the things that stand nearer than `clearance_m` to the driven line."""
+    """Builds the world of a site without standing things closer than `clearance_m` to the driven line."""
     parts = [part for spot in site.spots for part in spot.thing]
     owner = np.repeat(np.arange(len(site.spots)), [len(spot.thing) for spot in site.spots])
     x, y, heading, side, vx, vy, since, until = np.array(
@@ -134,7 +140,7 @@ def build(site: Site, driven: Line, *, clearance_m: float) -> World:
 
 
 def distances(shapes: Shapes, line: Line, *, reach_m: float = 3.0) -> Float[np.ndarray, " n"]:
-    """Horizontal distance from each shape to a line, in metres; inf beyond `reach_m`."""
+    """Horizontal distance of each shape from a line, in metres. Beyond `reach_m` it is inf."""
     reach = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + reach_m
     near = KDTree(line).query_ball_point(np.asarray(shapes.centre)[:, :2], reach)
     row = np.repeat(np.arange(len(near)), [len(indices) for indices in near])

@@ -1,4 +1,4 @@
-"""A road tunnel: walls, ceiling, lamps, and emergency niches at equal distances."""
+"""Road tunnel: walls, ceiling, lamps, and emergency niches at equal distances."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from sglpr_jax.sim.things import Thing
 
 PIECE_M = 6.0
 THICK_M = 2.0
-"""Deeper than a niche, so that the neighbouring pieces close its sides."""
+"""Thickness of the walls, in metres. It exceeds the depth of a niche, so neighbouring pieces close its sides."""
 NICHE_M = 1.3
 
 
 def tunnel(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """A tunnel whose pieces of PIECE_M are all alike, except that every n-th one has a niche on the right."""
+    """Tunnel of equal pieces of length PIECE_M. Every n-th piece has a niche on the right."""
     whole, driven = road(rng, length_m, closed)
     half, height, every = rng.uniform(3.8, 5.5), rng.uniform(4.8, 6.5), int(rng.integers(7, 16))
     pieces = along(whole, lambda: _piece(half, height, 0.0), PIECE_M)

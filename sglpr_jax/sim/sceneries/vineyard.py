@@ -1,4 +1,4 @@
-"""A vineyard: rows of vines on posts."""
+"""Vineyard: rows of vines on posts."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from sglpr_jax.sim.sceneries.ways import rows
 from sglpr_jax.sim.things import Thing
 
 APART_M = 22.0
-"""The vehicle leaves out rows, so that its passes are at least so far apart."""
+"""Minimum distance between passes, in metres. The vehicle skips rows to keep this distance."""
 FREE_M = 5.0
 
 
 def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Rows 2.8 to 3.4 m apart with a post every 4 to 6 m."""
+    """Rows of vines 2.8 to 3.4 m apart, with a post every 4 to 6 m."""
     pitch, every, high, thick = rng.uniform((2.8, 4, 1.6, 0.35), (3.4, 6, 2.2, 0.6)).tolist()
     skip = int(np.ceil(APART_M / pitch))
     run = rng.uniform(70, 110)
@@ -26,7 +26,7 @@ def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _vines(rng: np.random.Generator, every: float, high: float, thick: float) -> Thing:
-    """The leaves between two posts, of a height and density of their own, and the first post."""
+    """Leaves between two posts, with random size and density, and the first post."""
     top, wide = high * rng.uniform(0.9, 1.05), thick * rng.uniform(0.8, 1.2)
     leaves = block(VEGETATION, every, wide, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
     return leaves, post(POLE, 0.1, high + 0.15, -every / 2)

@@ -11,7 +11,7 @@ THICK_M = 0.4
 
 
 def walls(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """A road between two walls without any feature."""
+    """Road between two walls without features."""
     whole, driven = road(rng, length_m, closed)
     left, right, height = rng.uniform(3.5, 8), rng.uniform(3, 7), rng.uniform(1.8, 4)
     pair = tuple(

@@ -1,4 +1,4 @@
-"""A warehouse: aisles of one plan between shelves with pallets."""
+"""Warehouse: equal aisles between shelves with pallets."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ from sglpr_jax.sim.sceneries.ways import rows
 from sglpr_jax.sim.things import Thing
 
 FREE_M = 2.5
-"""At both ends of an aisle."""
+"""Free length at both ends of an aisle, in metres."""
 MORE = 1
-"""Aisles beyond the first and the last one that is driven."""
+"""Number of aisles before the first and after the last driven aisle."""
 LEVEL_M = 1.7
 
 
 def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Aisles 5 to 6 m apart between shelves of three levels, 85 to 95 % full."""
+    """Aisles 5 to 6 m apart, between shelves with three levels that are 85 to 95 % full."""
     pitch, aisle, bay, full = rng.uniform(5, 6), rng.uniform(2.6, 3.0), rng.uniform(2.4, 3.0), rng.uniform(0.85, 0.95)
     plan = rows(length_m, run_m=rng.uniform(25, 40), pitch_m=pitch, closed=closed, back_m=2.5, corner_m=0.6)
     lanes = pitch * np.arange(-MORE, plan.count + MORE + 1)
@@ -30,7 +30,7 @@ def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
 
 
 def _bay(rng: np.random.Generator, bay: float, deep: float, full: float) -> Thing:
-    """One bay of a double shelf: a frame, two boards, and pallets on three levels of either side."""
+    """One bay of a double shelf: a frame, two boards, and pallets on three levels on both sides."""
     parts = [block(POLE, 0.12, 0.12, 3.4 * LEVEL_M, -bay / 2, side * (deep / 2 - 0.06)) for side in (-1, 1)]
     parts += [block(OTHER_OBJECT, bay, deep, 0.14, bottom=level * LEVEL_M) for level in (1, 2)]
     for level in range(3):

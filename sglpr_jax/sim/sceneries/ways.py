@@ -1,4 +1,4 @@
-"""Lines for sceneries that repeat: roads, rings and rows, and the way of a vehicle along them."""
+"""Lines for sceneries where places repeat: roads, rings and rows, and the path of a vehicle along them."""
 
 from typing import Literal, NamedTuple
 
@@ -9,11 +9,11 @@ from scipy.ndimage import gaussian_filter1d
 from sglpr_jax.sim.routes import resampled, travelled
 
 STEP_M = 0.1
-"""Distance between two points of a line."""
+"""Distance between two points of a line, in metres."""
 MARGIN_M = 90.0
-"""Length of a road before the first and after the last scan, so that no scan sees an end."""
+"""Length of a road before the first and after the last scan, in metres. It hides the ends of the road."""
 LAPS = 1.5
-"""Laps around a closed line for revisits in the same direction."""
+"""Number of laps along a closed line for revisits in the same direction."""
 SWAY_WAVELENGTH_M = (15.0, 60.0)
 
 Line = Float[np.ndarray, "_ 2"]
@@ -22,7 +22,7 @@ REVISITS: tuple[Revisit, ...] = ("none", "same", "opposite")
 
 
 class Rows(NamedTuple):
-    """A way through parallel rows along x: row k is at y = k * pitch, from x = 0 to `run_m`."""
+    """Path through parallel rows along x. Row k is at y = k * pitch, from x = 0 to `run_m`."""
 
     line: Line
     count: int
@@ -30,7 +30,7 @@ class Rows(NamedTuple):
 
 
 def road(rng: np.random.Generator, length_m: float, closed: bool) -> tuple[Line, Line]:
-    """A road and the part of it to be driven: straight or an arc with MARGIN_M at both ends, or a closed ring."""
+    """Road and its driven part: a straight line or an arc with MARGIN_M at both ends, or a closed ring."""
     if closed:
         line = ring(length_m, straight=rng.uniform(0, 0.5))
         return line, line
@@ -41,20 +41,23 @@ def road(rng: np.random.Generator, length_m: float, closed: bool) -> tuple[Line,
 
 
 def ring(length_m: float, *, straight: float) -> Line:
-    """A closed line: two straight parts, together the share `straight` of the length, and two half circles."""
+    """Closed line of two straight parts and two half circles.
+
+    The straight parts together are the fraction `straight` of the length.
+    """
     count = round(length_m * straight / 2 / STEP_M), round(length_m * (1 - straight) / 2 / STEP_M)
     half = np.repeat([0.0, np.pi / (count[1] * STEP_M)], count)
     return _integrated(np.tile(half, 2))
 
 
 def _integrated(curvature: Float[np.ndarray, " n"]) -> Line:
-    """The line that starts at the origin along x and has this curvature (1 / metres) at each of its points."""
+    """Line that starts at the origin along x, with the given curvature (1 / metres) at each point."""
     heading = np.cumsum(curvature) * STEP_M
     return np.cumsum(STEP_M * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
 
 
 def rounded(corners: Line, *, corner_m: float, closed: bool = False) -> Line:
-    """The polygon through `corners`, its corners rounded by a Gaussian of width `corner_m`."""
+    """Polygon through `corners`, rounded by a Gaussian with standard deviation `corner_m`."""
     polygon = resampled(np.concatenate([corners, corners[:1]]) if closed else corners, STEP_M)
     polygon = polygon[:-1] if closed else polygon
     line = gaussian_filter1d(polygon, corner_m / STEP_M, axis=0, mode="wrap" if closed else "nearest")
@@ -62,9 +65,9 @@ def rounded(corners: Line, *, corner_m: float, closed: bool = False) -> Line:
 
 
 def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m: float, corner_m: float) -> Rows:
-    """A way of about `length_m` to and fro through rows of about `run_m` metres.
+    """Path of about `length_m` metres back and forth through rows of about `run_m` metres.
 
-    A closed one returns from the last row to the first at x = -`back_m`.
+    A closed path returns from the last row to the first at x = -`back_m`.
     """
     if closed:
         count = 2 * max(1, round((length_m - 2 * back_m) / (run_m + 2 * pitch_m) / 2))
@@ -79,16 +82,16 @@ def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m:
 
 
 def shifted(line: Line, left_m: Float[np.ndarray, " n"] | float) -> Line:
-    """`line` moved to the left by so many metres."""
+    """Shifts `line` to the left by `left_m` metres."""
     ahead = np.gradient(line, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return line + np.reshape(left_m, (-1, 1)) * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
 
 
 def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
-    """The way of a vehicle that keeps `right_m` metres right of `line` and sways by up to `sway_m`.
+    """Path of a vehicle `right_m` metres to the right of `line`, with a sway of up to `sway_m` metres.
 
-    With revisit "opposite" it turns around at the end and returns. With "same" it goes LAPS times around, and `line`
+    With revisit "opposite", the vehicle turns at the end and returns. With "same", it drives LAPS laps, and `line`
     must be closed.
     """
     if revisit == "same":
@@ -101,13 +104,13 @@ def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: floa
 
 
 def _turn(line: Line, radius_m: float) -> Line:
-    """The half circle to the left around the end of `line`."""
+    """Half circle to the left around the end of `line`."""
     ahead = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
     angle = np.linspace(-np.pi / 2, np.pi / 2, 2 + round(np.pi * radius_m / STEP_M))[1:-1, None]
     return line[-1] + radius_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))
 
 
 def _waves(rng: np.random.Generator, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """A slow random curve along a way, between -1 and 1."""
+    """Slowly varying random values along a path, between -1 and 1."""
     wavelengths, phases = rng.uniform(*SWAY_WAVELENGTH_M, 3), rng.uniform(0, 2 * np.pi, 3)
     return np.sin(2 * np.pi * length[:, None] / wavelengths + phases).mean(axis=1)
