@@ -27,7 +27,14 @@ os.environ |= {  # for the processes that tests start
 }
 
 TESTS = Path(__file__).resolve().parent
-QUICKLY = ("benchmarks/test_gpu.py", "benchmarks/test_speed.py", "cli/", "docs/", "training/", "test_wheel.py")
+QUICKLY = (
+    "benchmark_programs/test_gpu.py",
+    "benchmark_programs/test_speed.py",
+    "cli/",
+    "docs/",
+    "training/",
+    "test_wheel.py",
+)
 """What is tested there is what is done with numbers: XLA need not optimize, which halves the time that it takes. The
 numbers themselves are tested elsewhere, of programs compiled as users' are."""
 

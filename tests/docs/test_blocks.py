@@ -53,10 +53,11 @@ def test_command_lines_are_parsed(name, capsys):
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("line", lines_of(start="python benchmarks/"))
+@pytest.mark.parametrize("line", lines_of(start="python -m benchmarks."))
 def test_flags_of_benchmarks_exist(line):
-    _, file, *arguments = shlex.split(line)
-    source = (ROOT / file).read_text()
+    _, _, module, *arguments = shlex.split(line)
+    path = ROOT / module.replace(".", "/")
+    source = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
     flags = [argument.removeprefix("--no-").removeprefix("--") for argument in arguments if argument.startswith("--")]
     assert not [flag for flag in flags if not re.search(rf"\b{flag.replace('-', '_')}\b", source)], line
 

@@ -151,6 +151,6 @@ def test_the_shipped_models_say_how_they_were_made_and_tell_clear_pairs():
         Evidence(0.01, 1.0, 0.99, 0.97, 1.0, 300.0),
     )
     for model in (shipped, others):
-        assert "benchmarks/fit_loops.py" in model.made_with
+        assert "benchmarks/quality/fit_loops.py" in model.made_with
         assert model.probability(loop) > 0.99 and model.probability(none) < 0.01
         assert model.probability(repeats) < 0.1

@@ -1,0 +1,158 @@
+"""All that is measured and made on a GPU, in three commands of some minutes each; docs/guides/gpu.md.
+
+    python -m benchmarks.gpu simulate --out towns
+    python -m benchmarks.gpu train --data towns --preset sglpr --out runs/sglpr
+    python -m benchmarks.gpu measure
+
+Each stops by itself after --minutes; given once more it goes on where it stopped. It runs from a checkout that is not
+installed, where there is no tyro.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROUTES = ("00", "02", "05", "06", "07", "08")
+PRESETS = ("rings", "small", "sglpr", "paper-112", "paper")
+TYPES = ("bfloat16", "float32")
+TRAINING_SHARE = 0.85
+"""Of the minutes; in the rest of them a checkpoint is written and the weights are tested."""
+GO_ON = "stopped in time; the same command goes on"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Parse and do it: bad input ends in one line on stderr and exit status 1 (2 where no such option is known)."""
+    asked = parser().parse_args(arguments)
+    try:
+        asked.work(asked)
+    except (ValueError, OSError, FloatingPointError) as error:
+        sys.exit(f"error: {' '.join(str(error).split())}")
+
+
+def time_limit(minutes: float) -> Callable[[], bool]:
+    """A function that tells whether so many minutes are over since now."""
+    end = time.monotonic() + 60 * minutes
+    return lambda: time.monotonic() > end
+
+
+def simulate(asked: argparse.Namespace) -> None:
+    """Rates of the simulator and of images, and a dataset."""
+    stopped = time_limit(asked.minutes)
+    from benchmarks.gpu.gpu_simulate import TownsConfig, simulate_towns  # these bring JAX, which --help does not need
+    from benchmarks.gpu.simulator_rates import RateConfig
+
+    sensor = asked.sensor, asked.azimuth_steps
+    towns = TownsConfig(asked.out, tuple(asked.seq), asked.scans, asked.layout, *sensor, asked.seed)
+    rates = RateConfig(*sensor, asked.seq[0], asked.batch, asked.points, asked.repeats)
+    finished = simulate_towns(towns, rates, asked.results, stopped)
+    _report(f"{towns.scans_there} of {asked.scans * len(asked.seq)} scans in {asked.out}", finished, asked.results)
+
+
+def train(asked: argparse.Namespace) -> None:
+    """A training, and the scores of its weights so far."""
+    stopped = time_limit(TRAINING_SHARE * asked.minutes)
+    from benchmarks.gpu.gpu_train import TrainJob, train_preset
+
+    names = ("data", "preset", "out", "test", "compute", "chunk", "steps", "packs")
+    job = TrainJob(**{name: getattr(asked, name) for name in names})
+    try:
+        result = train_preset(job, asked.results, stopped)
+    except KeyboardInterrupt:  # how `sglpr_jax.train` stops while it packs recordings
+        if not stopped():
+            raise
+        _report(f"recordings are packed in {asked.packs}", False, asked.results)
+    else:
+        _report(str(result), result.finished, asked.results)
+
+
+def measure(asked: argparse.Namespace) -> None:
+    """Steps and descriptors of presets."""
+    stopped = time_limit(asked.minutes)
+    from benchmarks.gpu.gpu_measure import MeasureConfig, measure_presets
+    from benchmarks.gpu.model_rates import Timing
+
+    timing = Timing(asked.repeats, asked.calls, asked.size, asked.products, asked.peak_tflops)
+    batches = tuple(asked.batch)
+    config = MeasureConfig(tuple(asked.preset), tuple(asked.compute), batches, asked.chunk, timing)
+    _report("presets", measure_presets(config, asked.results, stopped), asked.results)
+
+
+def _report(what: str, finished: bool, results: Path) -> None:
+    from benchmarks.gpu.small_results import told
+
+    print(f"{what}: {'finished' if finished else GO_ON}\n{told(results)}")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = made.add_subparsers(required=True)
+    for work, add in ((simulate, _add_simulate), (train, _add_train), (measure, _add_measure)):
+        command = commands.add_parser(work.__name__, description=work.__doc__, help=work.__doc__)
+        command.set_defaults(work=work)
+        command.add_argument("--minutes", type=_positive, default=9.0, help="it stops by itself after these (9)")
+        command.add_argument("--results", type=Path, default=Path("build/gpu"), help="folder of results (build/gpu)")
+        add(command)
+    return made
+
+
+def _add_simulate(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("--out", type=Path, required=True, help="the dataset's folder")
+    add("--seq", nargs="+", default=ROUTES, help="routes of the simulator, 00 to 10")
+    add("--scans", type=_count, default=1000, help="of each route (1000)")
+    add("--layout", choices=("images", "varied", "scans"), default="images", help="as bin/simulate --images, --vary")
+    add("--sensor", default="hdl64e", help="as of bin/simulate")
+    add("--azimuth-steps", type=_count, help="firings per turn (the real sensor's)")
+    add("--seed", type=int, default=0)
+    add("--batch", type=_count, default=16, help="scans and clouds in one call, beside one (16)")
+    add("--points", type=_count, default=120_000, help="of a cloud that is rasterised (120000)")
+    add("--repeats", type=_count, default=10, help="how often everything is timed (10)")
+
+
+def _add_train(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("--data", type=Path, required=True, help="a dataset of several recordings")
+    add("--preset", required=True, help="a file of configs/ by name, or a path")
+    add("--out", type=Path, required=True, help="the run's folder")
+    add("--test", default="08", help="the recording to test on, never trained on (08)")
+    add("--compute", choices=TYPES, default="bfloat16")
+    add("--chunk", type=int, help="images at a time, 0: all (the preset's)")
+    add("--steps", type=_count, help="all steps of the run (the preset's)")
+    add("--packs", type=Path, help="pack the recordings into this folder, to read them faster")
+
+
+def _add_measure(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("--preset", nargs="+", default=PRESETS)
+    add("--compute", nargs="+", choices=TYPES, default=TYPES)
+    add("--batch", nargs="+", type=_count, default=(1, 12, 64), help="images described in one call (1 12 64)")
+    add("--chunk", type=int, help="images of a step at a time, 0: all (the preset's)")
+    add("--repeats", type=_count, default=10, help="how often everything is timed (10)")
+    add("--calls", type=_count, default=3, help="steps or descriptions in one timing (3)")
+    add("--size", type=_count, help="rows of the matrices of the peak (8192; on a CPU 2048)")
+    add("--products", type=_count, default=20, help="of them in one timing (20)")
+    add("--peak-tflops", type=_positive, default=989.0, help="nominal peak in bfloat16 (989, an H100's)")
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, found {text}")
+    return value
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, found {text}")
+    return int(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""How long commands take to start: the help of each, and bin/embed of one scan once its programs have been compiled.
+
+    taskset -c 1 python -m benchmarks.speed.start_up
+
+Seconds, and processor seconds, which are nearer the truth on a machine that is busy: the least and the median.
+"""
+
+import dataclasses
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from sglpr_jax.sim.recording import simulate_recording
+from sglpr_jax.sim.sensor import SENSORS
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS = tuple(
+    sorted(path.stem for path in (ROOT / "sglpr_jax" / "cli").glob("*.py") if (ROOT / "bin" / path.stem).exists())
+)
+
+
+def main(*, commands: tuple[str, ...] = COMMANDS, weights: str = "sglpr", repeats: int = 9) -> None:
+    """Time commands in processes of their own, one after another.
+
+    Args:
+        commands: whose help is timed.
+        weights: what bin/embed describes by.
+        repeats: how often each is timed.
+    """
+    lines = {f"{command} --help": (command, "--help") for command in commands}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scan = simulate_recording("08", scans=1, sensor=dataclasses.replace(SENSORS["hdl64e"], azimuth_steps=900))
+        (folder / "scans").mkdir()
+        points = scan.record(0).points
+        np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(folder / "scans" / "000000.bin")
+        embed = ("embed", "--data", f"{folder}/scans", "--weights", weights, "--out", f"{folder}/scans.npz")
+        environment = {**os.environ, "XDG_CACHE_HOME": name}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        seconds(embed, environment)  # compiles
+        lines[f"embed one scan, {weights}"] = embed
+        table = Table("", "seconds, least", "median", "processor seconds, least", "median")
+        for title, line in lines.items():
+            wall, processor = zip(*(seconds(line, environment) for _ in range(repeats)), strict=True)
+            found = (min(wall), statistics.median(wall), min(processor), statistics.median(processor))
+            table.add_row(title, *(f"{value:.2f}" for value in found))
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    print(f"{repeats} times each; {os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
+
+
+def seconds(line: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float]:
+    """How long a command takes, and how long processors work for it."""
+    command, *arguments = line
+    start, before = time.perf_counter(), _processor_s()
+    module = (sys.executable, "-m", f"sglpr_jax.cli.{command}")
+    subprocess.run((*module, *arguments), env=environment, check=True, capture_output=True)
+    return time.perf_counter() - start, _processor_s() - before
+
+
+def _processor_s() -> float:
+    """Of all processes that were started here and have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

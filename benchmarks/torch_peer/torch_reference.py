@@ -1,0 +1,140 @@
+"""The model, the losses and the training step as plain PyTorch modules, for timing and for checking against.
+
+The parts are those of the files `torch_*.py` beside this one. Modules have the names of our layers, so that our weights
+can be loaded.
+"""
+
+from collections.abc import Callable
+
+import flax.traverse_util
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from benchmarks.torch_peer.torch_backbones import BACKBONES
+from benchmarks.torch_peer.torch_heads import Detail, Place
+from benchmarks.torch_peer.torch_image import InputImage, from_polar, to_polar
+from sglpr_jax.losses import DICE_EPSILON
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.params import Params
+from sglpr_jax.training.config import LossConfig, TrainConfig
+
+HEADS = ("place_head", "segmentation_head", "narrow", "detail")
+"""Layers that are not the backbone's."""
+
+INFERENCE = {"freezing": True}
+"""Lets `torch.compile` take the weights for constants and reorder them beforehand."""
+
+
+class SGLPR(nn.Module):
+    """The backbone with the place head and, where the model has one, the segmentation head."""
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        _check(config)
+        self.tap = config.head.tap
+        self.input_image = InputImage(config)
+        self.view = to_polar(config.grid, *config.polar) if config.polar else nn.Identity()
+        self.backbone = BACKBONES[config.backbone.kind](config)
+        self.place_head = Place(config.backbone.width, config.head, circular=config.polar is not None)
+        if config.segments:
+            self._add_segmentation_head(config, self.backbone.width)
+
+    def _add_segmentation_head(self, config: ModelConfig, width: int) -> None:
+        self.back = from_polar(config.grid, *self.backbone.pixel_size) if config.polar else nn.Identity()
+        self.narrow = nn.Linear(width, config.detail) if config.detail else None
+        self.detail = Detail(config.channels, config.detail) if config.detail else None
+        self.segmentation_head = nn.Linear(config.detail or width, config.classes, bias=False)
+
+    def forward(self, counts: Tensor, *, segment: bool = False) -> tuple[Tensor, Tensor | None]:
+        """Descriptors (b, d) and, if asked for, logits (b, h, w, classes) of images of counts (b, h, w)."""
+        image = self.input_image(counts)
+        features, finer = self.backbone(self.view(image))
+        pixels = self.backbone.decode(features, finer) if segment or self.tap == "pixels" else None
+        descriptor = self.place_head(features if self.tap == "tokens" else pixels)
+        return descriptor, self._segment(pixels, image) if segment else None
+
+    def _segment(self, pixels: Tensor, image: Tensor) -> Tensor:
+        if self.detail is None:
+            return self.back(self.segmentation_head(pixels))
+        return self.segmentation_head(self.detail(self.back(self.narrow(pixels)), image))
+
+
+def _check(config: ModelConfig) -> None:
+    """Raises ValueError for a model of which PyTorch's has no counterpart."""
+    head = config.head
+    if not head.reads_features or head.pooling != "netvlad" or head.whiten:
+        raise ValueError("the PyTorch model has a place head of features and NetVLAD, without whitening")
+    if config.counts != "log1p" or config.compute != "float32":
+        raise ValueError("the PyTorch model takes log(1 + n) of counts, and computes in float32")
+
+
+def from_params(params: Params) -> SGLPR:
+    """The PyTorch model with our weights, the kernels of convolutions channels-last (torch_layers.py says why)."""
+    model = SGLPR(params.config)
+    flat = flax.traverse_util.flatten_dict(params.weights, sep=".")
+    model.load_state_dict({_torch_name(name): torch.tensor(_torch_layout(name, w)) for name, w in flat.items()})
+    return model.to(memory_format=torch.channels_last)
+
+
+def _torch_name(name: str) -> str:
+    """PyTorch's layers and ours have the same names, but there the backbone's are parts of it."""
+    path, _, weight = name.rpartition(".")
+    whole = "" if path.split(".")[0] in HEADS else "backbone."
+    return f"{whole}{path}.{'weight' if weight in ('kernel', 'scale') else weight}"
+
+
+def _torch_layout(name: str, weight: np.ndarray) -> np.ndarray:
+    """Flax's (..., in, out) as PyTorch's (out, in, ...)."""
+    return weight.transpose(-1, -2, *range(weight.ndim - 2)) if name.endswith("kernel") else weight
+
+
+def joint_loss(descriptors: Tensor, logits: Tensor | None, maps: Tensor | None, config: LossConfig) -> Tensor:
+    """Equation 8 of one tuple: anchor, one positive, negatives. Equation 5, with squared distances, without maps."""
+    distances = (descriptors[:1] - descriptors[1:]).square().sum(-1)
+    triplet = (config.margin + distances[0] - distances[1:]).relu().max()
+    if maps is None:
+        return triplet
+    cross_entropy = F.cross_entropy(logits.flatten(0, -2), maps.flatten())
+    probability, truth = logits.softmax(-1), F.one_hot(maps, logits.shape[-1]).to(logits.dtype)
+    overlap = (probability * truth).sum((0, 1, 2))
+    size = probability.square().sum((0, 1, 2)) + truth.square().sum((0, 1, 2))
+    dice = (1 - (2 * overlap + DICE_EPSILON) / (size + DICE_EPSILON)).mean()
+    return triplet + config.ce_weight * cross_entropy + config.dice_weight * dice
+
+
+def describe_job(params: Params, images: np.ndarray, chunk: int, compiled: bool) -> Callable[[], np.ndarray]:
+    """Describes images of counts, `chunk` at a time (0: all at once)."""
+    model, batch = from_params(params).eval(), torch.tensor(images)
+    described = torch.compile(model, dynamic=False, options=INFERENCE) if compiled else model
+
+    def job() -> np.ndarray:
+        with torch.inference_mode():
+            return torch.cat([described(part)[0] for part in batch.split(chunk or len(batch))]).numpy()
+
+    return job
+
+
+def train_job(
+    params: Params, images: np.ndarray, maps: np.ndarray | None, config: TrainConfig, compiled: bool
+) -> Callable[[], np.ndarray]:
+    """Makes one training step and returns its loss and the norm of its gradient; without maps by the triplet loss."""
+    model, batch = from_params(params), torch.tensor(images)
+    truth = None if maps is None else torch.tensor(maps, dtype=torch.int64)
+    adam = torch.optim.Adam(model.parameters(), lr=config.optimizer.learning_rate, fused=True)
+
+    def loss_of(batch: Tensor, truth: Tensor | None) -> Tensor:
+        return joint_loss(*model(batch, segment=truth is not None), truth, config.loss)
+
+    forward = torch.compile(loss_of, dynamic=False) if compiled else loss_of
+
+    def job() -> np.ndarray:
+        loss = forward(batch, truth)
+        adam.zero_grad()
+        loss.backward()
+        norm = nn.utils.get_total_norm(parameter.grad for parameter in model.parameters())
+        adam.step()
+        return np.array([loss.item(), norm.item()])
+
+    return job
