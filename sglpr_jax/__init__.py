@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from sglpr_jax.training.presets import load_preset as preset
     from sglpr_jax.training.recipe import TrainResult, train
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "bev": ("count_outside", "rasterize", "rasterize_labels", "rotate_image", "rotate_points"),

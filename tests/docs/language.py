@@ -53,7 +53,10 @@ def faults(page: Path) -> list[str]:
     found = list(sentences(page))
     faults = [f"{length(one)} words: {one}" for one in found if length(one) > MOST_WORDS]
     faults += [
-        f'"{word}": {one}' for one in found for word in VAGUE if re.search(rf"\b{re.escape(word)}\b", one, re.IGNORECASE)
+        f'"{word}": {one}'
+        for one in found
+        for word in VAGUE
+        if re.search(rf"\b{re.escape(word)}\b", one, re.IGNORECASE)
     ]
     mean = sum(map(length, found)) / max(len(found), 1)
     return [*faults, *([f"mean length {mean:.1f} words"] if mean > MEAN_WORDS else [])]
