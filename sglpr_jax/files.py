@@ -2,12 +2,13 @@
 
 import contextlib
 import errno
-import fcntl
 import functools
+import hashlib
 import json
 import os
 import re
 import shutil
+import tempfile
 import time
 import uuid
 import zipfile
@@ -16,6 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 ABANDONED_S = 3600
 """Age of unchanged temporary files, in seconds, after which they are considered left by a killed process."""
@@ -74,17 +80,39 @@ def alone_in(folder: Path) -> Iterator[None]:
     Raises:
       BlockingIOError: If another process holds the lock.
     """
+    busy = f"{folder}: expected exclusive use, found another process at work"
+    with _locked(folder, busy) if fcntl is not None else _locked_by_file(folder, busy):
+        yield
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, busy: str) -> Iterator[None]:
+    """Lock the folder itself. Without locks in the file system, nothing is locked."""
+    assert fcntl is not None
     held = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise BlockingIOError(f"{folder}: expected exclusive use, found another process at work") from error
+            raise BlockingIOError(busy) from error
         except OSError:  # the file system has no locks
             pass
         yield
     finally:
         os.close(held)
+
+
+@contextlib.contextmanager
+def _locked_by_file(folder: Path, busy: str) -> Iterator[None]:
+    """Lock a file in the system's temporary folder: Windows does not lock folders."""
+    import filelock
+
+    name = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
+    try:
+        with filelock.FileLock(Path(tempfile.gettempdir()) / f"sglpr-jax-{name}.lock", timeout=0):
+            yield
+    except filelock.Timeout as error:
+        raise BlockingIOError(busy) from error
 
 
 def write_text(path: Path, text: str) -> None:

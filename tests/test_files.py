@@ -1,6 +1,8 @@
 """A file or folder is written whole or not at all, and errors of writing name it."""
 
 import os
+import subprocess
+import sys
 import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from sglpr_jax import files
 from sglpr_jax.files import (
     ABANDONED_S,
     WriteError,
@@ -91,7 +94,10 @@ def test_what_was_left_long_ago_is_removed_and_nothing_else(tmp_path):
     assert names(tmp_path) == sorted([half[2].name, ".mine.tmp", "08.tmp", "a.json"])
 
 
-def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path):
+@pytest.mark.parametrize("system", ["posix", "windows"])
+def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path, monkeypatch, system):
+    if system == "windows":  # which has no fcntl
+        monkeypatch.setattr(files, "fcntl", None)
     with (
         alone_in(tmp_path),
         pytest.raises(BlockingIOError, match=rf"^{tmp_path}: expected .* found another process"),
@@ -100,6 +106,19 @@ def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path
         pass
     with alone_in(tmp_path):
         assert names(tmp_path) == []
+
+
+def test_the_package_works_without_fcntl():
+    code = """
+import sys
+sys.modules["fcntl"] = None  # importing it fails, as on Windows
+import numpy as np, sglpr_jax
+params = sglpr_jax.load("sglpr")
+points = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
+assert sglpr_jax.describe(params, sglpr_jax.scan_image(points, params.config)).shape == (256,)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):
