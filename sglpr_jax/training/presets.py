@@ -30,3 +30,7 @@ def load_preset(name: str) -> TrainConfig:
     if not isinstance(config, TrainConfig):
         raise ValueError(f"{path}: expected CONFIG, a TrainConfig, found {type(config).__name__}")
     return config
+
+
+preset = load_preset
+"""The public name, `sglpr_jax.preset`."""
