@@ -1,12 +1,14 @@
-"""The sentences of a page, and what is wrong with their English."""
+"""The sentences of pages and docstrings, and what is wrong with their English."""
 
+import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 MEAN_WORDS, MOST_WORDS = 16.0, 35
-"""Limits of the length of a sentence: over a page, and each."""
+"""Maximum number of words of a sentence: mean over a file, and each."""
 VAGUE = (
+    "are none",
     "as it is",
     "goes around",
     "hand in",
@@ -17,8 +19,8 @@ VAGUE = (
     "of such",
     "of those",
     "of which",
-    "said",
-    "so far as",
+    "refused",
+    "refuses",
     "so many",
     "that which",
     "throw-away",
@@ -27,8 +29,8 @@ VAGUE = (
 """Words that stand where a noun or a plain verb should."""
 
 
-def sentences(page: Path) -> Iterator[str]:
-    """Sentences of the running text: headings, code, tables and HTML are left out; a link is its text."""
+def sentences_of_page(page: Path) -> Iterator[str]:
+    """Sentences of the running text. Headings, code, tables and HTML are left out; a link is its text."""
     text = re.sub(r"^(```|~~~).*?^\1", "\n", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r"<[^>]+>|!\[[^\]]*\]\([^)]*\)", " ", text)
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
@@ -38,19 +40,28 @@ def sentences(page: Path) -> Iterator[str]:
             yield from _split(re.sub(r"^(?:[*-]|\d+\.) ", "", line))
 
 
+def sentences_of_code(path: Path) -> Iterator[str]:
+    """Sentences of the docstrings of a file, without their examples."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            text = node.value.value.partition("Example:")[0]
+            for block in re.split(r"\n\s*\n|\n(?=\s*(?:[*-]|[\w*]+:) )", text):
+                yield from _split(" ".join(block.split()))
+
+
 def _split(line: str) -> Iterator[str]:
     line = re.sub(r"`[^`]*`", "CODE", line)
     yield from filter(None, (part.strip() for part in re.split(r"(?<=[.!?])[\"*)]*\s+(?=[\"*(A-Z0-9])", line)))
 
 
 def length(sentence: str) -> int:
-    """Number of words; code, numbers and punctuation between them are one word each at most."""
+    """Number of words, without numbers and punctuation."""
     return len(re.findall(r"[A-Za-z][\w'-]*", sentence))
 
 
-def faults(page: Path) -> list[str]:
-    """What breaks the rules on a page, a line each."""
-    found = list(sentences(page))
+def faults(sentences: Iterable[str]) -> list[str]:
+    """What breaks the rules, a line each."""
+    found = list(sentences)
     faults = [f"{length(one)} words: {one}" for one in found if length(one) > MOST_WORDS]
     faults += [
         f'"{word}": {one}'
