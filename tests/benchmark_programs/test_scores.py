@@ -33,7 +33,7 @@ def test_two_ways_of_training_are_compared_seed_by_seed(tmp_path):
         return str(tmp_path / name)
 
     good, bad = ([written(f"{noise}-{seed}.npz", noise) for seed in (1, 2)] for noise in (0.05, 2.0))
-    output = printed("speed.paired", "--ours", *good, "--others", *bad)
+    output = printed("quality.paired", "--ours", *good, "--others", *bad)
     (row,) = [line for line in output.splitlines() if "top1-f1max" in line]
     ours, others, difference, each, interval = (cell.strip() for cell in row.split("│")[2:-1])
     assert float(ours) == 1 and 0 < float(others) < 0.9

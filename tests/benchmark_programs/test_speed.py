@@ -139,7 +139,7 @@ def test_index_is_timed_beside_others():
 def test_missing_torch_is_one_clear_error(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(SystemExit, match=r"PyTorch.*pip install 'sglpr-jax\[torch\]'"):
-        importlib.import_module(name).main()
+        importlib.import_module(f"benchmarks.torch_peer.{name}").main()
 
 
 def test_a_missing_compiler_is_one_clear_error(monkeypatch):

@@ -104,7 +104,7 @@ def test_a_program_is_written_in_place_of_weights(command, weights, tmp_path):
 
 def test_flags_of_weights_are_refused_beside_a_program(command, weights, tmp_path):
     ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--format", "onnx", "--half")
-    assert_one_line_error(ended, "expected --half with --format weights alone, found it with onnx")
+    assert_one_line_error(ended, "expected --half only with --format weights, found it with onnx")
     assert not (tmp_path / "out").exists()
 
 
@@ -125,5 +125,5 @@ def test_an_average_is_that_of_the_weights_named_with_and_without_the_head(comma
 
 def test_shares_without_an_average_are_refused(command, weights, tmp_path):
     ended = command("export", "--weights", weights, "--shares", "1", "--out", tmp_path / "out")
-    assert_one_line_error(ended, "expected --shares with --average alone, found it without")
+    assert_one_line_error(ended, "expected --shares only with --average, found it without")
     assert not (tmp_path / "out").exists()

@@ -118,8 +118,8 @@ def test_from_an_mcap_to_a_graph_and_a_corrected_trajectory(command, drive, mcap
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") >= 3
     judged = given == "a file"  # by the poses of the bag, but not where these are the odometry themselves
-    assert ("RMSE after alignment, by /odom" in page) == judged
-    assert ("is not known: the recording has no poses to judge by" in page) != judged
+    assert ("RMSE after alignment with /odom" in page) == judged
+    assert ("is not known: the recording has no poses" in page) != judged
 
 
 def test_a_map_takes_the_poses_of_its_bag(command, mcap, odometry, tmp_path):
@@ -140,7 +140,7 @@ def test_a_bag_without_rotations_is_no_odometry_and_another_bag_neither(command,
     bag = write_bag(tmp_path / "scans.bag", "ros1", clouds)
     run = ("loops", bag, "--out", tmp_path / "found", "--odometry")
     assert_one_line_error(command(*run, bag), "scans.bag: expected a bag with poses", "found no poses")
-    assert_one_line_error(command(*run, mcap), "drive.mcap: expected odometry from a file", "found another bag")
+    assert_one_line_error(command(*run, mcap), "drive.mcap: expected a file of odometry", "found another bag")
     still = write_bag(
         tmp_path / "still.bag", "ros1", [("/tf", TRANSFORMS, START_S, transforms("ros1", START_S, [BASE]))]
     )

@@ -59,7 +59,7 @@ def test_poses_of_other_times_serve_embedding_and_scoring_alike(command, scans, 
     late = write(tmp_path / "late.tum", positions, 1.1 * times + 1e6)
     for run in (("embed", *given, "--out", tmp_path / "late.npz"), ("evaluate", tmp_path / "bare.npz")):
         assert_one_line_error(
-            command(*run, "--poses", late), "late.tum", "expected 40 poses, one for each", "found 40 of"
+            command(*run, "--poses", late), "late.tum", "expected 40 poses, one for each", "found 40 from"
         )
 
 

@@ -45,7 +45,7 @@ def mixed(town, images, preset, tmp_path_factory):
 @pytest.mark.slow
 def test_a_run_of_two_sources_learns_places_and_semantics(mixed, town):
     out, _, ended = mixed
-    assert "training on 00; testing on 06" in ended.error and f"training on 00, 05, 08 of {town} too" in ended.error
+    assert "training on 00; testing on 06" in ended.error and f"also training on 00, 05, 08 of {town}" in ended.error
     lines = read_metrics(out / "metrics.jsonl")
     steps = [line for line in lines if "loss" in line]
     assert len(steps) == 6 and all(line["cross_entropy"] > 0 and line["dice"] > 0 for line in steps)
@@ -87,7 +87,7 @@ def test_also_needs_its_tuples_and_may_not_be_the_tested_dataset(command, town, 
     options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
     assert_one_line_error(command("train", *options, "--also", town), "3 of its recordings and 0 tuples")
     assert_one_line_error(command("train", *options, "--also-tuples", 1), "0 of its recordings and 1 tuples")
-    assert_one_line_error(command("train", *options, "--also", images), images, "expected another dataset")
+    assert_one_line_error(command("train", *options, "--also", images), images, "expected a dataset other than --data")
     assert_one_line_error(command("train", *options, "--also-tuples", 2), "fewer than the 2 tuples")
     assert not (tmp_path / "run").exists()
 

@@ -88,7 +88,7 @@ def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_ca
     )
     percent, degrees = map(
         float,
-        re.search(r"--drift-percent (\S+) --drift-deg-per-100m (\S+)\.$", message.split(" If the poses")[0]).groups(),
+        re.search(r"--drift-percent (\S+) --drift-deg-per-100m (\S+)\.$", message.split(" Check also")[0]).groups(),
     )
     assert 5 < percent < 20 and 2 < degrees < 10
     drift = DriftModel(percent / 100, degrees / 100)

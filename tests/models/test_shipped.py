@@ -154,7 +154,7 @@ def test_half_precision_is_half_as_large_and_describes_places_all_but_the_same(p
 def test_a_weight_too_large_for_half_precision_is_named(params, tmp_path):
     kernel = params.weights["segmentation_head"]["kernel"].at[0, 0].set(70_000.0)
     large = Params({**params.weights, "segmentation_head": {"kernel": kernel}}, params.config)
-    with pytest.raises(ValueError, match=r"segmentation_head/kernel: expected weights up to 65504"):
+    with pytest.raises(ValueError, match=r"segmentation_head/kernel: expected values up to 65504"):
         save(large, tmp_path / "weights", half=True)
     assert not list(tmp_path.iterdir())
 

@@ -200,7 +200,7 @@ def test_nothing_but_bad_scans_is_an_error(scans):
 
 
 def test_scans_without_a_grid_are_refused(scans):
-    with pytest.raises(ValueError, match="scans need a grid"):
+    with pytest.raises(ValueError, match="expected a grid"):
         embed_images(flatten, scans, None, config={})
 
 
