@@ -77,7 +77,7 @@ def test_derivatives_are_those_of_finite_differences(size, strides, circular, ch
     def convolved(x, kernel):  # finite differences are of numpy arrays
         return convolve(jnp.asarray(x), jnp.asarray(kernel), strides, circular)
 
-    check_grads(convolved, image_and_kernel((2, 5, 6, channels), size), order=2, atol=1e-2, rtol=1e-2)
+    check_grads(convolved, image_and_kernel((2, 5, 6, channels), size), order=2, atol=3e-2, rtol=3e-2)  # float32: 1.5 %
 
 
 @pytest.mark.parametrize("size, strides, circular", CASES)

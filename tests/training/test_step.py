@@ -239,7 +239,7 @@ def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, ran
     assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
     relabelled = batch.replace(classes=(batch.classes + 1) % 20)
     assert gradients_of(params, relabelled, config)[1]["triplet"] != metrics["triplet"]
-    with pytest.raises(ValueError, match="expected maps of classes"):
+    with pytest.raises(ValueError, match="expected class maps"):
         gradients_of(params, batch.replace(classes=None), config)
 
 
