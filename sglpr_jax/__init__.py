@@ -15,7 +15,7 @@
   `save_program`
 - simulate recordings with labels: `simulate`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
-- configure a model: `ModelConfig`, its backbones `SwinConfig`, `RingConfig`, `SglprConfig`, its `HeadConfig`
+- configure a model: `ModelConfig`, its backbones `SwinConfig`, `CircularConfig`, `SglprConfig`, its `HeadConfig`
 """
 
 import lazy_loader

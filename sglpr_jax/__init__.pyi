@@ -46,7 +46,7 @@ from .loops.odometry import read_odometry as read_odometry
 from .loops.optimization import optimize_trajectory as optimize_trajectory
 from .loops.places import PlaceMap as PlaceMap
 from .models.average import average as average
-from .models.backbones.rings_config import RingConfig as RingConfig
+from .models.backbones.circular_config import CircularConfig as CircularConfig
 from .models.backbones.sglpr_config import SglprConfig as SglprConfig
 from .models.backbones.swin_config import SwinConfig as SwinConfig
 from .models.config import HeadConfig as HeadConfig

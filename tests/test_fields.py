@@ -74,7 +74,7 @@ def test_anything_else_is_one_error_with_field_expected_and_found(values, messag
         (ModelConfig, dict(blind_m=float("nan"))),
         (ModelConfig, dict(blind_m=-2.0)),
         (ModelConfig, dict(range_channel=1)),
-        (ModelConfig, dict(backbone="rings")),
+        (ModelConfig, dict(backbone="circular")),
         (SwinConfig, dict(heads=(5, 6, 12, 24))),
         (SglprConfig, dict(depths=(), heads=())),
         (TupleConfig, dict(positives=0)),

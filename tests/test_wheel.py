@@ -45,7 +45,7 @@ def installed(tmp_path_factory):
 def test_the_package_is_the_wheel_s(installed):
     ended = installed("python", "-c", "import sglpr_jax; print(sglpr_jax.__file__, sglpr_jax.shipped_weights())")
     assert str(ROOT) not in ended.stdout and "site-packages" in ended.stdout, ended.stdout + ended.stderr
-    assert "'rings', 'sglpr'" in ended.stdout
+    assert "'circular', 'sglpr'" in ended.stdout
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -59,7 +59,7 @@ def test_the_whole_job_without_the_checkout(installed):
     """Simulate, embed, evaluate, segment."""
     for command in (
         ("sglpr-simulate", "--out", "town", "--seq", "08", "--scans", 12, "--azimuth-steps", 60),
-        ("sglpr-embed", "--weights", "rings", "--data", "town", "--seq", "08", "--out", "08.npz"),
+        ("sglpr-embed", "--weights", "circular", "--data", "town", "--seq", "08", "--out", "08.npz"),
         ("sglpr-evaluate", "08.npz", "--protocol", "pairs-f1max"),
         ("sglpr-segment", "--weights", "sglpr", "--data", "town", "--seq", "08", "--out", "maps"),
     ):

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 ROUTES = ("00", "02", "05", "06", "07", "08")
-PRESETS = ("rings", "small", "sglpr", "paper-112", "paper")
+PRESETS = ("circular", "sglpr", "paper-112", "paper")
 TYPES = ("bfloat16", "float32")
 TRAINING_SHARE = 0.85
 """Of the minutes; in the rest of them a checkpoint is written and the weights are tested."""

@@ -56,7 +56,7 @@ def describe(sequence: Recording) -> str:
 def score(name: str, sequence: Recording, seed: int | None) -> Score:
     """Describe the sequence, and score; comparing the queries with the rest is what a pair takes."""
     start = time.perf_counter()
-    file = embed(handcrafted(name, sequence, model_preset("small").grid), sequence, rotation_seed=seed)
+    file = embed(handcrafted(name, sequence, model_preset("sglpr").grid), sequence, rotation_seed=seed)
     described = time.perf_counter()
     result = top1_f1max(file)
     compared = time.perf_counter()

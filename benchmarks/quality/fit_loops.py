@@ -1,7 +1,7 @@
 """Fit the models of loops that ship with the package: how probable it is that two scans show one place.
 
     python -m benchmarks.quality.repeating_scans --seeds 1 2 --out build/fit
-    python -m benchmarks.quality.fit_loops build/fit --weights sglpr rings
+    python -m benchmarks.quality.fit_loops build/fit --weights sglpr circular
 
 Every drive is searched by the loop detector's finder, one candidate a scan. A pair is a loop if its scans are at most
 half as far apart as frames of other places (`other_m`, at most 10 m), and none beyond that. All sceneries count alike,
@@ -44,7 +44,7 @@ class Pairs(NamedTuple):
 def main(
     drives: tyro.conf.Positional[Path],
     *,
-    weights: tuple[str, ...] = ("sglpr", "rings"),
+    weights: tuple[str, ...] = ("sglpr", "circular"),
     left_out: tuple[str, ...] = LEFT_OUT,
     workers: int = 1,
     out: Path = DEFAULTS,

@@ -56,7 +56,7 @@ def main(
     towns: Sequence[str] = ("08:101", "00:102", "06:103"),
     scans: int = 1200,
     azimuth_steps: int = 900,
-    weights: str = "rings",
+    weights: str = "circular",
     registered: bool = False,
 ) -> None:
     """Print a table for each town.

@@ -38,7 +38,7 @@ class Command:
     """Metres above the road."""
     pitches: tuple[float, ...] = (0.0, 10.0)
     """Degrees by which the sensor looks down."""
-    weights: str = "rings"
+    weights: str = "circular"
     azimuth_steps: int = 600
     seed: int = 11
 

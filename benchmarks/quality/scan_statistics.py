@@ -12,13 +12,13 @@ from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.labels import CATEGORIES
 from sglpr_jax.models.presets import model_preset
 
-GRID = model_preset("small").grid
+GRID = model_preset("sglpr").grid
 
 Measures = Mapping[str, np.ndarray]
 
 NUMBERS = {
     "points": "points of a scan",
-    "occupied": "occupied cells of the small preset's grid, %",
+    "occupied": "occupied cells of the preset `sglpr`'s grid, %",
     "image_occupied": "density image: pixels above 0, %",
     "image_value": "density image: mean of the pixels above 0 (of 255)",
 }

@@ -26,7 +26,7 @@ OUT = "out"
 """What a command writes goes in here, in the folder that it is started in; so its name is always the same."""
 ERRORS = "stderr"
 TIMEOUT_S = 900
-TINY = Path(__file__).resolve().parents[1] / "tiny.py"
+TINY = "tiny"
 """The preset that trainings take."""
 DRIVE = "--azimuth-steps 60 --sensor vlp16"
 SCANS = "sequences/08/velodyne"
@@ -64,14 +64,14 @@ TRAINED = f"--seq 08 --data {TOWN} --preset {TINY} --steps 8 --method solid"
 WRITERS = {
     writer.name: writer
     for writer in (
-        Writer("embed", f"--weights rings --data {TOWN} --seq 08 --out {OUT}/08.npz"),
+        Writer("embed", f"--weights circular --data {TOWN} --seq 08 --out {OUT}/08.npz"),
         Writer("evaluate", f"../{INPUTS}/08.npz --data {TOWN} --seq 08 --out {OUT}/08"),
         Writer("simulate", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12"),
         Writer("simulate images", f"--out {OUT}/town {DRIVE} --seq 08 --scans 12 --images"),
-        Writer("export", f"--weights rings --out {OUT}/mine", refuses="does not exist yet"),
+        Writer("export", f"--weights circular --out {OUT}/mine", refuses="does not exist yet"),
         Writer(
             "export stablehlo",
-            f"--weights rings --format stablehlo --out {OUT}/mine",
+            f"--weights circular --format stablehlo --out {OUT}/mine",
             refuses="does not exist yet",
         ),
         Writer(

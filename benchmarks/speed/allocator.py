@@ -27,7 +27,7 @@ class Used(NamedTuple):
     peak_gb: float
 
 
-def main(*, preset: str = "rings", repeats: int = 10, steps: int = 2, points: int = 4096, threads: int = 2) -> None:
+def main(*, preset: str = "circular", repeats: int = 10, steps: int = 2, points: int = 4096, threads: int = 2) -> None:
     """Time steps on the CPU in two processes in turn, one of each setting.
 
     Args:

@@ -28,7 +28,7 @@ BATCH = 8
 def main(
     *,
     data: Path | None = None,
-    weights: tuple[str, ...] = ("sglpr", "rings"),
+    weights: tuple[str, ...] = ("sglpr", "circular"),
     scans: int = 640,
     repeats: int = 3,
     azimuth_steps: int = 1800,

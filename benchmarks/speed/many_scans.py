@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from benchmarks.tiny import MODEL
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.sim.recording import simulate_recording
@@ -58,4 +57,4 @@ def write_scans(folder: Path, *, count: int, points: int) -> None:
 
 def tiny_network() -> Params:
     """The model of the tiny preset, as drawn."""
-    return init(jax.random.key(0), config=MODEL)
+    return init(jax.random.key(0), preset="tiny")

@@ -1,6 +1,6 @@
 """Where the time of a training step goes: part by part of the network, forward and backward, beside its floor.
 
-    python -m benchmarks.speed.profile_step --preset rings sglpr
+    python -m benchmarks.speed.profile_step --preset circular sglpr
 
 JAX's profiler tells how long each compiled operation ran, and its metadata which line of the network it comes from. The
 floor of a part is what its matrix products and convolutions would take at the rate of one large matrix product.
@@ -41,7 +41,7 @@ OPERATION = re.compile(r"^\s*(?:ROOT )?%?(\S+) = .*? ([\w-]+)\(.*op_name=\"([^\"
 
 
 def main(
-    *, preset: tuple[str, ...] = ("rings", "small", "sglpr"), steps: int = 3, labels: bool = True, depth: int = 2
+    *, preset: tuple[str, ...] = ("circular", "sglpr"), steps: int = 3, labels: bool = True, depth: int = 2
 ) -> None:
     """Print a table for each preset.
 

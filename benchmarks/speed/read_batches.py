@@ -24,7 +24,7 @@ def main(
     cache: Path,
     *,
     seqs: tuple[str, ...] = (),
-    preset: str = "small",
+    preset: str = "sglpr",
     count: int = 4,
     repeats: int = 10,
     cold: bool = False,

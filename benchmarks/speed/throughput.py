@@ -32,7 +32,7 @@ Job = Callable[[], Any]
 
 def main(
     *,
-    preset: tuple[str, ...] = ("small",),
+    preset: tuple[str, ...] = ("sglpr",),
     compute: tuple[str, ...] = (),
     tuples: int | None = None,
     labels: bool = True,

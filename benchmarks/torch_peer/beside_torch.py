@@ -21,7 +21,7 @@ from benchmarks.speed.ratio import (
     warn_if_busy,
 )
 
-Preset = Literal["rings", "sglpr", "small", "paper"]
+Preset = Literal["circular", "sglpr", "paper"]
 """The models of which there is a PyTorch counterpart."""
 
 

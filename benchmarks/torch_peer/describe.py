@@ -13,7 +13,7 @@ from sglpr_jax.models.sglpr import describe
 
 def main(
     *,
-    preset: Preset = "small",
+    preset: Preset = "sglpr",
     batch: int = 1,
     repeats: int = 20,
     calls: int = 1,

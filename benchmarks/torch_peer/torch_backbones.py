@@ -2,9 +2,9 @@
 
 from torch import Tensor, nn
 
-from benchmarks.torch_peer.torch_rings import RingDecoder, RingNet
+from benchmarks.torch_peer.torch_circular import CircularDecoder, CircularNet
 from benchmarks.torch_peer.torch_swin import PatchExpand, SwinUnet, Windows
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.config import ModelConfig
 
@@ -33,15 +33,15 @@ class Swin(nn.Module):
         return self.expand(features)
 
 
-class Rings(nn.Module):
-    """The ring net, and its decoder."""
+class Circular(nn.Module):
+    """The circular CNN, and its decoder."""
 
     def __init__(self, config: ModelConfig):
         super().__init__()
-        self.rings = RingNet(config.channels, config.backbone)
+        self.rings = CircularNet(config.channels, config.backbone)
         self.pixel_size = averaged(config, config.backbone)
         if decodes(config):
-            self.decoder = RingDecoder(config.backbone.width, config.channels, config.backbone)
+            self.decoder = CircularDecoder(config.backbone.width, config.channels, config.backbone)
             self.width = self.decoder.width
 
     def forward(self, image: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -55,7 +55,7 @@ class Rings(nn.Module):
 
 
 class Sglpr(nn.Module):
-    """The Swin-Unet on the tokens of the ring net, and the ring net's decoder."""
+    """The Swin-Unet on the tokens of the circular CNN, and the circular CNN's decoder."""
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -63,10 +63,10 @@ class Sglpr(nn.Module):
         rows, columns = (edge // token for edge, token in zip(config.image_size, own.token, strict=True))
         windows = Windows(own.window, own.mlp_ratio, circular=True, shift_each_way=True)
         swin_unet = SwinUnet(own.stem.width, (rows, columns), own, windows, patch=1)
-        self.backbone = nn.ModuleDict({"stem": RingNet(config.channels, own.stem), "swin_unet": swin_unet})
+        self.backbone = nn.ModuleDict({"stem": CircularNet(config.channels, own.stem), "swin_unet": swin_unet})
         self.pixel_size = averaged(config, own.stem)
         if decodes(config):
-            self.decoder = RingDecoder(own.width, config.channels, own.stem)
+            self.decoder = CircularDecoder(own.width, config.channels, own.stem)
             self.width = self.decoder.width
 
     def forward(self, image: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -79,7 +79,7 @@ class Sglpr(nn.Module):
         return self.decoder([*finer, features])
 
 
-BACKBONES = {"swin": Swin, "rings": Rings, "sglpr": Sglpr}
+BACKBONES = {"swin": Swin, "circular": Circular, "sglpr": Sglpr}
 """By the kind that their configuration names."""
 
 
@@ -88,7 +88,7 @@ def decodes(config: ModelConfig) -> bool:
     return config.segments or config.head.tap == "pixels"
 
 
-def averaged(config: ModelConfig, rings: RingConfig) -> tuple[int, int]:
+def averaged(config: ModelConfig, rings: CircularConfig) -> tuple[int, int]:
     """Rows and columns of the averaged image."""
     rows, columns = (edge // rings.average for edge in config.image_size)
     return rows, columns

@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from benchmarks.torch_peer.torch_circular import CircularBlock
 from benchmarks.torch_peer.torch_layers import Convolution, means
-from benchmarks.torch_peer.torch_rings import RingBlock
 from sglpr_jax.models.config import HeadConfig
 
 
@@ -19,7 +19,7 @@ class Place(nn.Module):
         self.steps, self.means = len(config.channels), config.means
         for i, (inputs, outputs, kernel, stride) in enumerate(shapes):
             if config.means:
-                self.add_module(f"block_{i}", RingBlock(inputs, outputs, stride))
+                self.add_module(f"block_{i}", CircularBlock(inputs, outputs, stride))
                 continue
             self.add_module(
                 f"convolution_{i}", Convolution(inputs, outputs, kernel, (stride, stride), circular=circular)

@@ -24,7 +24,7 @@ CHECKED_STEPS = 2
 
 def main(
     *,
-    preset: Preset = "small",
+    preset: Preset = "sglpr",
     labels: bool = True,
     repeats: int = 10,
     chunk: tuple[int, ...] = (0,),

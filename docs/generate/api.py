@@ -11,7 +11,7 @@ GROUPS = {
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],
     "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],
-    "What a model is": ["ModelConfig", "SwinConfig", "RingConfig", "SglprConfig", "HeadConfig"],
+    "What a model is": ["ModelConfig", "SwinConfig", "CircularConfig", "SglprConfig", "HeadConfig"],
     "Images of a scan": ["Grid", "rasterize", "rasterize_labels", "density_bev", "rotate_image", "rotate_points"],
     "Labels": ["CATEGORIES", "taxonomy", "to_classes"],
 }

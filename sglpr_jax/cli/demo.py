@@ -1,4 +1,4 @@
-"""bin/demo: simulate, train, embed and evaluate in minutes."""
+"""bin/demo: simulate a town, find loops with the shipped weights, and show a short training."""
 
 import dataclasses
 import shutil
@@ -7,61 +7,72 @@ from pathlib import Path
 
 from sglpr_jax.cli.embed import EmbedCommand, embed_recording
 from sglpr_jax.cli.evaluate import EvaluateCommand, evaluate_file
+from sglpr_jax.cli.loops import LoopsCommand, loops_of_recording
 from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import own_names, parse_command, run
+from sglpr_jax.fields import CountOrNone
 from sglpr_jax.methods.names import SHIPPED, UNTRAINED
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 SCANS = 300
 AZIMUTH_STEPS = 450
 TESTED = "00"
-PRESET = "demo"
+PRESET = "circular"
 WEIGHTS = DEFAULT_WEIGHTS
-BESIDE = (SHIPPED, UNTRAINED, "thumbnail", "polar-fft")
+BESIDE = (UNTRAINED, SHIPPED)
 
 
 @dataclasses.dataclass(frozen=True)
 class DemoCommand:
-    """Fine-tune the shipped weights on two simulated recordings, and find the revisits of a third one that is held out.
+    """Find the loops of a simulated recording with the shipped weights, score their descriptors, and train briefly.
 
-    The third recording is 00, whose revisits have the same direction. The unchanged shipped weights and methods without
-    training are scored for comparison.
+    The training shows the command at work on two other recordings. It is far too short to reach the shipped weights.
     """
 
     out: Path = Path("runs/demo")
     """Output folder. The training run of an earlier demo is replaced; its simulated recordings are kept."""
     scans: int = SCANS
     """Scans of each recording."""
-    steps: int | None = None
-    """Training steps. None: the preset's."""
+    steps: CountOrNone = 20
+    """Training steps. 0: no training."""
 
 
 def demo(command: DemoCommand) -> Path:
     """Run the command. Returns the output folder."""
-    from sglpr_jax.cli.datasets import simulate  # slow imports, not needed for --help
-    from sglpr_jax.cli.train import TrainCommand, train_and_test
+    from sglpr_jax.cli.datasets import simulate  # slow import, not needed for --help
+    from sglpr_jax.evaluation.page.of_loops import PAGE as LOOPS_PAGE
     from sglpr_jax.evaluation.page.writing import PAGE
+
+    out, town = command.out, command.out / "town"
+    simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)
+    source = PosedRecordingOptions(seq=TESTED)
+
+    _title(f"loops of recording {TESTED}: bin/loops")
+    loops_of_recording(LoopsCommand(town, source=source, weights=WEIGHTS, out=out / "loops"))
+    _title("its descriptors and their score: bin/embed, bin/evaluate")
+    file = out / f"{TESTED}.npz"
+    embed_recording(EmbedCommand(data=town, source=source, weights=WEIGHTS, out=file))
+    evaluate_file(EvaluateCommand(file, data=town, source=source, weights=WEIGHTS))
+    if command.steps:
+        _title(f"{command.steps} steps of training, to show the command; thousands would be needed: bin/train")
+        _train(town, out / "run", command.steps)
+    print(f"\npages: {out / 'loops' / LOOPS_PAGE}, {out / TESTED / PAGE}")
+    return out
+
+
+def _train(town: Path, out: Path, steps: int) -> None:
+    from sglpr_jax.cli.train import TrainCommand, train_and_test
     from sglpr_jax.training.presets import load_preset
 
-    town, trained = command.out / "town", command.out / "run"
-    simulate(town, scans=command.scans, azimuth_steps=AZIMUTH_STEPS, seed=0)
-    if trained.exists():
-        shutil.rmtree(trained)
-    config = load_preset(PRESET)
-    config = config if command.steps is None else dataclasses.replace(config, steps=command.steps)
-    train_and_test(
-        TrainCommand(seq=TESTED, data=town, preset=PRESET, weights=WEIGHTS, method=BESIDE, out=trained, config=config),
-        go_on="the next demo restarts its training",
-    )
-    print(own_names("\nthe same with two commands: bin/embed, then bin/evaluate"), file=sys.stderr)
-    source, weights = PosedRecordingOptions(seq=TESTED), str(trained)
-    file = command.out / f"{TESTED}.npz"
-    embed_recording(EmbedCommand(data=town, source=source, weights=weights, out=file))
-    evaluate_file(EvaluateCommand(file, data=town, source=source, weights=weights))
-    pictures = sorted([*trained.glob("test/*.png"), *(command.out / TESTED).glob("*.png")])
-    print("pictures:", *pictures, sep="\n  ")
-    print(f"all on one page: {command.out / TESTED / PAGE}")
-    return command.out
+    if out.exists():
+        shutil.rmtree(out)
+    config = dataclasses.replace(load_preset(PRESET), steps=steps, score_every=steps)
+    command = TrainCommand(seq=TESTED, data=town, preset=PRESET, method=BESIDE, out=out, config=config)
+    train_and_test(command, go_on="the next demo restarts its training")
+
+
+def _title(text: str) -> None:
+    print(own_names(f"\n{text}"), file=sys.stderr)
 
 
 def main() -> None:

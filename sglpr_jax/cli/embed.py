@@ -16,7 +16,7 @@ class EmbedCommand:
     """Write one descriptor per scan, with ids, and with positions and times if available.
 
     Example:
-      bin/embed --weights runs/small-08 --data KITTI --seq 08 --out 08.npz
+      bin/embed --weights runs/sglpr-08 --data KITTI --seq 08 --out 08.npz
       bin/embed --data my_scans/ --out mine.npz --skip-bad
       bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz

@@ -18,7 +18,7 @@ class ExportCommand:
     """Write weights that describe places, without the segmentation head, or a program that contains them.
 
     Example:
-      bin/export --weights runs/small-08 --out mine --half
+      bin/export --weights runs/sglpr-08 --out mine --half
       bin/export --whiten my_scans/ --out mine      for your own sensor, without labels or poses
       bin/export --format onnx --out mine           for other runtimes
       bin/export --weights runs/b --average runs/a --shares 0.6 0.4 --out mine

@@ -35,7 +35,7 @@ class ReproduceCommand:
 
     Example:
       bin/reproduce table4 figure9 --plan                          prints the missing trainings and their duration
-      bin/reproduce all                                            on the simulated recordings, preset small
+      bin/reproduce all                                            on the simulated recordings, preset sglpr
       bin/reproduce table1 table2 --data KITTI --preset paper
     """
 
@@ -45,7 +45,7 @@ class ReproduceCommand:
     """Folder of the dataset: KITTI's layout, or ready-made BEV images. None: the simulated recordings."""
     nclt: Path | None = None
     """Sessions in NCLT's layout, for table 3 and figure 8. The first is the database. None: simulated sessions."""
-    preset: str = "small"
+    preset: str = "sglpr"
     """Name of a file in configs/, or path of your own file."""
     seq: tuple[str, ...] = ()
     """Recordings to test on. If omitted, those of 00, 02, 05, 06, 07 and 08 that the dataset contains."""

@@ -19,7 +19,7 @@ class StressCommand:
     The same command continues an interrupted run. Existing descriptor files with the same inputs are reused.
 
     Example:
-      bin/stress --weights runs/small-08 --data KITTI --seq 08 --out stress-08
+      bin/stress --weights runs/sglpr-08 --data KITTI --seq 08 --out stress-08
       bin/stress --method scan-context solid --data KITTI --seq 08 --out stress-08 --corruption rotation beams-16
     """
 

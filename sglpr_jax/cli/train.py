@@ -41,7 +41,7 @@ class TrainCommand:
     """Train a model on all recordings of a dataset but one, and test it on that one (leave-one-out).
 
     Example:
-      bin/train --seq 08                                  on the simulated recordings, preset small
+      bin/train --seq 08                                  on the simulated recordings, preset sglpr
       bin/train --seq 08 --data KITTI --preset paper
       bin/train --seq 08 --data KITTI --resume            resumes a stopped run
       bin/train --seq 06 --data IMAGES --also SIMULATED --also-tuples 4     semantics from a second, labelled dataset
@@ -60,7 +60,7 @@ class TrainCommand:
     pseudo_labels: Path | None = None
     """Folder of label images NN/<id>.png that a model predicted for the images of --data. They are added to training
     recordings of images without labels. The tested recording never uses them."""
-    preset: str = "small"
+    preset: str = "sglpr"
     """Name of a file in configs/, or path of your own file."""
     out: Path | None = None
     """Folder of the run. None: runs/PRESET-SEQ."""

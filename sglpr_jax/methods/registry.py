@@ -24,7 +24,7 @@ from sglpr_jax.models.weights_file import load
 def method_named(name: str, weights: str | None, recording: Recording) -> Method:
     """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method."""
     if name != NETWORK:
-        return handcrafted(name, recording, model_preset("small").grid)
+        return handcrafted(name, recording, model_preset("sglpr").grid)
     return network(load(DEFAULT_WEIGHTS if weights is None else weights))
 
 

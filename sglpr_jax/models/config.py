@@ -11,11 +11,11 @@ from sglpr_jax.categories import RAW_IDS, Categories
 from sglpr_jax.data.density_grid import check_density_grid
 from sglpr_jax.fields import NotNegative, Size, SizeOrNone, Sizes, check_fields
 from sglpr_jax.grid import Grid, ImageKind
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.backbones.swin_config import SwinConfig
 
-BackboneConfig = SwinConfig | RingConfig | SglprConfig
+BackboneConfig = SwinConfig | CircularConfig | SglprConfig
 """All backbone configurations. `models/backbones/interface.py` defines the properties that they share."""
 
 WHITENING_POWER = 0.4
@@ -26,7 +26,7 @@ WHITENING_POWER = 0.4
 class HeadConfig:
     """Place head: CBAM, three convolutions and NetVLAD (section 4.1.2).
 
-    The paper gives no kernel sizes, strides or channels. The presets `paper` and `paper-head-b` are two interpretations
+    The paper gives no kernel sizes, strides or channels. The preset `paper` is one interpretation
     (docs/decisions/paper.md).
     """
 

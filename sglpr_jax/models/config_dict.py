@@ -8,6 +8,10 @@ from typing import Annotated, Any
 from sglpr_jax.fields import check_value, field_types, is_config, require
 from sglpr_jax.models.config import ModelConfig
 
+RENAMED = {"rings": "circular"}
+"""Kinds of backbones in files of earlier versions, and their names today."""
+REMOVED = (("backbone.stem", []),)
+"""Fields, with their values, that files of earlier versions have and today's configuration has not."""
 ADDED_LATER = {"head.means": (), "head.whiten": False, "backbone.fine": (), "backbone.stem.fine": ()}
 """Values of fields that are missing in files of earlier versions."""
 
@@ -30,6 +34,7 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 def _read(annotation: Any, value: Any, field: str) -> Any:
     """Converts a value to a field's type: dictionaries to dataclasses, lists to tuples, whole numbers to floats."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    value = _of_today(value, f"{field}." if field else "")
     if is_config(annotation):
         return _read_dataclass(annotation, value, field)
     if origin in (typing.Union, types.UnionType):
@@ -42,6 +47,15 @@ def _read(annotation: Any, value: Any, field: str) -> Any:
     check_value(value, annotation, field)
     plain = parts[0] if origin is Annotated else annotation
     return float(value) if plain is float else value
+
+
+def _of_today(value: Any, prefix: str) -> Any:
+    """The fields of a file of an earlier version, without removed ones and with the present name of its `kind`."""
+    if not isinstance(value, dict):
+        return value
+    known = {name: one for name, one in value.items() if (prefix + name, one) not in REMOVED}
+    old = known.get("kind")
+    return {**known, "kind": RENAMED[old]} if isinstance(old, str) and old in RENAMED else known
 
 
 def _read_dataclass(expected: Any, value: Any, field: str) -> Any:

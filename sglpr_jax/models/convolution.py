@@ -1,7 +1,6 @@
 """Convolution of the backbones and heads: XLA's in the forward pass, matrix products in the backward pass.
 
-Two cases use products in the forward pass, too. Convolutions with few input channels use one matrix product. On a CPU,
-convolutions with many channels use Winograd's method, which needs a quarter of the multiplications.
+Convolutions with few input channels use one matrix product in the forward pass, too.
 
 On a CPU, XLA computes the gradient of a kernel by a slow general loop if the step runs in chunks. The loop takes 27 to
 70 times as long as the products. Otherwise XLA takes up to 1.8 times as long as the products.
@@ -16,18 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.layers import product, weight
-from sglpr_jax.models.winograd import AT_ONCE as COLUMNS_AT_ONCE
-from sglpr_jax.models.winograd import winograd
 
 FEW_INPUTS = 16
 """Maximum kernel height times channels for which a matrix product takes half the time of XLA's convolution."""
 AT_ONCE = 4
 """Number of output columns in one row of the matrix product for few channels."""
-MANY_CHANNELS = 32
-"""Minimum number of input and of output channels for which sums of pixels cost less than the multiplications they
-save."""
-MANY_PIXELS = 1536
-"""Minimum number of pixels of all images together. Below it, the sums of the kernel cost as much as they save."""
 
 
 class Convolution(nn.Module):
@@ -60,10 +52,10 @@ def convolve(
 ) -> Float[Array, "b _ _ f"]:
     """Convolve images that are extended by a border, with the derivative of matrix products.
 
-    Few input channels and many channels are computed by `_as_products`, all others by XLA's convolution.
+    Convolutions with few input channels are computed by `as_product`, all others by XLA.
     """
-    if _few_inputs(kernel) or _saves_multiplications(x, kernel, strides):
-        return _as_products(x, kernel, strides, circular)
+    if _few_inputs(kernel):
+        return as_product(x, kernel, strides, circular)
     border = _border(kernel, strides)
     padding, axes = ((border, border), (0, 0)), ("NHWC", "HWIO", "NHWC")
     x = _columns_around(x, border, circular)
@@ -73,32 +65,8 @@ def convolve(
 @convolve.defjvp
 def _(strides: tuple[int, int], circular: bool, primals: tuple[Array, Array], tangents: tuple[Array, Array]):
     (x, kernel), (x_tangent, kernel_tangent) = primals, tangents
-    by_x = _as_products(x_tangent, kernel, strides, circular)
-    return convolve(x, kernel, strides, circular), by_x + _as_products(x, kernel_tangent, strides, circular)
-
-
-def _as_products(
-    x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
-) -> Float[Array, "b _ _ f"]:
-    if not _saves_multiplications(x, kernel, strides):
-        return as_product(x, kernel, strides, circular)
-    return winograd(x, kernel, strides[0], circular)
-
-
-def _saves_multiplications(
-    x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int]
-) -> bool:
-    """Whether Winograd's method saves time at sufficient precision.
-
-    On a GPU, cuDNN chooses its own method. The precision of bfloat16 is too low for sums of pixels. An exported program
-    accepts any number of images on any machine, so the choice is left to XLA.
-    """
-    images, height, width, _ = x.shape
-    suits = len(kernel) == 3 and strides[1] == 1 and width % COLUMNS_AT_ONCE == 0
-    if not suits or min(kernel.shape[2:]) < MANY_CHANNELS or not isinstance(images, int):
-        return False
-    enough = images * height * width >= MANY_PIXELS
-    return enough and x.dtype == jnp.float32 and jax.default_backend() == "cpu"
+    by_x = as_product(x_tangent, kernel, strides, circular)
+    return convolve(x, kernel, strides, circular), by_x + as_product(x, kernel_tangent, strides, circular)
 
 
 def as_product(

@@ -181,7 +181,7 @@ def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelCon
         raise ValueError(f"the place head of this model reads {config.head.input}: expected no labels, found {found}")
 
 
-def init(key: Array, *, preset: str = "small", config: ModelConfig | None = None) -> Params:
+def init(key: Array, *, preset: str = "sglpr", config: ModelConfig | None = None) -> Params:
     """Initialise the weights of a named preset, or of `config` if it is given.
 
     Only the weights that the configuration needs are created.

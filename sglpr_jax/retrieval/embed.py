@@ -5,7 +5,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,8 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.fields import Size, check_value
-from sglpr_jax.grid import Grid, ImageKind
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.method import DescribeFn, DescribeScanFn, ImageMethod, Method, ScanMethod
+from sglpr_jax.methods.method import DescribeFn, ImageMethod, Method, ScanMethod
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
@@ -64,44 +63,22 @@ def embed(
     """
     method = network(method) if isinstance(method, Params) else method
     _check(method, recording)
-    sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
-    config = {"data": recording.name, **sensor, **method.about}
     options = {"rotation_seed": rotation_seed, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
     if isinstance(method, ScanMethod):
-        about = {"config": config, "distance": method.distance, "labels": method.labels}
-        return embed_scans(method.describe, recording, **about, **options)
-    about = {"config": config, "weights_hash": method.weights_hash, "categories": method.categories}
-    about |= {"image": method.image, "field": method.field}
-    return embed_images(method.describe, recording, method.grid, **about, batch=batch, **options)
+        return embed_scans(method, recording, **options)
+    return embed_images(method, recording, batch=batch, **options)
 
 
 def embed_images(
-    describe: DescribeFn,
+    method: ImageMethod,
     recording: Recording,
-    grid: Grid | None,
     *,
-    config: dict[str, Any],
-    weights_hash: str = "",
-    categories: int = 0,
-    image: ImageKind = "points",
-    field: Bool[np.ndarray, "h w"] | None = None,
     rotation_seed: int | None = None,
     batch: int = 8,
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
-    """Describe the image of every scan of a recording. Arguments that are not listed are those of `embed`.
-
-    Arguments:
-      describe: Function from images, and maps of classes with `categories`, to descriptors.
-      recording: Scans or images to describe.
-      grid: Grid for rasterising scans and cropping ready-made images. None leaves images whole.
-      config: How the descriptors are made, for `DescriptorFile.config`.
-      weights_hash: Hash of the weights. Empty for a method without weights.
-      categories: Number of classes of the maps. With 0, labels are not read.
-      image: Kind of image to compute from scans.
-      field: Cells that the method uses, or None for all.
-    """
+    """Describe the image of every scan of a recording. The arguments are those of `embed`."""
     check_value(batch, Size, "batch")
     batch = _batch_for(len(recording), batch)
     angles = _angles(len(recording), rotation_seed)
@@ -109,26 +86,25 @@ def embed_images(
     descriptors = _Descriptors()
 
     def read(row: int) -> tuple[int, Record]:
-        return row, recording.record(row, labels=bool(categories))
+        return row, recording.record(row, labels=bool(method.categories))
 
     def see(row: int, record: Record) -> View:
         angle = None if angles is None else jnp.float32(angles[row])
-        found = view(record, grid, image=image, categories=categories, angle=angle)
-        _check_view(np.asarray(found.image), field, name=record.name)
+        found = view(record, method.grid, image=method.image, categories=method.categories, angle=angle)
+        _check_view(np.asarray(found.image), method.field, name=record.name)
         return found
 
     for row, seen in _readable(recording, read, see, on_bad_scan):
         rows.append(row)
         views.append(seen)
         if len(views) == batch:
-            descriptors.add(_describe_padded(describe, views, batch))
+            descriptors.add(_describe_padded(method.describe, views, batch))
             views = []
             on_progress(row + 1)
     if views:
-        descriptors.add(_describe_padded(describe, views, batch))
+        descriptors.add(_describe_padded(method.describe, views, batch))
     on_progress(len(recording))
-    config = {**config, "rotation_seed": rotation_seed}
-    return _file(recording, rows, descriptors.all(), config=config, weights_hash=weights_hash)
+    return _file(method, recording, rows, descriptors.all(), rotation_seed=rotation_seed)
 
 
 class _Descriptors:
@@ -149,39 +125,31 @@ class _Descriptors:
 
 
 def embed_scans(
-    describe: DescribeScanFn,
+    method: ScanMethod,
     recording: Recording,
     *,
-    config: dict[str, Any],
-    distance: str,
-    labels: bool = False,
     rotation_seed: int | None = None,
     on_bad_scan: OnBadScan | None = None,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> DescriptorFile:
-    """Describe the finite points of every scan of a recording. Arguments that are not listed are those of `embed`.
+    """Describe the finite points of every scan of a recording. The arguments are those of `embed`.
 
-    Equal rotation seeds give the same angles as in `embed_images`.
-
-    Arguments:
-      describe: Function from points, and classes with `labels`, to a descriptor.
-      recording: Scans to describe.
-      config: How the descriptors are made, for `DescriptorFile.config`.
-      distance: Name of the function that compares the descriptors.
-      labels: Whether `describe` needs classes. A scan without labels then counts as unreadable.
+    Equal rotation seeds give the same angles as in `embed_images`. If the method needs labels, a scan without labels
+    counts as unreadable.
     """
     angles = _angles(len(recording), rotation_seed)
     rows, descriptors = [], []
 
     def read(row: int) -> tuple[Record]:
-        return (recording.record(row, labels=labels),)
+        return (recording.record(row, labels=method.labels),)
 
-    finite = functools.partial(_finite_points, labels=labels)
+    finite = functools.partial(_finite_points, labels=method.labels)
     for row, (points, classes) in _readable(recording, read, finite, on_bad_scan):
         rows.append(row)
-        descriptors.append(describe(points if angles is None else rotated(points, angles[row]), classes)[None])
+        seen = points if angles is None else rotated(points, angles[row])
+        descriptors.append(method.describe(seen, classes)[None])
         on_progress(row + 1)
-    return _file(recording, rows, descriptors, config={**config, "rotation_seed": rotation_seed}, distance=distance)
+    return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
 
 
 def scan_image(
@@ -269,15 +237,18 @@ def _begun(threads: ThreadPoolExecutor, read: Callable[[int], tuple], then: Call
         return failed
 
 
-def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], **about: Any) -> DescriptorFile:
+def _file(
+    method: Method, recording: Recording, rows: list[int], descriptors: list[np.ndarray], *, rotation_seed: int | None
+) -> DescriptorFile:
     """Returns the descriptor file of the given rows. Raises ValueError if there are no rows.
 
     `descriptors` may contain additional rows at the end, the padding of the last batch.
     """
     if not rows:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
-    if len(rows) < len(recording):  # Needed to add poses of all scans later.
-        about["config"] = {**about["config"], SKIPPED: sorted(set(range(len(recording))) - set(rows))}
+    sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
+    skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
+    config = {"data": recording.name, **sensor, **method.about, "rotation_seed": rotation_seed}
     return DescriptorFile(
         sequence=recording.name,
         ids=tuple(recording.ids[row] for row in rows),
@@ -285,7 +256,9 @@ def _file(recording: Recording, rows: list[int], descriptors: list[np.ndarray], 
         times=None if recording.times is None else recording.times[rows],
         descriptors=np.concatenate(descriptors)[: len(rows)],
         pose_source=recording.pose_source,
-        **{"weights_hash": "", **about},
+        config={**config, SKIPPED: skipped} if skipped else config,
+        weights_hash=method.weights_hash,
+        distance=method.distance if isinstance(method, ScanMethod) else "l2",
     )
 
 

@@ -86,7 +86,7 @@ def train(
     """Train a model on recordings. The folder `out` stores the run, which can be resumed from there.
 
     Args:
-        config: Model, loss, optimiser, number of steps and all other settings, for example `preset("small")`.
+        config: Model, loss, optimiser, number of steps and all other settings, for example `preset("sglpr")`.
         recordings: Training recordings. They need positions, and labels if the model or the loss uses them.
         out: Folder of the run: settings, metrics, checkpoints and the final weights.
         test: Recording of the later test. It is not read; the function only checks that it is not trained on.
@@ -112,7 +112,7 @@ def train(
 
     Example:
       recordings = [open_recording("KITTI", name) for name in ("00", "05")]
-      result = train(preset("small"), recordings, out="runs/mine")
+      result = train(preset("sglpr"), recordings, out="runs/mine")
       print(result)
     """
     folder = Path(out)

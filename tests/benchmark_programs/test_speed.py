@@ -114,15 +114,15 @@ def test_the_time_of_a_step_is_told_by_parts():
 
 
 def test_the_way_from_a_file_to_its_descriptor_is_timed():
-    output = printed("speed.embed", "--weights", "rings", "--scans", "65", "--repeats", "1", "--azimuth-steps", "90")
-    assert "rings: " in output and "scans/s" in output
+    output = printed("speed.embed", "--weights", "circular", "--scans", "65", "--repeats", "1", "--azimuth-steps", "90")
+    assert "circular: " in output and "scans/s" in output
     assert all(f"{part} " in output for part in ("reading", "image", "network"))
 
 
 def test_the_start_of_commands_is_timed():
-    options = ("--commands", "embed", "--weights", "rings", "--repeats", 1)
+    options = ("--commands", "embed", "--weights", "circular", "--repeats", 1)
     rows = table(printed("speed.start_up", *options))
-    assert [row[0] for row in rows] == ["embed --help", "embed one scan, rings"]
+    assert [row[0] for row in rows] == ["embed --help", "embed one scan, circular"]
     assert 0 < float(rows[0][3]) < float(rows[1][3])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
@@ -31,12 +31,12 @@ POLAR = ModelConfig(
     head=HeadConfig(tap="tokens", channels=(8, 12), kernels=(3, 3), strides=(1, 2), clusters=4),
     detail=4,
 )
-STEM = RingConfig(fine=(3,), widths=(4, 6), strides=(2, 1), means=(1, 2))
+STEM = CircularConfig(fine=(3,), widths=(4, 6), strides=(2, 1), means=(1, 2))
 AROUND = HeadConfig(tap="tokens", channels=(8, 12), kernels=(3, 3), strides=(2, 1), means=(1, 2), clusters=4)
 MODELS = {
     "square": model_preset("tiny"),
     "polar": POLAR,
-    "rings": dataclasses.replace(
+    "circular": dataclasses.replace(
         POLAR,
         backbone=dataclasses.replace(STEM, fine=(3, 5)),
         head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4),
@@ -101,7 +101,7 @@ def test_both_ways_of_reading_a_polar_image_agree(monkeypatch):
 
 
 def test_descriptors_of_the_network_that_ships_are_timed():
-    options = ("--preset", "rings", "--repeats", 2, "--calls", 2, "--threads", 1, "--chunk", 0, 1, "--batch", 2)
+    options = ("--preset", "circular", "--repeats", 2, "--calls", 2, "--threads", 1, "--chunk", 0, 1, "--batch", 2)
     rows = table(printed("torch_peer.describe", *options))
     assert [row[0] for row in rows] == ["JAX, chunk 0", "JAX, chunk 1"]
     assert all(float(row[3]) > 0 for row in rows)

@@ -3,7 +3,7 @@
 import pytest
 
 from sglpr_jax.cli import reproduce, train
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.swin_config import SwinConfig
 
 
@@ -11,23 +11,23 @@ from sglpr_jax.models.backbones.swin_config import SwinConfig
     "parse", [train.parse, lambda flags: reproduce.parse(["table1", *flags])], ids=["train", "reproduce"]
 )
 def test_a_flag_reaches_the_backbone_of_the_preset(parse):
-    swin = parse(["--preset", "small", "--model.backbone.window", "2", "--model.head.cbam", "False"]).config.model
+    swin = parse(["--preset", "paper", "--model.backbone.window", "2", "--model.head.cbam", "False"]).config.model
     assert isinstance(swin.backbone, SwinConfig) and swin.backbone.window == 2
-    assert swin.backbone.patch == 8 and not swin.head.cbam
-    rings = parse(["--preset", "rings", "--model.backbone.means", "1", "1", "2", "1", "1", "1", "1"]).config.model
-    assert isinstance(rings.backbone, RingConfig) and rings.backbone.means == (1, 1, 2, 1, 1, 1, 1)
+    assert swin.backbone.patch == 4 and not swin.head.cbam
+    rings = parse(["--preset", "circular", "--model.backbone.means", "1", "1", "2", "1", "1", "1", "1"]).config.model
+    assert isinstance(rings.backbone, CircularConfig) and rings.backbone.means == (1, 1, 2, 1, 1, 1, 1)
     sglpr = parse(["--preset", "sglpr", "--model.backbone.stem.average", "1"]).config.model
     assert sglpr.backbone.stem.average == 1
 
 
 def test_the_flags_of_another_backbone_are_unknown(capsys):
     with pytest.raises(SystemExit):
-        train.parse(["--preset", "rings", "--model.backbone.window", "4"])
+        train.parse(["--preset", "circular", "--model.backbone.window", "4"])
     assert "--model.backbone.window" in capsys.readouterr().err
 
 
 def test_help_shows_the_backbone_s_fields_without_subcommands(capsys):
     with pytest.raises(SystemExit):
-        train.parse(["--preset", "small", "--help"])
+        train.parse(["--preset", "paper", "--help"])
     text = capsys.readouterr().out
     assert "--model.backbone.window" in text and "model.backbone:" not in text

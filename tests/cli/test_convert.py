@@ -101,7 +101,7 @@ def test_what_cannot_be_converted_is_one_line(command, preset, state, tmp_path):
         ((tmp_path / "swin.pth", "--preset", preset), "found a pickle of PyTorch's"),
         ((tmp_path / "none.safetensors", "--preset", preset), "expected a checkpoint, found no file"),
         ((file, "--network", "swin-unet", "--preset", preset), "not a weight of Swin-Unet: more.weight"),
-        ((file, "--preset", "rings"), "expected a model with the backbone 'swin', found 'rings'"),
+        ((file, "--preset", "circular"), "expected a model with the backbone 'swin', found 'circular'"),
     ):
         ended = command("convert", *given, "--out", tmp_path / "start")
         assert_one_line_error(ended, message)

@@ -15,8 +15,8 @@ from .conftest import SENSOR, Ended, assert_one_line_error, run_command
 pytestmark = pytest.mark.slow
 SHIPPED = "shipped "
 MODELS = (*sglpr_jax.MODELS, *(SHIPPED + name for name in sglpr_jax.shipped_weights()))
-KINDS = ("tiny", "small", "sglpr", "shipped rings")
-"""A square image, polar ones of points and of densities, and weights without a segmentation head."""
+KINDS = ("tiny", "sglpr", "shipped circular")
+"""A square image of points, a polar one of densities, and weights without a segmentation head."""
 SCANS = 24
 """Few, and yet so many that the drive comes back to a place."""
 FEW = 3

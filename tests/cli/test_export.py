@@ -29,9 +29,9 @@ def weights(random_params, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def exported(command, weights, tmp_path, monkeypatch) -> Path:
-    """These weights, exported under the name `rings` into a package folder of their own."""
+    """These weights, exported under the name `circular` into a package folder of their own."""
     monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
-    folder = shipped.FOLDER / "rings"
+    folder = shipped.FOLDER / "circular"
     ended = command("export", "--weights", weights, "--out", folder, "--half")
     assert ended.status == 0, ended.error
     assert f"{folder}: 0." in ended.out and "MB of weights" in ended.out
@@ -39,17 +39,17 @@ def exported(command, weights, tmp_path, monkeypatch) -> Path:
 
 
 def test_exported_weights_embed_by_name_as_the_whole_ones_do(command, exported, weights, town, tmp_path):
-    for name in ("rings", weights):
+    for name in ("circular", weights):
         options = ("--weights", name, "--data", town, "--seq", "08", "--out", tmp_path / f"{Path(name).name}.npz")
         ended = command("embed", *options)
         assert ended.status == 0, ended.error
-    found, whole = (load(tmp_path / f"{name}.npz").descriptors for name in ("rings", "weights"))
+    found, whole = (load(tmp_path / f"{name}.npz").descriptors for name in ("circular", "weights"))
     assert 0 < np.abs(found - whole).max() < 1e-2
 
 
 def test_exported_weights_have_no_segmentation_head(command, exported, town, tmp_path):
-    ended = command("segment", "--weights", "rings", "--data", town, "--seq", "08", "--out", tmp_path / "maps")
-    assert_one_line_error(ended, "rings: expected weights with a segmentation head, found none")
+    ended = command("segment", "--weights", "circular", "--data", town, "--seq", "08", "--out", tmp_path / "maps")
+    assert_one_line_error(ended, "circular: expected weights with a segmentation head, found none")
 
 
 def test_float32_weights_with_the_head_are_those_of_before(command, weights, tmp_path):
@@ -76,8 +76,8 @@ def test_an_image_that_does_not_fit_the_grid_is_refused(command, weights, tmp_pa
 def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path, tool):
     file = (tmp_path / "08.npy",) if tool == "evaluate" else ()
     data = () if tool == "export" else ("--data", town, "--seq", "08")
-    ended = command(tool, *file, "--weights", "ringss", *data, "--out", tmp_path / "out.npz")
-    assert_one_line_error(ended, "ringss: expected a folder", "(rings), found neither")
+    ended = command(tool, *file, "--weights", "circularr", *data, "--out", tmp_path / "out.npz")
+    assert_one_line_error(ended, "circularr: expected a folder", "(circular), found neither")
 
 
 def test_whitened_weights_describe_with_the_layer_fitted_to_a_dataset(command, weights, town, tmp_path):

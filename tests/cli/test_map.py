@@ -214,7 +214,9 @@ def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command,
     run = ("relocalize", scan, "--map", places_file)
     assert_one_line_error(command(*run, "--out", tmp_path / "pose.json"), "dot.bin: expected a scan that shows a place")
     assert not (tmp_path / "pose.json").exists()
-    assert_one_line_error(command(*run, "--weights", "rings"), "one.safetensors: expected descriptors of the weights")
+    assert_one_line_error(
+        command(*run, "--weights", "circular"), "one.safetensors: expected descriptors of the weights"
+    )
     content = places_file.read_bytes()
     places_file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
     assert_one_line_error(

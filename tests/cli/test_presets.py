@@ -1,12 +1,14 @@
 import ast
 import dataclasses
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.cli.train import parse
+from sglpr_jax.models.presets import MODELS, model_preset
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset, preset_names
 
@@ -15,7 +17,7 @@ CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.py"))
 
 def test_every_file_of_configs_is_a_preset():
     assert set(preset_names()) == {path.stem for path in CONFIGS}
-    assert {"small", "paper", "demo"} <= set(preset_names())
+    assert set(preset_names()) == set(MODELS) and len(MODELS) == 5
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -24,13 +26,12 @@ def test_a_preset_loads_and_says_what_to_expect_and_how_to_run_it(path):
     said = ast.get_docstring(ast.parse(path.read_text())) or ""
     command = re.search(r"^Command: (bin/.+)$", said, re.MULTILINE)
     assert command and re.search("Expect|Reproduces", said)
-    assert command[1] == f"bin/{path.stem}" or command[1].endswith(f"--preset {path.stem}")
+    assert command[1].endswith(f"--preset {path.stem}")
 
 
-@pytest.mark.parametrize(("name", "cells_of_paper"), [("paper-11m", 0.5), ("paper-112", 2)])
-def test_the_paper_presets_differ_in_the_model_alone(name, cells_of_paper):
-    paper, other = load_preset("paper"), load_preset(name)
-    assert other.model.grid.resolution_m == paper.model.grid.resolution_m * cells_of_paper
+def test_the_paper_presets_differ_in_the_model_alone():
+    paper, other = load_preset("paper"), load_preset("paper-112")
+    assert other.model.grid.resolution_m == paper.model.grid.resolution_m * 2
     assert dataclasses.replace(other, model=paper.model) == paper
 
 
@@ -41,11 +42,12 @@ def test_the_paper_on_ready_made_images_has_the_tokens_of_the_paper():
     assert dataclasses.replace(other.backbone, patch=4) == paper.backbone
 
 
-def test_the_semantic_map_is_learnt_in_the_network_that_the_places_were():
-    places, semantics = load_preset("sglpr"), load_preset("sglpr-segmentation")
-    assert dataclasses.replace(semantics.model, head=places.model.head) == places.model
-    assert semantics.model.head == sglpr_jax.load("sglpr").config.head
-    assert semantics.loss.segmentation_alone and not places.loss.segmentation_alone
+def test_the_flags_of_the_guide_train_the_semantic_map_of_the_shipped_network():
+    guide = (CONFIGS[0].parents[1] / "docs/guides/semantics.md").read_text().replace("\\\n", " ")
+    command = next(line for line in guide.splitlines() if "--weights sglpr" in line)
+    config = parse(shlex.split(command)[1:]).config
+    assert config.model == sglpr_jax.load("sglpr").config
+    assert config.loss.segmentation_alone and not load_preset("sglpr").loss.segmentation_alone
 
 
 def test_a_file_of_ones_own_is_a_preset(preset):
@@ -54,7 +56,7 @@ def test_a_file_of_ones_own_is_a_preset(preset):
 
 @pytest.mark.parametrize("name", ["smal", "nowhere/mine.py"])
 def test_an_unknown_preset_lists_those_that_exist(name):
-    with pytest.raises(ValueError, match=rf"no preset '{name}'.*demo, paper.*small"):
+    with pytest.raises(ValueError, match=rf"no preset '{name}'.*paper-112, sglpr, tiny"):
         load_preset(name)
 
 

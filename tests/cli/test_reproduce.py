@@ -179,7 +179,7 @@ def test_bad_input_is_refused_before_anything_is_trained(town, images, preset, t
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("preset_name", ["small", "paper"])
+@pytest.mark.parametrize("preset_name", ["sglpr", "paper"])
 def test_every_variant_differs_from_the_preset_and_from_every_other(preset_name):
     config = load_preset(preset_name)
     configs = {name: variant_config(config, name) for name in VARIANTS}

@@ -25,8 +25,8 @@ from .conftest import assert_one_line_error
 METHODS = ("sglpr", "untrained", "thumbnail", "polar-fft")
 
 
-def test_without_flags_the_small_preset_runs_and_08_stays_a_string():
-    assert parse([]) == TrainCommand(seq="08", preset="small", config=load_preset("small"))
+def test_without_flags_the_preset_sglpr_runs_and_08_stays_a_string():
+    assert parse([]) == TrainCommand(seq="08", preset="sglpr", config=load_preset("sglpr"))
     assert parse(["--seq", "00", "--train-seq", "02", "08"]).train_seq == ("02", "08")
 
 
@@ -40,13 +40,13 @@ def test_flags_override_the_preset_and_the_preset_the_defaults(preset):
 def test_a_mistyped_flag_or_preset_is_refused(command):
     ended = command("train", "--stepps", 3)
     assert ended.status == 2 and "--stepps" in ended.error and "--steps" in ended.error
-    assert_one_line_error(command("train", "--preset", "smal"), "smal", "paper", "small")
+    assert_one_line_error(command("train", "--preset", "sglp"), "sglp", "paper", "sglpr")
 
 
 def test_help_names_the_presets_and_the_examples(command):
     ended = command("train", "--help")
     assert ended.status == 0
-    for words in ("paper-head-b", "bin/train --seq 08", "--optimizer.learning-rate", "--resume"):
+    for words in ("paper-112", "bin/train --seq 08", "--optimizer.learning-rate", "--resume"):
         assert words in ended.out
 
 

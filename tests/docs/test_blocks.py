@@ -4,7 +4,6 @@ import dataclasses
 import importlib
 import inspect
 import re
-import runpy
 import shlex
 import sys
 
@@ -12,6 +11,7 @@ import pytest
 import tyro
 
 import sglpr_jax
+from sglpr_jax.models.presets import model_preset
 
 from .pages import PAGES, ROOT, blocks, command_lines, name_of
 
@@ -72,7 +72,7 @@ def test_nothing_else_is_unknown():
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
 def test_python_runs(page, in_examples, monkeypatch):
     """All blocks of a page, one after another, in a folder with a small dataset; what is trained is a tiny model."""
-    model = runpy.run_path(str(ROOT / "benchmarks" / "tiny.py"))["MODEL"]
+    model = model_preset("tiny")
     preset = sglpr_jax.preset
     monkeypatch.setattr(sglpr_jax, "preset", lambda name: dataclasses.replace(preset(name), model=model))
     found = {"__name__": "page"}

@@ -26,7 +26,7 @@ def test_the_average_is_the_mean_and_then_forgets():
 
 
 def test_rings_do_not_hold_the_motion():
-    params, posts = sglpr_jax.load("rings"), np.random.default_rng(0).uniform(-60, 60, (200, 2))
+    params, posts = sglpr_jax.load("circular"), np.random.default_rng(0).uniform(-60, 60, (200, 2))
     without, within = (_moved(params, posts, least) for least in (4, 10_000))
     assert 24 < without < 31  # some at the start is lost, before there is an average
     assert within < 1  # the reference: where rings are compared, the motion stands still

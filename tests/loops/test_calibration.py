@@ -15,7 +15,7 @@ FRAMES = 50
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ NOW = CandidateConfig(exclude_frames=0, min_travelled_m=0.0)
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 @pytest.fixture(scope="module")

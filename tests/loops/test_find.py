@@ -28,7 +28,7 @@ CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=0, min_travell
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 @pytest.fixture(scope="module")

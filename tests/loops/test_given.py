@@ -29,7 +29,7 @@ EMPTY = Seen(np.ones(256, np.float32), np.zeros((152, 152), np.uint8), None)
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 @pytest.fixture

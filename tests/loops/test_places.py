@@ -21,7 +21,7 @@ MAPPED = 60
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=8, exclude_s=0
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ TILTS = {"forward": (0.0, 25.0, 0.0), "sideways": (20.0, 10.0, 0.0), "upside dow
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 def tilted_from_level(degrees) -> np.ndarray:

@@ -24,11 +24,11 @@ TINY = dataclasses.replace(
 )
 MODELS: dict[str, ModelConfig] = {
     "pixels": dataclasses.replace(TINY, head=dataclasses.replace(HEAD, tap="pixels", strides=(4,), kernels=(4,))),
-    "polar, stem": dataclasses.replace(
+    "polar": dataclasses.replace(
         TINY,
         field="circle",
         polar=(16, 32),
-        backbone=dataclasses.replace(SWIN, stem=(4, 8)),
+        backbone=SWIN,
         detail=4,
         head=HEAD,
     ),

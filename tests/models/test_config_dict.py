@@ -26,7 +26,7 @@ def test_every_preset_s_configuration_survives_json(preset):
 @pytest.mark.parametrize("path", ["image", "compute", "head.pooling", "backbone.average", "grid.height"])
 def test_a_missing_field_is_an_error_and_no_default(path):
     """Weights of density images without `image` would be fed point counts."""
-    values = values_of(model_preset("rings"))
+    values = values_of(model_preset("circular"))
     *way, name = path.split(".")
     del functools.reduce(lambda place, step: place[step], way, values)[name]
     with pytest.raises(ValueError, match=rf"^here: .*expected the fields of a \w+ \(.*\), found no '{name}'$"):
@@ -34,9 +34,21 @@ def test_a_missing_field_is_an_error_and_no_default(path):
 
 
 def test_a_field_that_came_later_may_be_missing():
-    values = values_of(model_preset("rings"))
+    values = values_of(model_preset("circular"))
     del values["head"]["whiten"]
-    assert config_from_dict(values, source="here") == model_preset("rings")
+    assert config_from_dict(values, source="here") == model_preset("circular")
+
+
+def test_files_of_earlier_versions_are_read():
+    values = values_of(model_preset("sglpr"))
+    values["backbone"]["stem"]["kind"] = "rings"
+    assert config_from_dict(values, source="here") == model_preset("sglpr")
+    values = values_of(model_preset("paper"))
+    values["backbone"]["stem"] = []
+    assert config_from_dict(values, source="here") == model_preset("paper")
+    values["backbone"]["stem"] = [4, 8]  # a network that can no longer be built
+    with pytest.raises(ValueError, match="found 'stem'"):
+        config_from_dict(values, source="here")
 
 
 @pytest.mark.parametrize(
@@ -56,11 +68,15 @@ def test_a_field_that_came_later_may_be_missing():
         ("head.cbam", "yes", "head.cbam: expected a value of type bool, found 'yes'"),
         ("head.channels", 3, "head.channels: expected a list, found 3"),
         ("head", [], "head: expected the fields of a HeadConfig, found []"),
-        ("backbone", None, "backbone: expected the fields of a SwinConfig or RingConfig or SglprConfig, found None"),
-        ("backbone.kind", "vgg", "backbone: expected a kind, swin or rings or sglpr, found 'vgg'"),
+        (
+            "backbone",
+            None,
+            "backbone: expected the fields of a SwinConfig or CircularConfig or SglprConfig, found None",
+        ),
+        ("backbone.kind", "vgg", "backbone: expected a kind, swin or circular or sglpr, found 'vgg'"),
         ("backbone.kind", "swin", "backbone: expected the fields of a SwinConfig ("),
         ("backbone.widths", [[16]], "backbone.widths: expected a value of type int, found [16]"),
-        ("backbone.kind", ["rings"], "backbone: expected a kind, swin or rings or sglpr, found ['rings']"),
+        ("backbone.kind", ["circular"], "backbone: expected a kind, swin or circular or sglpr, found ['circular']"),
         ("image", "Density", "image: expected one of 'points', 'density', found 'Density'"),
         ("counts", "log", "counts: expected one of 'raw', 'log1p', 'clipped', found 'log'"),
         ("head.pooling", "gem", "head.pooling: expected one of 'netvlad', 'mean', 'spectrum', found 'gem'"),
@@ -79,7 +95,7 @@ def test_a_field_that_came_later_may_be_missing():
     ],
 )
 def test_a_wrong_value_is_one_line_with_file_field_expected_and_found(path, value, message):
-    values = values_of(model_preset("rings"))
+    values = values_of(model_preset("circular"))
     *way, name = path.split(".")
     place = values
     for step in way:

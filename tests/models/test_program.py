@@ -19,7 +19,7 @@ RNG = np.random.default_rng(0)
 TINY = model_preset("tiny")
 
 
-@pytest.fixture(scope="module", params=["tiny", "rings", "sglpr"])
+@pytest.fixture(scope="module", params=["tiny", "circular", "sglpr"])
 def params(request, random_params):
     return random_params(model_preset(request.param))
 
@@ -74,7 +74,7 @@ def test_the_input_of_counts_is_made_as_it_is_said():
 
 
 def test_the_input_of_densities_is_made_as_it_is_said():
-    config = model_preset("rings")
+    config = model_preset("circular")
     config = dataclasses.replace(config, image="density")
     said = input_description(config)
     assert "u = 64 + i for i > 0, 63 + i for i < 0" in said["cells"] and "v = 63 - j for j > 0, 64 - j" in said["cells"]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from sglpr_jax.models.backbones.rings_config import RingConfig
-from sglpr_jax.models.backbones.sglpr import RingSwin
+from sglpr_jax.models.backbones.circular_config import CircularConfig
+from sglpr_jax.models.backbones.sglpr import CircularSwin
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.place import PlaceHead
@@ -20,7 +20,7 @@ from sglpr_jax.models.weights import weight_shapes
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.heat_maps import heat_maps
 
-STEM = RingConfig(widths=(4, 6), strides=(2, 1), means=(1, 1))
+STEM = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1))
 BACKBONE = SglprConfig(stem=STEM, embed_dim=8, depths=(2, 2), heads=(1, 2), window=2)
 HEAD = HeadConfig(
     tap="tokens", channels=(8, 8), kernels=(3, 3), strides=(2, 1), means=(1, 2), cbam_reduction=4, clusters=4
@@ -36,17 +36,17 @@ def params(random_params):
 
 
 def test_maps_and_tokens_have_the_shapes_configured(random_variables):
-    net = RingSwin(BACKBONE)
+    net = CircularSwin(BACKBONE)
     tokens, maps, seen = net.apply(random_variables(net, POLAR), POLAR)
     assert tokens.shape == (2, 4, 16, 8)
     assert [m.shape for m in maps] == [(2, 8, 16, 2), (2, 4, 16, 4)]
-    assert seen["ring_block1"].shape == (2, 4, 16, 6)
+    assert seen["circular_block1"].shape == (2, 4, 16, 6)
     assert seen["enc1_out"].shape == (2, 2, 8, 16)
 
 
 def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variables):
     """Such a window is two coarse tokens wide: four tokens, eight sectors of the image."""
-    net = RingSwin(BACKBONE)
+    net = CircularSwin(BACKBONE)
     variables = random_variables(net, POLAR)
     straight, turned = (net.apply(variables, image)[0] for image in (POLAR, jnp.roll(POLAR, 8, axis=2)))
     np.testing.assert_allclose(turned, jnp.roll(straight, 4, axis=2), atol=1e-4)

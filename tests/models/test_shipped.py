@@ -129,8 +129,8 @@ def test_what_is_neither_a_name_nor_a_folder_lists_the_names(placeholder, tmp_pa
             load(unknown)
     monkeypatch.setattr(shipped, "FOLDER", tmp_path / "empty")
     assert shipped_weights() == ()
-    with pytest.raises(FileNotFoundError, match=r"rings: .*\(there are none\), found neither"):
-        load("rings")
+    with pytest.raises(FileNotFoundError, match=r"circular: .*\(there are none\), found neither"):
+        load("circular")
 
 
 def images_of(params: Params) -> jax.Array:

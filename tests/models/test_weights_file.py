@@ -12,7 +12,7 @@ import safetensors.numpy
 
 import sglpr_jax
 from sglpr_jax.models import weights_file
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
@@ -49,7 +49,7 @@ def test_weights_with_and_without_a_segmentation_head_are_grafted_onto_each_othe
 
 
 def with_fine_blocks(*channels):
-    rings = RingConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
+    rings = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
     head = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
     return dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=rings, head=head)
 
@@ -167,7 +167,7 @@ def test_a_damaged_configuration_is_named(params, tmp_path, text, expected):
 
 def test_the_weights_of_another_preset_are_refused(params, tmp_path):
     folder = save(params, tmp_path / "weights")
-    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("small"))))
+    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(model_preset("circular"))))
     with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected the weights of its configuration, \S+ of shape"):
         load(folder)
 
@@ -222,7 +222,7 @@ def test_the_hash_is_that_of_what_describes(params):
 
 
 @pytest.mark.parametrize("tap", ["tokens", "pixels"])
-@pytest.mark.parametrize("name", ["paper", "small", "small-stem", "rings", "sglpr"])
+@pytest.mark.parametrize("name", ["paper", "circular", "sglpr"])
 def test_what_describes_is_what_a_model_without_a_segmentation_head_has(name, tap):
     config = model_preset(name)
     config = dataclasses.replace(config, head=dataclasses.replace(config.head, tap=tap))

@@ -16,7 +16,7 @@ def file():
         times=np.array([0.0, 0.1, 0.2]),
         descriptors=np.eye(3, 4, dtype=np.float32),
         pose_source="08/poses.txt (SemanticKITTI)",
-        config={"preset": "small", "grid": {"resolution_m": 0.4}},
+        config={"preset": "sglpr", "grid": {"resolution_m": 0.4}},
         weights_hash="abc",
         distance="scan-context",
     )

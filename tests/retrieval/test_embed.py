@@ -16,8 +16,9 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_classes
+from sglpr_jax.methods.method import ImageMethod, ScanMethod
+from sglpr_jax.retrieval import embed
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.retrieval.embed import embed_images, embed_scans
 
 GRID = Grid(resolution_m=1.0, height=16, width=16)
 SCANS = 7  # 8 is the next power of two
@@ -27,6 +28,20 @@ PICTURES = tuple(Path(f"{i:06d}.png") for i in range(SCANS))
 def flatten(images):
     """A method whose descriptor is the image itself."""
     return images.reshape(len(images), -1)
+
+
+def embed_images(describe, recording, grid, *, config, rotation_seed=None, batch=8, on_bad_scan=None, **options):
+    """The descriptor file of a method on images."""
+    about = {name: options.pop(name) for name in ("weights_hash", "categories", "image", "field") if name in options}
+    method = ImageMethod(describe, grid, about=config, **about)
+    options |= {"rotation_seed": rotation_seed, "batch": batch, "on_bad_scan": on_bad_scan}
+    return embed.embed_images(method, recording, **options)
+
+
+def embed_scans(describe, recording, *, config, distance, labels=False, **options):
+    """The descriptor file of a method on points."""
+    method = ScanMethod(describe, labels=labels, distance=distance, about=config)
+    return embed.embed_scans(method, recording, **options)
 
 
 def clouds() -> list[np.ndarray]:
@@ -73,7 +88,7 @@ def test_scans_are_rasterised_and_keep_what_evaluation_needs(scans, tmp_path):
     np.testing.assert_array_equal(found.descriptors, expected)
     assert found.descriptors.dtype == np.float32 and found.descriptors.sum() > 0
     assert (found.sequence, found.ids, found.pose_source) == ("08", scans.ids, "poses/08.txt")
-    assert (found.config, found.weights_hash) == ({"method": "pixels", "rotation_seed": None}, "abc")
+    assert (found.config, found.weights_hash) == ({"data": "08", "method": "pixels", "rotation_seed": None}, "abc")
     np.testing.assert_array_equal(found.positions, scans.positions)
     np.testing.assert_array_equal(found.times, scans.times)
     found.save(tmp_path / "08.npz")
@@ -85,7 +100,7 @@ def test_each_scan_is_turned_by_its_own_angle(scans):
     for cloud, angle, descriptor in zip(clouds(), drawn_angles(3), found.descriptors, strict=True):
         turned = rotate_points(jnp.asarray(cloud), jnp.float32(angle))
         np.testing.assert_array_equal(descriptor, np.asarray(rasterize(turned, grid=GRID)).reshape(-1))
-    assert found.config == {"rotation_seed": 3}
+    assert found.config == {"data": "08", "rotation_seed": 3}
     other = embed_images(flatten, scans, GRID, config={}, rotation_seed=4)
     assert (other.descriptors != found.descriptors).any(axis=1).all()
 
@@ -252,7 +267,7 @@ def test_points_are_described_scan_by_scan(scans):
     found = embed_scans(mean_point, scans, config={"method": "mean"}, distance="cosine", on_progress=seen.append)
     np.testing.assert_array_equal(found.descriptors, [cloud.mean(axis=0) for cloud in clouds()])
     assert (found.distance, found.weights_hash, found.ids, seen) == ("cosine", "", scans.ids, [*range(1, SCANS + 1)])
-    assert found.config == {"method": "mean", "rotation_seed": None}
+    assert found.config == {"data": "08", "method": "mean", "rotation_seed": None}
 
 
 def test_points_are_turned_as_images_are(scans):

@@ -53,7 +53,7 @@ def test_the_maps_that_a_preset_names_are_there_and_have_the_form_of_its_image(p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tiny", "small-stem", *shipped_weights()])
+@pytest.mark.parametrize("name", ["tiny", *shipped_weights()])
 def test_a_square_and_a_polar_preset_and_every_shipped_weight_have_pictures(name, random_params):
     params = load(name) if name in shipped_weights() else random_params(model_preset(name))
     grid = params.config.grid

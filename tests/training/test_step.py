@@ -305,7 +305,7 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
 
 def test_the_step_of_the_preset_that_the_pages_train_is_whole():
     """Only traced, for it would be compiled for a minute."""
-    config = dataclasses.replace(load_preset("demo"), tuples=4)
+    config = dataclasses.replace(load_preset("sglpr"), tuples=4)
     grid, images = config.model.grid, config.images
     batch = Batch(
         labelled=np.ones(images, bool),

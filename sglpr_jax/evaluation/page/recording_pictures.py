@@ -30,7 +30,7 @@ def take_pictures(
     """
     rows = recording_rows(recording, source)
     frames = sorted({frame for found in worst for frame in (found.query, found.answer)})
-    images = {frame: _image(recording, rows[frame], model_preset("small").grid) for frame in frames}
+    images = {frame: _image(recording, rows[frame], model_preset("sglpr").grid) for frame in frames}
     if params is None:
         needs = "maps: add --weights beside --data."
         return Pictures(images, f"Semantic {needs}", f"Feature heat {needs}")

@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.evaluation.protocols.pairs import pair_distances, score_pairs
-from sglpr_jax.evaluation.protocols.pairs_f1max import GAP
+from sglpr_jax.evaluation.protocols.pairs_f1max import GAP, NEGATIVE_M, POSITIVE_M
 from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import ScoredPairs, check_frames
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
 
 def score_listed_pairs(

@@ -10,8 +10,8 @@ from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
+POSITIVE_M, NEGATIVE_M = 3.0, 20.0
 GAP = 50
 """Frames at most this number of frames apart are neighbours, not revisits."""
 

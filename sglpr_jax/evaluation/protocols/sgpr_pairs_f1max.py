@@ -7,8 +7,8 @@ from sglpr_jax.evaluation.protocols.protocol import Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
+POSITIVE_M, NEGATIVE_M = 3.0, 20.0
 NEGATIVE_SHARE = 0.005
 """Fraction of the negative pairs that is kept."""
 

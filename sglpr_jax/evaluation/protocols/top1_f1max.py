@@ -5,8 +5,8 @@ from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import Source
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, Near, database_end
-from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
 
+POSITIVE_M, NEGATIVE_M = 3.0, 20.0
 METRES = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m"
 
 

@@ -3,8 +3,7 @@
 from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import Source
-from sglpr_jax.evaluation.protocols.top1_f1max import METRES, excluded, score_top1
-from sglpr_jax.same_place import POSITIVE_M
+from sglpr_jax.evaluation.protocols.top1_f1max import METRES, POSITIVE_M, excluded, score_top1
 
 
 def top1_strict_f1max(source: Source, *, seed: int = 0) -> Result:

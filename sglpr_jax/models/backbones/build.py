@@ -1,8 +1,8 @@
 """Maps the configuration of a backbone to its layers. Configurations do not import layers, which require JAX."""
 
+from sglpr_jax.models.backbones.circular import CircularBackbone
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.interface import Backbone
-from sglpr_jax.models.backbones.rings import RingBackbone
-from sglpr_jax.models.backbones.rings_config import RingConfig
 from sglpr_jax.models.backbones.sglpr import SglprBackbone
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.backbones.swin import SwinBackbone
@@ -15,7 +15,7 @@ def build(config: BackboneConfig, *, circular: bool) -> Backbone:
     match config:
         case SwinConfig():
             return SwinBackbone(config, circular)
-        case RingConfig():
-            return RingBackbone(config)
+        case CircularConfig():
+            return CircularBackbone(config)
         case SglprConfig():
             return SglprBackbone(config)

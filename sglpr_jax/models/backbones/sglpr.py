@@ -1,7 +1,7 @@
 """The paper's Swin-Unet on tokens of circular convolutions, which a rotation of the scan only shifts.
 
 A patch of eight sectors changes under rotations smaller than its size; a convolution follows them. Therefore the stem
-reduces the polar image like the ring net, and the attention windows use the resulting tokens. A rotation by a whole
+reduces the polar image like the circular CNN, and the attention windows use the resulting tokens. A rotation by a whole
 number of windows of the coarsest map is a shift of the tokens. Other rotations must be learnt.
 """
 
@@ -10,8 +10,8 @@ import dataclasses
 import flax.linen as nn
 from jaxtyping import Array, Float
 
+from sglpr_jax.models.backbones.circular import CircularDecoder, CircularNet
 from sglpr_jax.models.backbones.interface import Seen
-from sglpr_jax.models.backbones.rings import RingDecoder, RingNet
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.backbones.swin_unet import SwinUnet
 
@@ -24,23 +24,23 @@ class SglprBackbone:
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
         """Computes the tokens and the maps of the stem. The tokens replace the last map."""
-        return RingSwin(self.config, name="backbone")(image, train=train)
+        return CircularSwin(self.config, name="backbone")(image, train=train)
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
         """Computes a pixel for each pixel of the averaged image."""
-        return RingDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
+        return CircularDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
 
 
-class RingSwin(nn.Module):
+class CircularSwin(nn.Module):
     """Network from the polar image to a token for each pixel of the stem's last map."""
 
     config: SglprConfig
 
     @nn.compact
     def __call__(self, polar: Float[Array, "b p q c"], *, train: bool = False) -> Seen:
-        """Returns the tokens as features. The maps are named as in the ring net and the Swin-Unet."""
+        """Returns the tokens as features. The maps are named as in the circular CNN and the Swin-Unet."""
         config = self.config
-        maps = RingNet(config.stem, name="stem")(polar)
+        maps = CircularNet(config.stem, name="stem")(polar)
         tokens, named = SwinUnet(
             embed_dim=config.embed_dim,
             depths=config.depths,
@@ -53,4 +53,4 @@ class RingSwin(nn.Module):
             shift_each_way=True,
             name="swin_unet",
         )(maps[-1], train=train)
-        return Seen(tokens, maps[:-1], {f"ring_block{i}": x for i, x in enumerate(maps[1:])} | named)
+        return Seen(tokens, maps[:-1], {f"circular_block{i}": x for i, x in enumerate(maps[1:])} | named)

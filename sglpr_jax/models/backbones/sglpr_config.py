@@ -1,10 +1,10 @@
-"""Configuration of the Swin-Unet on the tokens of the ring net."""
+"""Configuration of the Swin-Unet on the tokens of the circular CNN."""
 
 import dataclasses
 from typing import Literal
 
 from sglpr_jax.fields import Depths, Share, Size, Sizes, check_fields
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.swin_config import check_stages
 
 
@@ -13,8 +13,8 @@ class SglprConfig:
     """Swin-Unet whose tokens come from circular convolutions on the polar image."""
 
     kind: Literal["sglpr"] = "sglpr"
-    stem: RingConfig = RingConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
-    """Ring net that makes the tokens. Its last map has one pixel for each token."""
+    stem: CircularConfig = CircularConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
+    """Circular CNN that makes the tokens. Its last map has one pixel for each token."""
     embed_dim: Size = 64
     depths: Depths = (2, 2)
     """Number of blocks of each stage."""
@@ -59,7 +59,7 @@ class SglprConfig:
         """Maps to draw as heat maps: the stem, the first and last stage of the encoder, and the decoder."""
         stem, last = len(self.stem.widths) - 1, len(self.depths) - 1
         return {
-            "stem": f"ring_block{stem}",
+            "stem": f"circular_block{stem}",
             "encoder, first": "enc0_out",
             "encoder, last": f"enc{last}_out",
             "decoder": f"dec{last}_out",

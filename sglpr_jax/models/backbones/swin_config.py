@@ -13,9 +13,6 @@ class SwinConfig:
     kind: Literal["swin"] = "swin"
     patch: Size = 4
     """Edge of a token's patch, in pixels of the image."""
-    stem: Sizes = ()
-    """Channels of convolutions before the patch embedding. Each entry after the first halves the resolution. The
-    segmentation head uses each map again. (): no convolutions, as in the paper."""
     embed_dim: Size = 96
     depths: Depths = (2, 2, 2, 2)
     """Number of blocks of each stage."""
@@ -30,11 +27,6 @@ class SwinConfig:
     def __post_init__(self):
         check_fields(self)
         check_stages(self.embed_dim, self.depths, self.heads)
-        if self.patch % self._stem_pixel:
-            raise ValueError(
-                f"patch: expected a multiple of {self._stem_pixel}, the pixel of a stem with {len(self.stem)} widths, "
-                f"found {self.patch}"
-            )
 
     @property
     def token(self) -> tuple[int, int]:
@@ -61,15 +53,6 @@ class SwinConfig:
         """Maps to draw as heat maps. Normalised maps are left out, because they have the same strength everywhere."""
         last = len(self.depths) - 1
         return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
-
-    @property
-    def stem_patch(self) -> int:
-        """Edge of a token's patch, in pixels of its source map: the image, or the stem's last map."""
-        return self.patch // self._stem_pixel
-
-    @property
-    def _stem_pixel(self) -> int:
-        return 2 ** max(len(self.stem) - 1, 0)
 
 
 def check_stages(embed_dim: int, depths: tuple[int, ...], heads: tuple[int, ...]) -> None:

@@ -3,7 +3,7 @@
 import flax.linen as nn
 from jaxtyping import Array, Float
 
-from sglpr_jax.models.backbones.rings import RingBlock, block_means
+from sglpr_jax.models.backbones.circular import CircularBlock, block_means
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.heads.cbam import CBAM
@@ -39,7 +39,7 @@ class PlaceHead(nn.Module):
         config = self.config
         channels, kernel, stride = config.channels[i], config.kernels[i], config.strides[i]
         if config.means:
-            return block_means(RingBlock(channels, stride, name=f"block_{i}")(x), 1, config.means[i])
+            return block_means(CircularBlock(channels, stride, name=f"block_{i}")(x), 1, config.means[i])
         strides, name = (stride, stride), f"convolution_{i}"
         x = Convolution(channels, kernel, strides, circular=self.circular, name=name)(x)
         return nn.relu(LayerNorm(name=f"norm_{i}")(x))

@@ -13,29 +13,29 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.interface import Seen
-from sglpr_jax.models.backbones.rings_config import RingConfig
 from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.layers import LayerNorm, Linear
 
 
 @dataclasses.dataclass(frozen=True)
-class RingBackbone:
-    """Ring net and its decoder: layers `rings` and `decoder`."""
+class CircularBackbone:
+    """Circular CNN and its decoder: layers `rings` and `decoder`."""
 
-    config: RingConfig
+    config: CircularConfig
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
         """Computes the features: the last map. There is no stochastic depth."""
-        maps = RingNet(self.config, name="rings")(image)
-        return Seen(maps[-1], maps[:-1], {f"ring_block{i}": seen for i, seen in enumerate(maps[1:])})
+        maps = CircularNet(self.config, name="rings")(image)
+        return Seen(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
         """Computes a pixel for each pixel of the averaged image."""
-        return RingDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
+        return CircularDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
 
 
-class RingBlock(nn.Module):
+class CircularBlock(nn.Module):
     """Circular convolution, layer norm, ReLU. If input and output have the same shape, the input is added."""
 
     features: int
@@ -50,14 +50,14 @@ class RingBlock(nn.Module):
         return x + y if x.shape == y.shape else y
 
 
-class RingNet(nn.Module):
+class CircularNet(nn.Module):
     """Network from the polar image to the features of the place head and all intermediate maps.
 
     Average pooling loses details that are smaller than its blocks. Therefore, fine blocks run beside the others at the
     full number of sectors. Their maps are averaged to the size of the maps that they join.
     """
 
-    config: RingConfig
+    config: CircularConfig
 
     @nn.compact
     def __call__(self, polar: Float[Array, "b p q c"]) -> list[Float[Array, "b _ _ _"]]:
@@ -66,14 +66,16 @@ class RingNet(nn.Module):
         maps = [block_means(polar, config.average, config.average)]
         for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
             if i < len(config.fine):
-                fine = RingBlock(config.fine[i], config.strides[i - 1] if i else config.average, name=f"fine_{i}")(fine)
+                fine = CircularBlock(config.fine[i], config.strides[i - 1] if i else config.average, name=f"fine_{i}")(
+                    fine
+                )
                 joining = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
                 maps[-1] = jnp.concatenate([maps[-1], joining], axis=-1)
-            maps.append(block_means(RingBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
+            maps.append(block_means(CircularBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
         return maps
 
 
-class RingDecoder(nn.Module):
+class CircularDecoder(nn.Module):
     """Decoder from the features to the resolution of the averaged image. It uses every finer map again."""
 
     widths: tuple[int, ...]
@@ -88,7 +90,7 @@ class RingDecoder(nn.Module):
             seen, width = maps[of_map], self.widths[max(of_map - 1, 0)]
             x = Linear(width, name=f"narrow_{i}")(x)
             x = jnp.concatenate([_repeated(x, seen.shape[1] // x.shape[1], seen.shape[2] // x.shape[2]), seen], axis=-1)
-            x = RingBlock(width, name=f"block_{i}")(x)
+            x = CircularBlock(width, name=f"block_{i}")(x)
         return x
 
 

@@ -1,13 +1,13 @@
-"""The ring net and its decoder as plain PyTorch modules, with the layers and names of ours."""
+"""The circular CNN and its decoder as plain PyTorch modules, with the layers and names of ours."""
 
 import torch
 from torch import Tensor, nn
 
 from benchmarks.torch_peer.torch_layers import Convolution, means, repeated
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 
 
-class RingBlock(nn.Module):
+class CircularBlock(nn.Module):
     """Convolution around the sectors, layer norm, ReLU; added to its input where both have the same shape."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1):
@@ -20,17 +20,17 @@ class RingBlock(nn.Module):
         return x + y if x.shape == y.shape else y
 
 
-class RingNet(nn.ModuleDict):
+class CircularNet(nn.ModuleDict):
     """From the polar image to the averaged image and the map of each block, with what joins it."""
 
-    def __init__(self, inputs: int, config: RingConfig):
+    def __init__(self, inputs: int, config: CircularConfig):
         super().__init__()
         self.config, fine = config, inputs
         for i, channels in enumerate(config.fine):
-            self[f"fine_{i}"] = RingBlock(fine, channels, config.strides[i - 1] if i else config.average)
+            self[f"fine_{i}"] = CircularBlock(fine, channels, config.strides[i - 1] if i else config.average)
             fine = channels
         for i, (seen, width) in enumerate(zip(map_channels(inputs, config), config.widths, strict=False)):
-            self[f"block_{i}"] = RingBlock(seen, width, config.strides[i])
+            self[f"block_{i}"] = CircularBlock(seen, width, config.strides[i])
 
     def forward(self, polar: Tensor) -> list[Tensor]:
         config, fine = self.config, polar
@@ -43,16 +43,16 @@ class RingNet(nn.ModuleDict):
         return maps
 
 
-class RingDecoder(nn.ModuleDict):
-    """From features of so many channels back to the averaged image, past the maps that the ring net shrank."""
+class CircularDecoder(nn.ModuleDict):
+    """From features of so many channels back to the averaged image, past the maps that the circular CNN shrank."""
 
-    def __init__(self, features: int, inputs: int, config: RingConfig):
+    def __init__(self, features: int, inputs: int, config: CircularConfig):
         super().__init__()
         shrink = zip(config.strides, config.means, strict=True)
         self.finer = [i for i, (stride, sectors) in enumerate(shrink) if stride * sectors > 1][::-1]
         for i, of_map in enumerate(self.finer):
             width, seen = config.widths[max(of_map - 1, 0)], map_channels(inputs, config)[of_map]
-            self[f"narrow_{i}"], self[f"block_{i}"] = nn.Linear(features, width), RingBlock(width + seen, width)
+            self[f"narrow_{i}"], self[f"block_{i}"] = nn.Linear(features, width), CircularBlock(width + seen, width)
             features = width
         self.width = features
 
@@ -65,7 +65,7 @@ class RingDecoder(nn.ModuleDict):
         return x
 
 
-def map_channels(inputs: int, config: RingConfig) -> list[int]:
+def map_channels(inputs: int, config: CircularConfig) -> list[int]:
     """Of the averaged image and the map of each block, with what joins it."""
     joining = (*config.fine, *(0,) * (len(config.widths) + 1 - len(config.fine)))
     return [own + more for own, more in zip((inputs, *config.widths), joining, strict=True)]

@@ -1,4 +1,4 @@
-"""Configuration of the ring net."""
+"""Configuration of the circular CNN."""
 
 import dataclasses
 import math
@@ -8,10 +8,10 @@ from sglpr_jax.fields import Size, Sizes, check_fields
 
 
 @dataclasses.dataclass(frozen=True)
-class RingConfig:
+class CircularConfig:
     """Circular convolutions on the polar image, with one block for each width."""
 
-    kind: Literal["rings"] = "rings"
+    kind: Literal["circular"] = "circular"
     average: Size = 2
     """Edge of the squares of polar pixels that are averaged before the first block. Without averaging, the resampling
     skips cells."""
@@ -31,12 +31,12 @@ class RingConfig:
             raise ValueError("widths: expected at least one block, found ()")
         if not len(self.widths) == len(self.strides) == len(self.means):
             raise ValueError(
-                "expected equal numbers of widths, strides and means of the ring net, found "
+                "expected equal numbers of widths, strides and means of the circular CNN, found "
                 f"widths {self.widths}, strides {self.strides}, means {self.means}"
             )
         if len(self.fine) > len(self.widths):
             raise ValueError(
-                f"fine: expected at most one value for each width of the ring net, {self.widths}, found {self.fine}"
+                f"fine: expected at most one value for each width of the circular CNN, {self.widths}, found {self.fine}"
             )
 
     @property
@@ -63,4 +63,4 @@ class RingConfig:
     def pictures(self) -> dict[str, str]:
         """Maps to draw as heat maps: those of the first, the middle and the last block."""
         last = len(self.widths) - 1
-        return {f"block {i + 1}": f"ring_block{i}" for i in sorted({0, last // 2, last})}
+        return {f"block {i + 1}": f"circular_block{i}" for i in sorted({0, last // 2, last})}

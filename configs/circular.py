@@ -1,4 +1,4 @@
-"""Circular convolutions on the polar image instead of the Swin-Unet: more accurate than `small` with less computation.
+"""A circular CNN on the polar image, without attention: the cheaper of the two shipped networks.
 
 Reproduces no result of the paper. It answers the first open question of its conclusion: a descriptor that does not
 change when the scan is rotated. docs/decisions/models.md has the reasons, docs/results.md the measurements.
@@ -8,7 +8,7 @@ rotated .919 and .981. The flags of that run were `--sampling.cluster 4 --sampli
 --optimizer.decay-steps 75 --score-every 160`. It took five minutes on one CPU core; at this rate the 1500 steps of the
 preset take less than half an hour.
 
-Command: bin/train --seq 06 --data KITTI_BEV --preset rings
+Command: bin/train --seq 06 --data KITTI_BEV --preset circular
 """
 
 from sglpr_jax.data.sampling.config import TupleConfig
@@ -16,7 +16,7 @@ from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(
-    model=model_preset("rings"),
+    model=model_preset("circular"),
     sampling=TupleConfig(negatives=0),  # the batch's other places are the negatives
     loss=LossConfig(
         margin=0.3,

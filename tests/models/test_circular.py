@@ -1,4 +1,4 @@
-"""The ring net: a rotation of the scan shifts its features and no more."""
+"""The circular CNN: a rotation of the scan shifts its features and no more."""
 
 import dataclasses
 
@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.backbones.rings import RingDecoder, RingNet, block_means
-from sglpr_jax.models.backbones.rings_config import RingConfig
+from sglpr_jax.models.backbones.circular import CircularDecoder, CircularNet, block_means
+from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, segment
 
-RINGS = RingConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
+RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
 HEAD = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
 CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=RINGS, detail=6, head=HEAD)
 SPECTRUM = dataclasses.replace(CONFIG, head=dataclasses.replace(HEAD, pooling="spectrum"))
@@ -29,7 +29,7 @@ def params(request, random_params):
 @pytest.mark.parametrize("fine", [(), (3, 5)])
 def test_maps_shrink_as_configured_and_turn_with_the_image(fine, random_variables):
     image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
-    net = RingNet(dataclasses.replace(RINGS, fine=fine))
+    net = CircularNet(dataclasses.replace(RINGS, fine=fine))
     variables = random_variables(net, image)
     maps = net.apply(variables, image)
     joining = [*fine, 0, 0, 0, 0]
@@ -56,7 +56,7 @@ def test_means_of_blocks_are_numpys(radii, sectors):
 
 def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_variables):
     image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
-    net, decoder = RingNet(RINGS), RingDecoder(RINGS.widths)
+    net, decoder = CircularNet(RINGS), CircularDecoder(RINGS.widths)
     variables = random_variables(net, image)
     maps = net.apply(variables, image)
     weights = random_variables(decoder, maps)
@@ -69,7 +69,7 @@ def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_vari
 def test_fine_blocks_see_what_the_means_do_not(random_variables):
     image = jax.random.normal(jax.random.key(0), (1, 16, 32, 2))
     other = image.at[0, 4, 8].add(1.0).at[0, 5, 9].add(-1.0)  # in one square
-    plain, fine = RingNet(RINGS), RingNet(dataclasses.replace(RINGS, fine=(3,)))
+    plain, fine = CircularNet(RINGS), CircularNet(dataclasses.replace(RINGS, fine=(3,)))
     for net, differs in ((plain, False), (fine, True)):
         variables = random_variables(net, image)
         change = jnp.abs(net.apply(variables, image)[-1] - net.apply(variables, other)[-1]).max()
@@ -119,10 +119,10 @@ def test_the_spectrum_reads_every_radius(random_variables):
 
 def test_what_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match="equal numbers of widths, strides and means"):
-        RingConfig(widths=(4, 8))
+        CircularConfig(widths=(4, 8))
     with pytest.raises(ValueError, match="at most one value for each width"):
-        RingConfig(widths=(4,), strides=(1,), means=(1,), fine=(3, 3))
-    with pytest.raises(ValueError, match="'rings' requires a polar image"):
+        CircularConfig(widths=(4,), strides=(1,), means=(1,), fine=(3, 3))
+    with pytest.raises(ValueError, match="'circular' requires a polar image"):
         ModelConfig(backbone=RINGS)
     with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
         dataclasses.replace(CONFIG, polar=(20, 32))
