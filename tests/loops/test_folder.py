@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from recordings import of_images
 
+from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_csv, read_loops_jsonl, read_tum
+from sglpr_jax.loops.graph_files import read_g2o, read_loops_csv, read_loops_jsonl
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.transforms import transform
 

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.formats.trajectory import read_trajectory
 from sglpr_jax.loops.graph_files import (
     read_g2o,
-    read_kitti,
     read_loops_csv,
     read_loops_jsonl,
-    read_tum,
     write_g2o,
     write_kitti,
     write_loops_csv,
@@ -110,7 +109,7 @@ def test_no_loops_are_files_too(tmp_path, poses):
         (read_g2o, "FIX 0\nVERTEX_SE3:QUAT 1 2 3 4 5 6 7 x\n", "line 2: expected numbers"),
         (read_loops_jsonl, '{"query": 1}\n', "line 1: expected a loop as JSON"),
         (read_loops_csv, "a,b\n", "line 1: expected query,match"),
-        (read_tum, "0 1 2 3 0 0 0 2\n", "expected a quaternion of length 1"),
+        (read_tum, "0 1 2 3 0 0 0 2\n", "expected a rotation qx qy qz qw of length 1 in row 1"),
         (read_tum, "1 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "row 2: expected a time >= 1"),
         (read_kitti, "1 2 3\n", "line 1: expected 12 numbers, found 3"),
     ],

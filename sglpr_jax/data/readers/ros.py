@@ -20,6 +20,7 @@ from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform
 from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.formats.trajectory import check_height
 from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.readable import only
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
@@ -139,13 +140,10 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     poses, how = _of_lidar(placed[used], transforms, lidar)
     missing = len(kept) - int(kept.sum())
     left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
-    rows = np.flatnonzero(kept)
+    chosen = recording if not missing else only(recording, np.flatnonzero(kept).tolist())
     return dataclasses.replace(
-        recording,
-        ids=tuple(recording.ids[i] for i in rows),
-        paths=tuple(recording.paths[i] for i in rows),
+        chosen,
         positions=positions[kept] if poses is None else poses[kept, :3, 3],
-        times=scans.seconds[kept],
         pose_source=f"{used} ({tracks[used]}, {how}{left_out})",
         world_from_lidar=None if poses is None else poses[kept],
     )
