@@ -124,7 +124,7 @@ def test_a_change_of_the_clock_is_told_for_every_layout(tmp_path):
     folder = folder_of_scans(tmp_path / "scans", 12)
     np.savetxt(folder / "times.txt", SECONDS[:12] + 86400.0 * (np.arange(12) >= 7))
     said = (
-        r"scans: expected one drive, found 24 h between scans 6 and 7 \(1 jumps\); scans before and after a jump count"
+        r"scans: expected one drive, found 24 h between scans 6 and 7 \(1 jumps\); scans before and after a jump"
     )
     with pytest.warns(DataWarning, match=said):
         open_recording(folder, sensor_height=1.7)
