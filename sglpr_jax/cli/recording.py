@@ -30,7 +30,7 @@ class RecordingOptions:
     `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
     pose_topic: str | None = None
     """Pose topic of a bag that has several, for example /odom."""
-    time_unit: TimeUnit = "auto"
+    time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)
     """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
