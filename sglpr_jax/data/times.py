@@ -17,7 +17,7 @@ SLOWEST_S = 10.0
 """Maximum median step of scans and poses, in seconds: keyframes at 0.1 Hz."""
 FASTEST_S = 0.005
 """Minimum mean step of scans, in seconds: twice the rate of the fastest LiDARs (100 Hz)."""
-PROOF = 10
+PROOF = 5
 """Number of steps from which the unit is judged. Fewer steps prove nothing."""
 EPOCH = 1e8
 """Whole numbers below this one may number frames. Whole seconds since 1970 are larger since 1973."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.ros_poses import StampedPose
 from sglpr_jax.data.formats.timed_poses import poses_of
+from sglpr_jax.data.times import doubt
 
 UNIT = 0.01
 """Maximum deviation of the length of a quaternion from 1."""
@@ -26,8 +27,8 @@ class Stamps(NamedTuple):
 
     @property
     def orderly(self) -> bool:
-        """Whether the header times are positive and never decrease."""
-        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all())
+        """Whether the header times are positive, never decrease, and can be seconds (`times.doubt`)."""
+        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all() and not doubt(self.own))
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:

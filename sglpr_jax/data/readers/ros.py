@@ -25,6 +25,7 @@ from sglpr_jax.data.readable import only
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 
 ENDINGS = (".bag", ".mcap", ".db3")
@@ -72,7 +73,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
         name=name,
         ids=ids,
         positions=None,
-        times=stamps.seconds,
+        times=_times(stamps, f"{root}, {topic}"),
         pose_source=None,
         paths=tuple(Path(scan) for scan in ids),
         read=partial(_read, bag=bag, topic=topic, where=where),
@@ -81,6 +82,14 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
     )
     lidar = bag.frame(topic, int(recorded[0])).strip("/")
     return _with_poses(recording, bag, stamps, pose_topic, lidar)
+
+
+def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
+    """Times of the scans in seconds, or None with a warning if neither headers nor recorder have seconds."""
+    if found := doubt(stamps.seconds):
+        warn(f"{source}: expected times in seconds in the headers or of the recorder, found {found}; not used")
+        return None
+    return stamps.seconds
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
