@@ -121,3 +121,22 @@ def test_wrong_files_are_one_clear_error(tmp_path, read, text, message):
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"file.*{message}"):
         read(path)
+
+
+def test_coordinates_of_a_country_come_back_with_all_digits(tmp_path, poses, loops):
+    """UTM: seven digits before the point."""
+    poses, times = poses.copy(), 1.7e9 + np.arange(6) / 7
+    poses[:, :3, 3] += (412345.678912345, 5654321.123456789, 0.0)
+    write_tum(tmp_path / "t.tum", poses, times)
+    write_kitti(tmp_path / "t.kitti", poses)
+    write_g2o(tmp_path / "t.g2o", [], poses)
+    again, clock = read_tum(tmp_path / "t.tum")
+    np.testing.assert_array_equal(clock, times)
+    np.testing.assert_array_equal(again[:, :3, 3], poses[:, :3, 3])
+    np.testing.assert_allclose(again, poses, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(read_kitti(tmp_path / "t.kitti"), poses)
+    graph = read_g2o(tmp_path / "t.g2o")
+    np.testing.assert_array_equal(np.stack([graph.poses[i][:3, 3] for i in range(6)]), poses[:, :3, 3])
+    write_loops_csv(tmp_path / "t.csv", loops)
+    for loop, row in zip(loops, read_loops_csv(tmp_path / "t.csv"), strict=True):
+        np.testing.assert_array_equal(row[2][:3, 3], loop.match_from_query[:3, 3])

@@ -4,12 +4,11 @@ The drive goes around a circle: 200 frames of 40 s, then 80 frames of 16 s on th
 is replaced: it matches the nearest frame within 15 m that the detector does not consider recent.
 """
 
-import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bags import header, typestore, write_bag
+from bags import typestore, write_bag
 from recordings import of_scans
 
 import sglpr_jax
@@ -34,6 +33,7 @@ TURN = 2 * np.pi * np.arange(FRAMES) / LAP
 POSES = np.stack([transform(RADIUS_M * np.cos(a), RADIUS_M * np.sin(a), a + np.pi / 2) for a in TURN])
 STAMPS = {unit: SECONDS * PER_SECOND[unit] for unit in ("s", "ms", "us", "ns")} | {"rows": np.arange(float(FRAMES))}
 SAME = {(query, max(query - LAP, 0)) for query in range(LAP - 7, FRAMES)}
+SEARCHED: dict[bytes, set[tuple[int, int]]] = {}
 OTHER_UNIT = "expected times in seconds, found steps of .*, which fit (milli|micro|nano)seconds; state the unit"
 
 
@@ -73,7 +73,13 @@ def found_in(detector: LoopDetector, times) -> set[tuple[int, int]]:
 
 
 def loops_of(params, recording: Recording) -> set[tuple[int, int]]:
-    return found_in(detector_of(params, time_unit="s"), recording.times)
+    """The loops of a recording. Equal times are searched once."""
+    if recording.times is None:
+        return found_in(detector_of(params), None)
+    times = np.round(recording.times - recording.times[0], 6)
+    if times.tobytes() not in SEARCHED:
+        SEARCHED[times.tobytes()] = found_in(detector_of(params, time_unit="s"), times)
+    return SEARCHED[times.tobytes()]
 
 
 def clouds(times=None) -> Recording:
@@ -138,6 +144,7 @@ def written_bag(folder: Path, headers, recorded) -> Path:
     """A bag of small clouds with these times in the headers and of the recorder."""
     store = typestore("ros1").types
     field, name = store["sensor_msgs/msg/PointField"], "sensor_msgs/msg/PointCloud2"
+    head, time = store["std_msgs/msg/Header"], store["builtin_interfaces/msg/Time"]
     layout = {
         "height": 1,
         "width": 1,
@@ -149,7 +156,12 @@ def written_bag(folder: Path, headers, recorded) -> Path:
         "is_dense": True,
     }
     messages = [
-        ("/points", name, late, store[name](header=header("ros1", own, "lidar"), **layout))
+        (
+            "/points",
+            name,
+            late,
+            store[name](head(seq=0, stamp=time(int(own), round(own % 1 * 1e9)), frame_id="lidar"), **layout),
+        )
         for own, late in zip(headers.tolist(), recorded.tolist(), strict=True)
     ]
     return write_bag(folder / "drive.bag", "ros1", messages)
@@ -171,18 +183,10 @@ def test_a_bag_without_seconds_has_no_times(tmp_path):
         assert open_recording(path, sensor_height=1.7).times is None
 
 
-DATES = np.datetime64("2026-01-02T03:04:05", "ns") + (SECONDS * 1e9).astype("timedelta64[ns]")
-START = datetime.datetime(2026, 1, 2, tzinfo=datetime.UTC)
-WITH_A_UNIT = {
-    "datetime64": DATES,
-    "datetime64, microseconds": DATES.astype("datetime64[us]"),
-    "timedelta64": DATES - DATES[0],
-    "datetime": [START + datetime.timedelta(seconds=second) for second in SECONDS.tolist()],
-    "timedelta": [datetime.timedelta(seconds=second) for second in SECONDS.tolist()],
+FROM_PYTHON = {
+    "seconds": 1.7e9 + SECONDS,
+    "datetime64": np.datetime64("2026-01-02T03:04:05", "ns") + (SECONDS * 1e9).astype("timedelta64[ns]"),
 }
-
-
-FROM_PYTHON = {"s": STAMPS["s"], "epoch": 1.7e9 + SECONDS, **WITH_A_UNIT}
 
 
 @pytest.mark.parametrize("times", FROM_PYTHON.values(), ids=FROM_PYTHON)
