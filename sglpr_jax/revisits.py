@@ -7,12 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from sglpr_jax.poses import distances
-from sglpr_jax.same_place import POSITIVE_M
-
-EXCLUDED_S = 30.0
-"""Minimum age of a match, in seconds. Later frames are neighbours of the query, not revisits."""
-EXCLUDED_FRAMES = 290
-"""Replaces EXCLUDED_S for sequences without times: 30 s at KITTI's 9.6 scans per second."""
+from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S, POSITIVE_M
 
 BLOCK = 32
 """Number of queries whose positions are compared at a time, so that the distances fit in the cache."""
@@ -56,6 +51,23 @@ def database_end(
         return np.zeros(0, dtype=np.int64)
     first_younger = np.searchsorted(clock, clock - excluded, side="right")
     return np.where(clock - clock[0] < excluded, 0, np.minimum(first_younger + 1, np.arange(n)))
+
+
+def are_recent(
+    n: int,
+    times: Float[np.ndarray, " n"] | None,
+    now: float | None,
+    *,
+    seconds: float = EXCLUDED_S,
+    frames: int = EXCLUDED_FRAMES,
+) -> Bool[np.ndarray, " n"]:
+    """Return which of `n` places are too recent to be a revisit: those less than `seconds` old at the time `now`.
+
+    Without times or without `now`, these are the last `frames` places.
+    """
+    if now is not None and times is not None:
+        return times > now - seconds
+    return np.arange(n) >= n - frames
 
 
 def has_near(

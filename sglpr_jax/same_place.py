@@ -1,6 +1,13 @@
-"""Distances that define "the same place"."""
+"""Distances that define "the same place", and ages that define a revisit."""
 
 POSITIVE_M = 3.0
 """Maximum distance of two scans that show the same place, in metres."""
 NEGATIVE_M = 20.0
 """Distance beyond which two scans show different places, in metres. Between the two limits a pair is neither."""
+EXCLUDED_S = 30.0
+"""Minimum age of a match, in seconds. Later frames are neighbours of the query, not revisits."""
+EXCLUDED_FRAMES = 290
+"""Replaces EXCLUDED_S for sequences without times: 30 s at KITTI's 9.6 scans per second."""
+SAME_PASS_FRAMES = 50
+"""Maximum difference of the frame numbers within one pass, in training and in `retrieval.nearest`. It is smaller than
+EXCLUDED_FRAMES, because a pass that returns after 5 s also gives training pairs."""

@@ -43,7 +43,7 @@ class EvaluateCommand:
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
-    """File of timestamps for --poses: seconds, one number a line."""
+    """File of timestamps for --poses: one number a line, in `--time-unit`."""
     distance: str | None = None
     """Distance between descriptors of a .npy file: l2 (None), cosine, ... Descriptor files define it themselves."""
     protocol: tuple[str, ...] = ()
@@ -93,7 +93,8 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     params = None if command.weights is None else load(command.weights)
     poses = None
     if command.poses is not None:
-        poses = read_trajectory(command.poses, format=command.pose_format, times=command.times)
+        unit = command.source.time_unit
+        poses = read_trajectory(command.poses, format=command.pose_format, times=command.times, time_unit=unit)
     methods = read_methods(
         (command.file, *command.compare),
         poses=poses,

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,6 +30,9 @@ class RecordingOptions:
     `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
     pose_topic: str | None = None
     """Pose topic of a bag that has several, for example /odom."""
+    time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)
+    """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
+    contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
     def open(self, root: Path) -> "Recording":
         """Open the recording and describe it on stderr. Raises the errors of `data.open_recording`."""
@@ -49,7 +52,7 @@ class PosedRecordingOptions(RecordingOptions):
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None
-    """File of timestamps, if no times.txt is beside the scans: seconds, one number a line."""
+    """File of timestamps, if no times.txt is beside the scans: one number a line, in `--time-unit`."""
 
 
 def open_with_poses(
@@ -63,9 +66,9 @@ def open_with_poses(
 
     if is_own(path, root):
         return own_odometry(source.open(root), root)
-    odometry = read_odometry(path, format=format)  # read first, because a bag opens slowly
+    odometry = read_odometry(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly
     opened = source.open(root)
-    recording, poses = at_scans(opened, odometry, path, format=format)
+    recording, poses = at_scans(opened, odometry, path, format=format, time_unit=source.time_unit)
     if recording is not opened:
         print(recording.found[-1], file=sys.stderr)
     return recording, poses

@@ -9,9 +9,10 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
+from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.fields import Size
+from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.loops.choices import CANDIDATES
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
@@ -29,12 +30,18 @@ class RelocalizeCommand:
     Example:
       bin/relocalize my_scans/000003.bin --map town.safetensors
       bin/relocalize my_scans/000003.bin --map town.safetensors --out pose.json
+      bin/relocalize drive.mcap --frame 12 --map town.safetensors
     """
 
     scan: Annotated[Path, tyro.conf.Positional]
-    """A scan (.bin, .pcd, .ply, .npy, .npz, .las) or a ready-made image (.png)."""
+    """A scan (.bin, .pcd, .ply, .npy, .npz, .las) or a ready-made image (.png). With --frame, a recording: a dataset, a
+    bag or a folder of scans."""
     map: Path
     """Map of bin/map."""
+    frame: CountOrNone | None = None
+    """Number of the scan in the recording, from 0."""
+    seq: str | None = None
+    """Sequence of the recording. May be omitted if there is only one."""
     out: Path | None = None
     """JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
     candidates: Size = CANDIDATES
@@ -46,26 +53,31 @@ class RelocalizeCommand:
     """Format of the scan. `auto` detects it from the name or the content of the file."""
     sensor_height: SensorHeight = "auto"
     """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scan.
-    `auto` takes the mounting of the map's last place."""
+    `auto` takes the mounting of the map's last place or, with --frame, that of the recording."""
 
 
 def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     """Run the command. Returns the answers, the most probable first."""
     from sglpr_jax.files import write_json  # slow imports, not needed for --help
     from sglpr_jax.loops.places import PlaceMap
-    from sglpr_jax.loops.query import read_query
+    from sglpr_jax.loops.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
 
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
-    record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
+    name = command.scan.name
+    if command.frame is None:
+        record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
+    else:
+        options = RecordingOptions(command.seq, format=command.format, sensor_height=command.sensor_height)
+        record, name = query_of(options.open(command.scan), command.frame), f"frame {command.frame} of {name}"
     found = places.relocate(params, record, candidates=command.candidates)
     if not found:
-        raise ValueError(f"{command.scan}: expected a scan that shows a place, found an almost empty one")
+        raise ValueError(f"{name}: expected a scan that shows a place, found an almost empty one")
     if command.out is not None:
         write_json(command.out, [_as_json(one) for one in found])
-    console().print(_table(command.scan, found))
+    console().print(_table(name, found))
     return found
 
 
@@ -74,8 +86,8 @@ def _as_json(found: "Relocated") -> dict:
     return {**about, "world_from_query": found.world_from_query.tolist(), "covariance": found.loop.covariance.tolist()}
 
 
-def _table(scan: Path, found: "list[Relocated]") -> Table:
-    title = escape(f"{scan.name} in the map")  # rich interprets brackets as styles
+def _table(name: str, found: "list[Relocated]") -> Table:
+    title = escape(f"{name} in the map")  # rich interprets brackets as styles
     shared = f"Answers more than {NEGATIVE_M:g} m apart share the probability; closer ones support each other."
     caption = shared if len(found) > 1 else None
     table = Table("place", "probability", "x [m]", "y [m]", "z [m]", "yaw [deg]", title=title, caption=caption)

@@ -41,7 +41,7 @@ def readable(
 
 
 def only(recording: Recording, rows: Sequence[int]) -> Recording:
-    """Return the recording with only the given scans or images."""
+    """Return the recording with only the given scans or images. They keep their ids and numbers."""
     return dataclasses.replace(
         recording,
         ids=tuple(recording.ids[row] for row in rows),
@@ -49,5 +49,6 @@ def only(recording: Recording, rows: Sequence[int]) -> Recording:
         label_paths=tuple(recording.label_paths[row] for row in rows) if recording.label_paths else (),
         positions=None if recording.positions is None else recording.positions[list(rows)],
         times=None if recording.times is None else recording.times[list(rows)],
+        rows=recording.numbers[list(rows)],
         world_from_lidar=None if recording.world_from_lidar is None else recording.world_from_lidar[list(rows)],
     )

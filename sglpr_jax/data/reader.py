@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, TimeUnit
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.fields import check_value, field_types
 
@@ -23,12 +23,14 @@ class ReadOptions:
     """Pose file of a plain folder, if it is not beside the scans."""
     pose_format: PoseFormat = "auto"
     times: Path | None = None
-    """File with one time per line, in seconds."""
+    """File with one time per line."""
+    time_unit: TimeUnit = "auto"
+    """Unit of the times in `times` and `poses`."""
     pose_topic: str | None = None
     """Topic of the poses in a bag that has several."""
 
     def __post_init__(self):
-        for name in ("pose_source", "format", "pose_format"):
+        for name in ("pose_source", "format", "pose_format", "time_unit"):
             check_value(getattr(self, name), field_types(ReadOptions)[name], name)
 
 

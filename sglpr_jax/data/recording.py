@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int, Int32
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import ReadRecord, Record
@@ -47,13 +47,15 @@ class Recording:
     """Poses of the LiDAR in the frame of a bag's messages, if these contain rotations. None for other layouts."""
     found: tuple[str, ...] = ()
     """What the reader found, in words: the format of the scans and the ignored files."""
+    rows: Int[np.ndarray, " n"] | None = None
+    """Row of each scan in the whole recording, if scans are left out. None means that no scan is left out."""
 
     def __post_init__(self):
         """Raises ValueError if two scans have the same id, or if a field does not have one entry per scan."""
         if len(set(self.ids)) < len(self.ids):
             twice = next(name for name in self.ids if self.ids.count(name) > 1)
             raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {twice!r} twice")
-        for name in ("paths", "positions", "times", "label_paths", "world_from_lidar"):
+        for name in ("paths", "positions", "times", "label_paths", "world_from_lidar", "rows"):
             values = getattr(self, name)
             if values is not None and len(values) != len(self) and not (name == "label_paths" and not values):
                 raise ValueError(
@@ -62,6 +64,11 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @property
+    def numbers(self) -> Int[np.ndarray, " n"]:
+        """Number of each scan in the whole recording, from 0. Scans that are left out have numbers, too."""
+        return np.arange(len(self)) if self.rows is None else self.rows
 
     @property
     def description(self) -> tuple[str, ...]:

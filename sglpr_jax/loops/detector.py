@@ -1,6 +1,7 @@
 """Loop detector for a stream of scans."""
 
 import dataclasses
+import datetime
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,12 +10,15 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.special import expit, logit
 
+from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.record import Record
+from sglpr_jax.data.times import PROOF, doubt
+from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Compared, Seen
 from sglpr_jax.loops.choices import MIN_PROBABILITY
 from sglpr_jax.loops.consistency import ConsistencyConfig, agree
 from sglpr_jax.loops.drift import DriftModel, deviations
-from sglpr_jax.loops.given import given_pose, given_record, given_time
+from sglpr_jax.loops.given import DATES, given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
 from sglpr_jax.loops.pose_search import VerificationConfig
 from sglpr_jax.loops.probability import LoopModel, default_model
@@ -67,14 +71,25 @@ class LoopDetector:
               print(loop.query, loop.match, loop.match_from_query, loop.probability)
     """
 
-    def __init__(self, params: Params, *, model: LoopModel | None = None, config: DetectorConfig = DetectorConfig()):
+    def __init__(
+        self,
+        params: Params,
+        *,
+        model: LoopModel | None = None,
+        config: DetectorConfig = DetectorConfig(),
+        time_unit: TimeUnit = "auto",
+    ):
         """Create a detector without frames.
 
         Arguments:
           params: Weights of the model that describes the scans.
           model: Model of the probabilities, by default the one shipped for the weights.
           config: Thresholds.
+          time_unit: Unit of the times of `add`. "auto" expects seconds and rejects times whose first steps contradict
+            this. Dates and time differences of numpy and datetime have a unit of their own.
         """
+        check_value(time_unit, TimeUnit, "time_unit")
+        self.time_unit: TimeUnit = time_unit
         self.finder = CandidateFinder(
             params, config=config.candidates, verification=config.verification, drift=config.drift
         )
@@ -100,7 +115,7 @@ class LoopDetector:
         self,
         scan: Record | ArrayLike,
         *,
-        time: float | None = None,
+        time: float | np.datetime64 | np.timedelta64 | datetime.datetime | datetime.timedelta | None = None,
         odometry: ArrayLike | None = None,
     ) -> list[Loop]:
         """Add the next frame. Returns the loops that it closes or confirms, of this and of the last few frames.
@@ -108,15 +123,30 @@ class LoopDetector:
         Arguments:
           scan: A record (with the mounting of its sensor), points (n, 3) in metres, or an image (h, w) from
             `density_bev`.
-          time: Time of the scan, in seconds.
+          time: Time of the scan in `time_unit`, or a date.
           odometry: Pose of the LiDAR in a fixed frame. It may drift.
 
         Raises:
-          ValueError: If a value has another shape, if times decrease, or if only some frames have a time or odometry.
+          ValueError: If a value has another shape, if times decrease or are not in seconds, or if only some frames have
+            a time or odometry.
           TypeError: If a value is not an array of numbers, for instance a path.
         """
         record, pose = given_record(scan), given_pose(odometry)
-        return self.add_seen(self.finder.seen(record), time=given_time(time), odometry=pose)
+        seconds = self._seconds(time)
+        return self.add_seen(self.finder.seen(record), time=seconds, odometry=pose)
+
+    def _seconds(self, time: Any) -> float | None:
+        """Convert a time to seconds. With "auto", raises ValueError as soon as the steps show another unit."""
+        seconds, before = given_time(time, unit=self.time_unit), self.finder.index.times
+        if seconds is None or isinstance(time, DATES) or self.time_unit != "auto" or len(self) > PROOF:
+            return seconds
+        clock = np.array([seconds]) if before is None else np.append(before, seconds)
+        if found := doubt(clock):
+            raise ValueError(
+                f"frame {len(self)}: expected times in seconds, found {found}; state the unit with LoopDetector(..., "
+                "time_unit=...), or leave the times out"
+            )
+        return seconds
 
     def add_seen(
         self,

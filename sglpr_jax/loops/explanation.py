@@ -3,6 +3,7 @@
 import numpy as np
 
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import FASTEST_S
 from sglpr_jax.loops.candidates import CandidateConfig
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.probability import Evidence
@@ -55,7 +56,7 @@ def why_few_queries(recording: Recording, rules: CandidateConfig, *, frames: int
         return f"The times do not advance: all {frames} frames have the time {times[0]:.12g} s; give --times."
     standing = int((steps == 0).sum())
     about = f" ({standing} of {len(steps)} times do not advance)" if 2 * standing > len(steps) else ""
-    unit = " Times are expected in seconds." if lasts < 1e-3 * len(steps) else ""
+    unit = " Times are expected in seconds." if lasts < FASTEST_S * len(steps) else ""
     return (
         f"The recording lasts {lasts:.3g} s{about}: pairs less than {rules.exclude_s:g} s apart are not considered."
         f"{unit}{some}"

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import doubt
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.candidates import Candidate, Compared, Seen
 from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
 from sglpr_jax.loops.drift import DriftModel
@@ -94,7 +96,7 @@ def find_loops(
     """Find the loops of a recording.
 
     Poses are between LiDAR frames, the frames of the points, whatever the mounting of the sensor. Scans that are almost
-    empty have no loops. If the odometry contradicts most of the loops, a warning says so.
+    empty have no loops. A warning says if the odometry contradicts most of the loops, or if times are not in seconds.
 
     Arguments:
       recording: The scans.
@@ -122,6 +124,8 @@ def find_loops(
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
     check_is(recording, Recording, by="open_recording")
+    if recording.times is not None and (doubted := doubt(recording.times)):
+        warn(f"{recording.name}: expected times in seconds, found {doubted}; 30 s decide which frames are recent")
     odometry = None if odometry is None else given_poses(odometry, of="odometry")
     if odometry is not None and len(odometry) != len(recording):
         raise ValueError(

@@ -5,15 +5,16 @@ Files are written atomically. Poses are those of the LiDAR (x forward, y left, z
 
 import csv
 import io
+import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, check_times, numbers_of, read_poses, read_rows
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of
 from sglpr_jax.files import in_short, parse_json, write_text
 from sglpr_jax.loops.drift import DriftModel, step_deviations
 from sglpr_jax.loops.loop import Loop, Rejected
@@ -23,6 +24,8 @@ from sglpr_jax.poses import are_rotations
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 UPPER = np.triu_indices(6)
 """Indices of the 21 numbers of an information matrix, row by row, translation before rotation."""
+Ids = Sequence[str] | Mapping[int, str]
+"""Id of each frame, by its number."""
 COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
 
 
@@ -40,6 +43,7 @@ def write_g2o(
     odometry: Float[np.ndarray, "n 4 4"] | None = None,
     *,
     drift: DriftModel = DriftModel(),
+    numbers: Int[np.ndarray, " n"] | None = None,
 ) -> None:
     """Write a pose graph: a vertex for each pose, an edge for each step of the odometry, an edge for each loop.
 
@@ -48,17 +52,20 @@ def write_g2o(
       loops: Loops.
       odometry: Pose of the LiDAR at each frame. Without it, the file has only the edges of the loops.
       drift: Drift of the odometry, which determines the information matrices of its edges (`step_deviations`).
+      numbers: Number of the vertex of each pose, as in the loops. By default 0, 1, 2, ...
 
     Raises:
       WriteError: If the file cannot be written.
     """
     lines = []
     if odometry is not None:
-        lines += [f"{VERTEX} {i} {row}" for i, row in enumerate(_pose_rows(odometry))]
+        frames = list(range(len(odometry))) if numbers is None else numbers.tolist()
+        lines += [f"{VERTEX} {i} {row}" for i, row in zip(frames, _pose_rows(odometry), strict=True)]
         steps = _pose_rows(inverse(odometry[:-1]) @ odometry[1:])
         spread = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
         information = (_numbers(np.diag(1 / row)[UPPER]) for row in spread)
-        lines += [f"{EDGE} {i} {i + 1} {row} {next(information)}" for i, row in enumerate(steps)]
+        ends = itertools.pairwise(frames)
+        lines += [f"{EDGE} {i} {j} {row} {next(information)}" for (i, j), row in zip(ends, steps, strict=True)]
     for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
         lines.append(f"{EDGE} {loop.match} {loop.query} {row} {_numbers(loop.information[UPPER])}")
     write_text(Path(path), "".join(f"{line}\n" for line in lines))
@@ -94,43 +101,22 @@ def read_g2o(path: Path | str) -> Graph:
 
 def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:
     """Write a TUM file: a line `time x y z qx qy qz qw` for each pose, in seconds and metres."""
-    lines = (f"{time:.6f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
+    lines = (f"{time:.9f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
     write_text(Path(path), "".join(lines))
-
-
-def read_tum(path: Path | str) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"]]:
-    """Read poses and times of a TUM file.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If a line is invalid. The message names the line.
-    """
-    path = Path(path)
-    rows = read_rows(path, columns=8)
-    check_times(path, rows[:, 0])
-    return from_quaternions(rows[:, 1:4], _quaternions(rows[:, 4:], path)), rows[:, 0]
 
 
 def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
     """Write a KITTI file: 12 numbers a line, in KITTI's camera axes (x right, y down, z forward)."""
     camera = CAMERA_FROM_LIDAR @ poses @ CAMERA_FROM_LIDAR.T
-    write_text(Path(path), "".join(f"{_numbers(pose[:3].reshape(-1))}\n" for pose in camera))
+    write_text(Path(path), "".join(f"{_all_digits(pose[:3].reshape(-1))}\n" for pose in camera))
 
 
-def read_kitti(path: Path | str, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
-    """Read 12 numbers a line, in KITTI's camera axes or, with `camera=False`, with z up. Errors as in `read_tum`."""
-    rows = read_poses(Path(path))
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows
-    return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
-
-
-def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Sequence[str] | None = None) -> None:
+def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Ids | None = None) -> None:
     """Write loops, one JSON object a line, with the `ids` of the frames if they are given."""
     write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids))}\n" for loop in loops))
 
 
-def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Sequence[str] | None = None) -> None:
+def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Ids | None = None) -> None:
     """Write rejected pairs, one JSON object a line, with the `ids` of the frames if they are given."""
     lines = []
     for one in rejected:
@@ -141,7 +127,7 @@ def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Se
 
 
 def read_loops_jsonl(path: Path | str) -> list[Loop]:
-    """Read a file of `write_loops_jsonl`. Raises the errors of `read_tum`."""
+    """Read a file of `write_loops_jsonl`. Raises the errors of `read_g2o`."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
@@ -163,7 +149,7 @@ def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
 def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "4 4"], float]]:
     """Read query, match, match_from_query and probability from a table of `write_loops_csv`.
 
-    Raises the errors of `read_tum`.
+    Raises the errors of `read_g2o`.
     """
     path, found = Path(path), []
     if not path.is_file():
@@ -188,10 +174,10 @@ def _poses_of(loops: Sequence[Loop]) -> Float[np.ndarray, "n 4 4"]:
 
 
 def _pose_rows(poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
-    """x y z qx qy qz qw of each pose."""
+    """x y z qx qy qz qw of each pose, with all digits: coordinates in a country's grid have seven before the point."""
     if not len(poses):
         return []
-    return [_numbers(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
+    return [_all_digits(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
 
 
 def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
@@ -220,16 +206,22 @@ def _check_loop(query: int, match: int, shares: Sequence[float], where: str) -> 
         raise ValueError(f"{where}: expected probability and overlap from 0 to 1, found {shares}")
 
 
+def _all_digits(values: Float[np.ndarray, " n"]) -> str:
+    """Shortest text that reads back as the same float64 values."""
+    short = ((value, f"{value:.9g}") for value in values.tolist())
+    return " ".join(text if float(text) == value else repr(value) for value, text in short)
+
+
 def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-def _as_json(loop: Loop, ids: Sequence[str] | None) -> dict:
+def _as_json(loop: Loop, ids: Ids | None) -> dict:
     pose, covariance = loop.match_from_query.tolist(), loop.covariance.tolist()
     return {**_named(loop, ids), "match_from_query": pose, "covariance": covariance, **_shares(loop)}
 
 
-def _named(loop: Loop, ids: Sequence[str] | None) -> dict:
+def _named(loop: Loop, ids: Ids | None) -> dict:
     """Frames of a loop, and their ids if they are given."""
     named = {} if ids is None else {"query_id": ids[loop.query], "match_id": ids[loop.match]}
     return {"query": loop.query, "match": loop.match, **named}

@@ -6,34 +6,39 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.pose_files import columns_of
+from sglpr_jax.data.choices import TimeUnit
+from sglpr_jax.data.formats.pose_files import columns_of, read_kitti, read_tum
 from sglpr_jax.data.formats.scan_poses import poses_at_scans
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.choices import OdometryFormat
-from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_tum
+from sglpr_jax.loops.graph_files import read_g2o
 from sglpr_jax.poses import are_rotations
 
 BAGS = (".bag", ".mcap", ".db3")
 
 
-def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float[np.ndarray, "n 4 4"]:
+def read_odometry(
+    path: Path | str, *, format: OdometryFormat = "auto", time_unit: TimeUnit = "auto"
+) -> Float[np.ndarray, "n 4 4"]:
     """Read a file of poses, in order.
 
     Arguments:
       path: File with a pose of the LiDAR in each line, or a g2o graph.
       format: Format of the file. "auto" recognises g2o by its suffix and tum by 8 numbers a line. It does not guess the
         axes of files with 12 numbers a line.
+      time_unit: Unit of the times of a tum file (`times_of`).
 
     Raises:
       FileNotFoundError: If the file does not exist.
-      ValueError: If the file has another format, no poses or invalid poses.
+      ValueError: If the file has another format or time unit, no poses or invalid poses.
     """
     path = Path(path)
     check_value(format, OdometryFormat, f"{path}, format")
+    check_value(time_unit, TimeUnit, f"{path}, time_unit")
     format = _format_of(path) if format == "auto" else format
-    poses = _READERS[format](path)
+    poses = read_tum(path, time_unit=time_unit)[0] if format == "tum" else _READERS[format](path)
     if not len(poses):
         raise ValueError(f"{path}: expected at least one pose, found none")
     turned = poses[:, :3, :3]
@@ -44,19 +49,26 @@ def read_odometry(path: Path | str, *, format: OdometryFormat = "auto") -> Float
 
 
 def at_scans(
-    recording: Recording, odometry: Float[np.ndarray, "n 4 4"], path: Path, *, format: OdometryFormat
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"],
+    path: Path,
+    *,
+    format: OdometryFormat,
+    time_unit: TimeUnit = "auto",
 ) -> tuple[Recording, Float[np.ndarray, "q 4 4"]]:
     """Match odometry to the scans of a recording.
 
     Poses are matched row by row. If a tum file has other times than the scans, poses are interpolated at the times of
-    the scans (`poses_at_scans`). Scans without a pose are removed from the recording, and `Recording.found` says so. If
-    the scans have no times, they get the times of a tum file.
+    the scans (`poses_at_scans`). Scans without a pose are removed from the recording, and `Recording.found` says so.
+    The other scans keep their numbers (`Recording.numbers`). If the scans have no times, they get the times of a tum
+    file.
 
     Arguments:
       recording: The scans.
       odometry: Poses that `read_odometry` read from `path`.
       path: File of the odometry.
       format: Format of the file.
+      time_unit: Unit of the times of a tum file (`times_of`).
 
     Returns:
       The recording, and a pose for each of its scans.
@@ -65,7 +77,7 @@ def at_scans(
       ValueError: If most scans have no pose, or if the numbers of poses and scans differ and times are missing.
     """
     tum = (_format_of(path) if format == "auto" else format) == "tum"
-    stamps = read_tum(path)[1] if tum else None
+    stamps = read_tum(path, time_unit=time_unit)[1] if tum else None
     found = poses_at_scans(
         str(path), odometry, stamps, recording.times, scans=len(recording), of=f"scan of {recording.name}"
     )
@@ -128,6 +140,5 @@ def _vertices(path: Path) -> Float[np.ndarray, "n 4 4"]:
 _READERS = {
     "kitti": read_kitti,
     "lidar": lambda path: read_kitti(path, camera=False),
-    "tum": lambda path: read_tum(path)[0],
     "g2o": _vertices,
 }

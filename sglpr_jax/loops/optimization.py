@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.drift import DriftModel, deviations, step_deviations
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
@@ -21,6 +22,8 @@ from sglpr_jax.loops.transforms import inverse
 
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
+MOST_RISEN_M = 2.0
+"""Maximum correction of a height without a warning, in metres."""
 ROUNDS = 5
 """Maximum number of solutions. Before each next one, loops that bend the solution beyond the drift are dropped."""
 
@@ -52,7 +55,7 @@ class OptimizedTrajectory(NamedTuple):
 
 
 def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
-    """Correct the odometry of a recording by its loops, within the stated drift.
+    """Correct the odometry of a recording by its loops, within the stated drift. Warns if heights move by metres.
 
     It takes about a second for a few hundred frames, and minutes for a few thousand.
 
@@ -70,7 +73,14 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     if found.odometry is None:
         raise ValueError(f"{found.recording.name}: expected loops found with odometry, found loops without it")
     odometry = found.odometry[: found.frames]
-    return optimized(odometry, found.loops, drift=found.drift, mounting=found.recording.mounting)
+    corrected = optimized(odometry, found.loops, drift=found.drift, mounting=found.recording.mounting)
+    risen_m = float(np.abs(corrected.poses[:, 2, 3] - odometry[:, 2, 3]).max(initial=0))
+    if risen_m > MOST_RISEN_M:
+        warn(
+            f"{found.recording.name}: expected heights near those of the odometry, found them moved by up to "
+            f"{risen_m:.1f} m; only registered loops (--register) measure heights"
+        )
+    return corrected
 
 
 def optimized(

@@ -3,12 +3,16 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
+
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.data.formats.record_size import unusual_record
 from sglpr_jax.data.formats.scan_files import says_its_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.record import Record, scan_record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.loops.odometry import BAGS
 from sglpr_jax.loops.places import PlaceMap
 
 
@@ -27,11 +31,15 @@ def read_query(
 
     Raises:
       IsADirectoryError: If `path` is a folder.
-      ValueError: If height and tilt cannot be estimated, because the scan shows no ground. Errors of `scan_record` and
-        `read_image` are raised, too.
+      ValueError: If `path` is a bag, or if height and tilt cannot be estimated, because the scan shows no ground.
+        Errors of `scan_record` and `read_image` are raised, too.
     """
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: expected one scan or image, found a folder; name a file in it")
+        raise IsADirectoryError(
+            f"{path}: expected one scan or image, found a folder; name a file in it, or a scan with --frame"
+        )
+    if path.suffix in BAGS:
+        raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")
     if path.suffix == ".png":
         return Record(image=read_image(path))
     record = scan_record(path, format=_found(path) if format == "auto" else format)
@@ -44,6 +52,18 @@ def read_query(
     if found is None:
         raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")
     return dataclasses.replace(record, mounting=found)
+
+
+def query_of(recording: Recording, frame: int) -> Record:
+    """Read the scan with this number from a recording, as a query for `PlaceMap.relocate`.
+
+    Raises ValueError if the recording has no such scan, or if it is left out because it has no pose.
+    """
+    rows = np.flatnonzero(recording.numbers == frame)
+    if not rows.size:
+        there = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"
+        raise ValueError(f"{recording.name}: expected the number of a scan, found {frame}; it has {there}")
+    return recording.record(int(rows[0]), labels=False)
 
 
 def _found(path: Path) -> ScanFormat:

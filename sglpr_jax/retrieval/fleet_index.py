@@ -25,7 +25,7 @@ from sglpr_jax.retrieval.index_rows import (
     new_places,
     places_of,
 )
-from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
+from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, are_recent
 
 FORMAT = "sglpr-jax fleet index 1"
 """Format in every table."""
@@ -145,9 +145,7 @@ class FleetIndex:
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
         """Return which places are too recent to be a revisit. See `Index.recent`."""
-        if now is not None and (times := self.times) is not None:
-            return times > now - seconds
-        return np.arange(len(self)) >= len(self) - frames
+        return are_recent(len(self), None if now is None else self.times, now, seconds=seconds, frames=frames)
 
     def _candidates(self, query: Float[np.ndarray, " d"], k: int, where: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns the rows and descriptors of the nearest k places by LanceDB, without its approximate index."""

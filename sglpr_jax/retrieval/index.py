@@ -29,7 +29,7 @@ from sglpr_jax.retrieval.index_rows import (
     new_places,
     places_of,
 )
-from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
+from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, are_recent
 
 FORMAT = "sglpr-jax index 1"
 """Format in every file."""
@@ -172,13 +172,8 @@ class Index:
     def recent(
         self, now: float | None = None, *, seconds: float = EXCLUDED_S, frames: int = EXCLUDED_FRAMES
     ) -> Bool[np.ndarray, " n"]:
-        """Return which places are too recent to be a revisit: those less than `seconds` old at the time `now`.
-
-        Without times or without `now`, these are the last `frames` places.
-        """
-        if now is not None and self.times is not None:
-            return self.times > now - seconds
-        return np.arange(len(self)) >= len(self) - frames
+        """Return which places are too recent to be a revisit at the time `now` (`revisits.are_recent`)."""
+        return are_recent(len(self), self.times, now, seconds=seconds, frames=frames)
 
     def save(self, path: Path | str) -> None:
         """Write the index to one safetensors file, atomically. Its header contains the ids and metadata as JSON."""

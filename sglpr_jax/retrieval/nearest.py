@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float32, Int
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.retrieval.distances import distance_function, smallest
+from sglpr_jax.same_place import SAME_PASS_FRAMES
 
 BLOCK = 512
 """Number of queries compared with the whole database at a time."""
@@ -46,7 +47,7 @@ def nearest(
     database: DescriptorFile | None = None,
     *,
     k: int = 1,
-    exclude_frames: int = 50,
+    exclude_frames: int = SAME_PASS_FRAMES,
     exclude_s: float = 0.0,
 ) -> Nearest:
     """Find the nearest `k` places of every query by the distance that the descriptor files name.

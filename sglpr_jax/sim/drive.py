@@ -108,7 +108,8 @@ def read_path(file: Path) -> PlanarPath:
     if len(poses) < 2:
         raise ValueError(f"{file}: expected 2 poses or more, 12 numbers a line, found {len(poses)}")
     times_file = file.parent / "times.txt"
-    times = read_times(times_file) if times_file.is_file() else np.arange(len(poses)) / 10
+    times = read_times(times_file, unit="s") if times_file.is_file() else None
+    times = np.arange(len(poses)) / 10 if times is None else times
     if len(times) != len(poses):
         raise ValueError(f"{times_file}: expected {len(poses)} times, one per pose of {file.name}, found {len(times)}")
     if not np.all(np.diff(times) > 0):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import find
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.drift import DriftModel
-from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_jsonl, read_tum, write_kitti, write_tum
+from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, write_kitti, write_tum
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights_file import load

@@ -163,7 +163,9 @@ def test_folders_for_files_and_files_for_folders_are_one_clear_error(command, to
     assert_one_line_error(command(*run, poses, *out, "--add-to", tmp_path), "expected an index, found a folder")
     scans = town / "sequences/08/velodyne"
     ended = command("relocalize", scans, "--map", places_file)
-    assert_one_line_error(ended, "velodyne: expected one scan or image, found a folder; name a file in it")
+    assert_one_line_error(
+        ended, "velodyne: expected one scan or image, found a folder; name a file in it, or use --frame"
+    )
     ended = command("relocalize", scans / "000020.bin", "--map", tmp_path)
     assert_one_line_error(ended, "expected an index, found a folder")
     assert {path.name for path in tmp_path.iterdir()} == {"town.safetensors", "one.safetensors", "poses.tum"}
@@ -190,7 +192,7 @@ def places_file(tmp_path):
 def test_brackets_in_a_name_are_no_style(capsys):
     loop = Loop(1, 0, np.eye(4), np.eye(6), 0.9)
     answers = [Relocated("[red]sunday/000003", np.eye(4), loop)]
-    Console(width=140).print(_table(Path("[bold]scan.bin"), answers))
+    Console(width=140).print(_table("[bold]scan.bin", answers))
     shown = capsys.readouterr().out
     assert "[red]sunday/000003" in shown and "[bold]scan.bin in the map" in shown
 
@@ -202,7 +204,7 @@ def test_answers_that_share_the_probability_say_so(capsys, command, tmp_path):
         Relocated(f"08/{i:06d}", pose, Loop(2, i, pose, np.eye(6), 0.5)) for i, pose in enumerate((np.eye(4), far))
     ]
     for few, words in ((answers, True), (answers[:1], False)):
-        Console(width=140).print(_table(Path("scan.bin"), few))
+        Console(width=140).print(_table("scan.bin", few))
         assert ("Answers more than 20 m apart share the probability" in capsys.readouterr().out) == words
     ended = command("relocalize", "scan.bin", "--map", tmp_path / "map", "--candidates", "1000000000")
     assert_one_line_error(ended, "--candidates: expected a number from 1 up to 1048576, found 1000000000")

@@ -30,8 +30,10 @@ def test_commands_share_the_flags_of_a_recording_and_its_poses(command):
     assert tyro.cli(command, args=POSED[command]).source == PosedRecordingOptions()
     flags = ("--seq", "07", "--pose-source", "kitti", "--format", "nclt", "--sensor-height", "2.5")
     flags += ("--pose-topic", "/odom", "--poses", "p.csv", "--pose-format", "csv", "--times", "t.txt")
+    flags += ("--time-unit", "ms")
     found = tyro.cli(command, args=(*POSED[command], *flags)).source
-    assert found == PosedRecordingOptions("07", "kitti", "nclt", 2.5, "/odom", Path("p.csv"), "csv", Path("t.txt"))
+    files = (Path("p.csv"), "csv", Path("t.txt"))
+    assert found == PosedRecordingOptions("07", "kitti", "nclt", 2.5, "/odom", *files, time_unit="ms")
 
 
 @pytest.mark.parametrize("command", UNPOSED, ids=lambda command: command.__name__)

@@ -5,7 +5,7 @@ import pytest
 from bags import FILES, TRANSFORMS, header, transforms, typestore, write_bag
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
 from sglpr_jax.data.warning import DataWarning
 
@@ -144,7 +144,8 @@ def test_poses_that_are_not_finite_are_none(tmp_path):
     times = np.arange(5.0, 6.0, 0.1)
     where = {5.0: (np.nan, 0.0, 0.0)}
     track = poses("ros1", "/odom", times, where=lambda t: where.get(t, (1.0, 2.0, 3.0)), turns=never)
-    recording = opened(tmp_path, "ros1", scans("ros1", times) + track)
+    with pytest.warns(DataWarning, match=r"on /odom, found 1 of 10 without finite position or without rotation; these"):
+        recording = opened(tmp_path, "ros1", scans("ros1", times) + track)
     np.testing.assert_array_equal(recording.positions, np.tile([1.0, 2.0, 3.0], (10, 1)))
 
 
@@ -188,6 +189,57 @@ def test_rotations_that_nobody_measured_are_none(tmp_path, quaternion):
     recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
     assert recording.world_from_lidar is None and len(recording.positions) == len(times)
     assert recording.pose_source.endswith("interpolated; its rotations are constant or missing)")
+
+
+def test_one_message_without_rotation_is_dropped_and_the_others_turn(tmp_path):
+    times = np.arange(5.0, 11.0, 0.1)
+    track = poses("ros2", "/odom", times, turns=lambda t: turned(t) if t != times[7] else (0.0, 0.0, 0.0, 0.0))
+    with pytest.warns(
+        DataWarning, match=r"expected valid poses on /odom, found 1 of 60 without finite position or"
+    ):
+        recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
+    np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, np.eye(4)), atol=1e-5)
+
+
+def test_poses_once_a_second_with_jitter_reach_all_scans(tmp_path):
+    times = np.arange(5.0, 35.0, 0.1)
+    stamps = np.arange(4.0, 37.0) + np.random.default_rng(0).uniform(-0.2, 0.2, 33)
+    recording = opened(tmp_path, "mcap", scans("mcap", times) + poses("mcap", "/odom", stamps, turns=never))
+    assert len(recording) == len(times)
+    np.testing.assert_allclose(recording.positions[:, 0], 10 * times, atol=1e-4)
+
+
+def test_scans_without_a_pose_keep_their_numbers_free(tmp_path):
+    times = np.arange(5.0, 9.0, 0.5)
+    recording = opened(tmp_path, "mcap", scans("mcap", times) + poses("mcap", "/odom", np.arange(6.45, 9.2, 0.5)))
+    assert recording.numbers.tolist() == [3, 4, 5, 6, 7]
+
+
+def test_bags_of_two_days_are_two_recordings(tmp_path):
+    times, folder = np.arange(5.0, 7.0, 0.1), tmp_path / "bags"
+    folder.mkdir()
+    for day, (name, where) in enumerate({"monday": 0.0, "tuesday": 234.0}.items()):
+        for part, some in enumerate((times[:10], times[10:])):
+            clock = 86400.0 * day + some
+            track = poses("ros1", "/odom", clock, where=lambda t, x=where: (x, t % 86400, 0.0))
+            messages = sorted(scans("ros1", clock) + track, key=lambda message: message[2])
+            write_bag(folder / f"{name}_{part}.bag", "ros1", messages)
+    assert recording_names(folder) == ("monday_0", "tuesday_0")
+    with pytest.raises(FileNotFoundError, match="expected the name of one sequence, found monday_0, tuesday_0"):
+        open_recording(folder)
+    for name, x in (("monday_0", 0.0), ("tuesday_0", 234.0)):
+        recording = open_recording(folder, name, sensor_height=1.7)
+        assert len(recording) == 20
+        np.testing.assert_allclose(recording.positions[:, 0], x)
+
+
+def test_a_track_that_jumps_is_told(tmp_path):
+    times = np.arange(5.0, 7.0, 0.1)
+    track = poses("ros2", "/odom", times, where=lambda t: (t + 234.0 * (t > 6.05), 0.0, 0.0))
+    with pytest.warns(
+        DataWarning, match=r"drive: expected consecutive scans near each other, found 0000\d\d and"
+    ):
+        opened(tmp_path, "ros2", scans("ros2", times) + track)
 
 
 def test_rotations_between_two_are_those_of_an_even_turn():

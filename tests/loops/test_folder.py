@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from recordings import of_images
 
+from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
+from sglpr_jax.data.readable import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.graph_files import read_g2o, read_kitti, read_loops_csv, read_loops_jsonl, read_tum
+from sglpr_jax.loops.graph_files import read_g2o, read_loops_csv, read_loops_jsonl
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.transforms import transform
 
@@ -77,3 +79,26 @@ def test_a_file_that_cannot_be_written_is_named(found, tmp_path):
     (tmp_path / "out").write_text("a file, no folder")
     with pytest.raises(WriteError, match="out"):
         write_found(found, tmp_path / "out")
+
+
+def test_frames_keep_the_numbers_of_the_recording(found, tmp_path):
+    """Also if scans without a pose were left out before the search."""
+    images = {tmp_path / f"{i:06d}.png": np.eye(8, dtype=np.float32) for i in range(80)}
+    some = only(of_images(images, times=10.0 + np.arange(80)), [70, 71, 72, 75, 76, 77])
+    pair = Loop(3, 1, transform(2.0, 0.0, 0.0), np.eye(6), 0.25)
+    write_found(dataclasses.replace(found, recording=some, rejected=(Rejected(pair, "repeats"),)), tmp_path / "out")
+    assert [(query, match) for query, match, *_ in read_loops_csv(tmp_path / "out/loops.csv")] == [(76, 70)]
+    assert [(loop.query, loop.match) for loop in read_loops_jsonl(tmp_path / "out/loops.jsonl")] == [(76, 70)]
+    first = json.loads((tmp_path / "out/loops.jsonl").read_text())
+    assert (first["query_id"], first["match_id"]) == ("000076", "000070")
+    second = json.loads((tmp_path / "out/rejected.jsonl").read_text())
+    assert (second["query"], second["match"], second["query_id"]) == (75, 71, "000075")
+    graph = read_g2o(tmp_path / "out/loops.g2o")
+    assert list(graph.poses) == [70, 71, 72, 75, 76]
+    assert [(i, j) for i, j, *_ in graph.edges] == [(70, 71), (71, 72), (72, 75), (75, 76), (70, 76)]
+    assert read_tum(tmp_path / "out/trajectory.tum")[1].tolist() == [80, 81, 82, 85, 86]
+
+
+def test_a_trajectory_without_times_has_row_numbers_that_are_read_as_such(found, tmp_path):
+    write_found(dataclasses.replace(found, recording=dataclasses.replace(found.recording, times=None)), tmp_path)
+    assert read_tum(tmp_path / "trajectory.tum")[1] is None

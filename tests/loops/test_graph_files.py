@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.formats.trajectory import read_trajectory
 from sglpr_jax.loops.graph_files import (
     read_g2o,
-    read_kitti,
     read_loops_csv,
     read_loops_jsonl,
-    read_tum,
     write_g2o,
     write_kitti,
     write_loops_csv,
@@ -110,7 +109,7 @@ def test_no_loops_are_files_too(tmp_path, poses):
         (read_g2o, "FIX 0\nVERTEX_SE3:QUAT 1 2 3 4 5 6 7 x\n", "line 2: expected numbers"),
         (read_loops_jsonl, '{"query": 1}\n', "line 1: expected a loop as JSON"),
         (read_loops_csv, "a,b\n", "line 1: expected query,match"),
-        (read_tum, "0 1 2 3 0 0 0 2\n", "expected a quaternion of length 1"),
+        (read_tum, "0 1 2 3 0 0 0 2\n", "expected a rotation qx qy qz qw of length 1 in row 1"),
         (read_tum, "1 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", "row 2: expected a time >= 1"),
         (read_kitti, "1 2 3\n", "line 1: expected 12 numbers, found 3"),
     ],
@@ -122,3 +121,22 @@ def test_wrong_files_are_one_clear_error(tmp_path, read, text, message):
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"file.*{message}"):
         read(path)
+
+
+def test_coordinates_of_a_country_come_back_with_all_digits(tmp_path, poses, loops):
+    """UTM: seven digits before the point."""
+    poses, times = poses.copy(), 1.7e9 + np.arange(6) / 7
+    poses[:, :3, 3] += (412345.678912345, 5654321.123456789, 0.0)
+    write_tum(tmp_path / "t.tum", poses, times)
+    write_kitti(tmp_path / "t.kitti", poses)
+    write_g2o(tmp_path / "t.g2o", [], poses)
+    again, clock = read_tum(tmp_path / "t.tum")
+    np.testing.assert_array_equal(clock, times)
+    np.testing.assert_array_equal(again[:, :3, 3], poses[:, :3, 3])
+    np.testing.assert_allclose(again, poses, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(read_kitti(tmp_path / "t.kitti"), poses)
+    graph = read_g2o(tmp_path / "t.g2o")
+    np.testing.assert_array_equal(np.stack([graph.poses[i][:3, 3] for i in range(6)]), poses[:, :3, 3])
+    write_loops_csv(tmp_path / "t.csv", loops)
+    for loop, row in zip(loops, read_loops_csv(tmp_path / "t.csv"), strict=True):
+        np.testing.assert_array_equal(row[2][:3, 3], loop.match_from_query[:3, 3])

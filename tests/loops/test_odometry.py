@@ -33,8 +33,8 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
     recording = of_scans(clouds, times=times, positions=np.arange(18.0).reshape(6, 3))
     path = tmp_path / "odometry.tum"
     write_tum(path, poses, np.arange(5.0))
-    found, given = at_scans(recording, read_odometry(path), path, format="auto")
-    assert found.ids == ("1", "2", "3", "4")
+    found, given = at_scans(recording, read_odometry(path), path, format="auto", time_unit="s")
+    assert found.ids == ("1", "2", "3", "4") and found.numbers.tolist() == [1, 2, 3, 4]
     np.testing.assert_array_equal(found.positions, recording.positions[1:5])
     at = np.array([0.5, 1.25, 4.0, 4.0])
     between = np.stack([transform(x, 0.1 * x, 0.3 * x) for x in at])
@@ -46,7 +46,9 @@ def test_a_tum_file_of_other_times_is_interpolated_at_the_scans(tmp_path, poses)
     late = dataclasses.replace(recording, times=times + 3)
     message = r"odometry\.tum: expected 6 poses, one for each scan of 08.* 2\.5 to 9\.0 s, found 5 from 0\.0 to"
     with pytest.raises(ValueError, match=message):
-        at_scans(late, poses, path, format="tum")
+        at_scans(late, poses, path, format="tum", time_unit="s")
+    with pytest.raises(ValueError, match=r"found 5, and the file has no times .*row numbers 0, 1, 2"):
+        at_scans(recording, poses, path, format="tum")
 
 
 @pytest.mark.parametrize(("stamps", "by_row"), [(0.0, True), (5e-4, True), (0.02, False), ("numbers", True)])
@@ -93,7 +95,7 @@ def test_scans_without_times_get_those_of_a_tum_file(tmp_path, poses):
 )
 def test_as_many_other_poses_without_times_name_their_file_and_the_recording(tmp_path, poses, name, format, times, why):
     write_kitti(tmp_path / "kitti.txt", poses)
-    write_tum(tmp_path / "odometry.tum", poses, np.arange(5.0))
+    write_tum(tmp_path / "odometry.tum", poses, np.arange(5.0) / 10)
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(6)}, times=times)
     message = f"{name}: expected 6 poses, one for each scan of 08, found 5, and {why} ha.* no times to interpolate at"
     with pytest.raises(ValueError, match=message):

@@ -1,16 +1,18 @@
 """A drifted drive of known truth is corrected by its loops; wrong loops do not bend it; gtsam reads our g2o."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import of_images
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.graph_files import read_g2o, write_g2o
 from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import optimize_trajectory, optimized, trajectory_error
+from sglpr_jax.loops.optimization import MOST_RISEN_M, optimize_trajectory, optimized, trajectory_error
 from sglpr_jax.loops.transforms import from_quaternions, inverse, transform
 
 FRAMES = 120
@@ -120,3 +122,13 @@ def test_the_error_does_not_mind_where_a_trajectory_lies():
     assert trajectory_error(poses, true) == pytest.approx(0, abs=1e-9)
     noise = rng.normal(size=(50, 3))
     assert trajectory_error(from_quaternions(true + noise, rotations), true) == pytest.approx(np.sqrt(3), rel=0.15)
+
+
+def test_heights_that_move_by_metres_are_told(twice_around, odometry, loops):
+    images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(FRAMES)}
+    low = odometry.copy()
+    low[:, 2, 3] -= 0.06 * np.arange(FRAMES)  # odometry that sinks, which loops of known heights correct
+    moved = FoundLoops(of_images(images), FRAMES, loops, (), low)
+    with pytest.warns(DataWarning, match="08: expected heights near those of the odometry, found them moved by"):
+        corrected = optimize_trajectory(moved)
+    assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MOST_RISEN_M

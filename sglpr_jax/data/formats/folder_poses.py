@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.choices import PoseFormat
+from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.formats.pose_files import read_times
 from sglpr_jax.data.formats.scan_poses import poses_at_scans, unturned
 from sglpr_jax.data.formats.trajectory import Trajectory, read_trajectory
@@ -15,7 +15,13 @@ TIMES_FILE = "times.txt"
 
 
 def folder_trajectory(
-    root: Path, *, scans: int, poses: Path | None = None, pose_format: PoseFormat = "auto", times: Path | None = None
+    root: Path,
+    *,
+    scans: int,
+    poses: Path | None = None,
+    pose_format: PoseFormat = "auto",
+    times: Path | None = None,
+    time_unit: TimeUnit = "auto",
 ) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
     """Read the positions and times of the scans in a plain folder.
 
@@ -28,6 +34,7 @@ def folder_trajectory(
         line are poses of the LiDAR, z up.
       pose_format: Format of the pose file.
       times: File of timestamps. By default, `TIMES_FILE` beside the scans, or else the times of the poses.
+      time_unit: Unit of the times in both files. With "auto", row numbers are not times (`times_of`).
 
     Returns:
       Positions in metres, times in seconds, and a description of the pose source. Each is `None` if unknown.
@@ -44,11 +51,12 @@ def folder_trajectory(
     clock = times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
     seconds = None
     if clock is not None:
-        seconds = read_times(clock)
-        _check_rows(clock, len(seconds), scans)
+        seconds = read_times(clock, unit=time_unit)
+        _check_rows(clock, scans if seconds is None else len(seconds), scans)
     if path is None:
         return None, seconds, None
-    found = read_trajectory(path, format=pose_format, twelve_numbers="lidar" if poses is None else None)
+    twelve = "lidar" if poses is None else None
+    found = read_trajectory(path, format=pose_format, time_unit=time_unit, twelve_numbers=twelve)
     positions, said = _at_scans(path, found, seconds, scans, of=f"scan of {root.resolve().name}")
     source = found.source if poses is not None else path.name
     return positions, found.times if seconds is None else seconds, f"{source}{said}"

@@ -6,14 +6,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.choices import TimeUnit
+from sglpr_jax.data.formats.timed_poses import poses_of
+from sglpr_jax.data.times import ADVICE, times_of
+from sglpr_jax.data.warning import warn
 from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
 FARTHEST_M = 1e8
 """Maximum absolute coordinate of a position, in metres."""
-LATEST_S = 1e11
-"""Maximum time in seconds, after the year 5000. Larger numbers are milli-, micro- or nanoseconds."""
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
@@ -55,35 +57,47 @@ def rotations_of(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> Float[np.
     from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     check_quaternions(path, quaternions)
+    if not len(quaternions):
+        return np.zeros((0, 3, 3))
     return Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
 
 
-def read_times(path: Path) -> Float[np.ndarray, " n"]:
-    """Return the times (n,) in seconds of a file with one number a line.
+def read_times(path: Path, *, unit: TimeUnit = "auto") -> Float[np.ndarray, " n"] | None:
+    """Return the times (n,) in seconds of a file with one number a line. Warns and returns None for row numbers.
 
     Raises:
       FileNotFoundError: If the file does not exist.
-      ValueError: If a line is not a finite number, or `check_times` fails. The message names the line or row.
+      ValueError: If a line is not a finite number, or `times_of` fails. The message names the line or row.
     """
-    times = read_rows(path, columns=1)[:, 0]
-    check_times(path, times)
+    times = times_of(read_rows(path, columns=1)[:, 0], source=path, unit=unit)
+    if times is None:
+        warn(f"{path}: expected times, found row numbers (0, 1, 2, ...), not used; {ADVICE}")
     return times
 
 
-def check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
-    """Raise ValueError if a time is smaller than the previous one. The message names its row in `path`.
+def read_tum(
+    path: Path, *, time_unit: TimeUnit = "auto"
+) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, " n"] | None]:
+    """Read the poses of a TUM file (`time x y z qx qy qz qw`), and their times in seconds or None (`times_of`).
 
-    Times in smaller units than seconds are rejected, too. Limits such as "30 s older" would be wrong for them.
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line is invalid. The message names the line or row.
     """
-    late = np.flatnonzero(np.abs(times) > LATEST_S)
-    if late.size:
-        raise ValueError(
-            f"{path}, row {late[0] + 1}: expected seconds, found {times[late[0]]:g}; is it in a smaller unit?"
-        )
-    backwards = np.flatnonzero(np.diff(times) < 0)
-    if backwards.size:
-        row = int(backwards[0]) + 2
-        raise ValueError(f"{path}, row {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
+    rows = read_rows(path, columns=8)
+    times = times_of(rows[:, 0], source=path, unit=time_unit)
+    check_positions(path, rows[:, 1:4])
+    return poses_of(rows[:, 1:4], rotations_of(path, rows[:, 4:])), times
+
+
+def read_kitti(path: Path, *, camera: bool = True) -> Float[np.ndarray, "n 4 4"]:
+    """Read poses with z up from 12 numbers a line, in KITTI's camera axes or, with `camera=False`, with z up.
+
+    Raises the errors of `read_poses`.
+    """
+    rows = read_poses(path)
+    poses = poses_of(rows[:, :, 3], rows[:, :, :3])
+    return CAMERA_FROM_LIDAR.T @ poses @ CAMERA_FROM_LIDAR if camera else poses
 
 
 def rows_of(ids: Sequence[str], *, rows: int, path: Path) -> list[int]:

@@ -36,6 +36,17 @@ class RosBag:
         return {connection.topic: connection.msgtype for connection in self._reader.connections}
 
     @property
+    def parts(self) -> list[tuple[Path, int, int]]:
+        """Path of each bag with messages, and the recorder's times (ns) of its first and last message."""
+        spans = zip(self.paths, self._reader.readers, strict=True)
+        return [(path, part.start_time, part.end_time) for path, part in spans if part.message_count]
+
+    @property
+    def has_clouds(self) -> bool:
+        """Whether the bag has a point cloud topic."""
+        return any(kind in CLOUDS for kind in self.topics.values())
+
+    @property
     def cloud_topics(self) -> tuple[str, ...]:
         """Point cloud topics. Raises ValueError, with a list of all topics, if the bag has no point clouds."""
         topics = self.topics

@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
+from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.ros_poses import StampedPose
 from sglpr_jax.data.formats.timed_poses import poses_of
+from sglpr_jax.data.times import doubt
 
 UNIT = 0.01
 """Maximum deviation of the length of a quaternion from 1."""
@@ -25,8 +27,8 @@ class Stamps(NamedTuple):
 
     @property
     def orderly(self) -> bool:
-        """Whether the header times are positive and never decrease."""
-        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all())
+        """Whether the header times are positive, never decrease, and can be seconds (`times.doubt`)."""
+        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all() and not doubt(self.own))
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:
@@ -47,15 +49,24 @@ class Track:
     """Child frame, such as "base_link". Empty if the messages do not name it."""
     frame: str
     """Reference frame, such as "odom"."""
+    dropped: int = 0
+    """Number of messages without a valid pose, which are not part of the track."""
 
     @classmethod
     def of(cls, found: Iterable[tuple[int, StampedPose]]) -> "Track":
-        """Create a track from recorder times (ns) and poses. Poses with non-finite positions are dropped."""
-        kept = [(time, pose) for time, pose in found if np.isfinite(pose.numbers[:3]).all()]
+        """Create a track from recorder times (ns) and poses. Poses with non-finite positions are dropped.
+
+        If most poses have a rotation, those without one are dropped, too.
+        """
+        given = list(found)
+        placed = [(time, pose) for time, pose in given if np.isfinite(pose.numbers[:3]).all()]
+        valid = _are_unit([pose.numbers[3:] for _, pose in placed])
+        turned = [one for one, fits in zip(placed, valid, strict=True) if fits]
+        kept = turned if 2 * len(turned) > len(placed) else placed
         numbers = np.array([pose.numbers for _, pose in kept], np.float64).reshape(-1, 7)
         stamps = Stamps(np.array([t for t, _ in kept], np.int64), np.array([pose.time for _, pose in kept], float))
         child, frame = (kept[0][1].child, kept[0][1].frame) if kept else ("", "")
-        return cls(stamps, numbers[:, :3], numbers[:, 3:], child, frame)
+        return cls(stamps, numbers[:, :3], numbers[:, 3:], child, frame, len(given) - len(kept))
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -63,9 +74,7 @@ class Track:
     @property
     def turned(self) -> bool:
         """Whether the quaternions are valid rotations that change. A GPS receiver writes zeros or a constant."""
-        with np.errstate(invalid="ignore"):
-            lengths = np.linalg.norm(self.quaternions, axis=1)
-        return bool(len(self) and (np.abs(lengths - 1) <= UNIT).all() and np.ptp(self.quaternions, axis=0).any())
+        return bool(len(self) and _are_unit(self.quaternions).all() and np.ptp(self.quaternions, axis=0).any())
 
     @property
     def moves(self) -> bool:
@@ -75,6 +84,13 @@ class Track:
 
     def __str__(self) -> str:
         return f"{len(self)} poses of {self.child or 'a body'} in {self.frame or 'a frame'}"
+
+
+def _are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
+    """Whether each quaternion has length 1."""
+    with np.errstate(invalid="ignore"):
+        lengths = np.linalg.norm(np.reshape(np.asarray(quaternions, np.float64), (-1, 4)), axis=1)
+        return np.abs(lengths - 1) <= UNIT
 
 
 def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:

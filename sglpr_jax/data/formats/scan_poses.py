@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.formats.timed_poses import WIDEST_S, interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of, widest_gap_s
 
 SAME_S = 0.001
 """Maximum difference of equal times, in seconds. Programs round times differently."""
@@ -36,9 +36,9 @@ def poses_at_scans(
     """Assign a pose to each scan.
 
     If the numbers of poses and scans are equal and their times do not differ, poses are assigned row by row. This also
-    applies to `stamps` that merely count rows, and to `stamps` with another origin but the same intervals. Otherwise
-    the poses are interpolated. A scan has no pose if the poses before and after it are more than 1 s apart, or if it is
-    more than 0.1 s before the first pose or after the last one.
+    applies to `stamps` with another origin but the same intervals. Otherwise the poses are interpolated. A scan has no
+    pose if the poses before and after it are too far apart in time (`widest_gap_s`), or if it is more than 0.1 s before
+    the first pose or after the last one.
 
     Arguments:
       source: Name of the pose file, for messages.
@@ -55,7 +55,10 @@ def poses_at_scans(
         return ScanPoses(np.ones(scans, bool), poses, said)
     if stamps is None or times is None:
         why = "the file has no times" if stamps is None else "the scans have no times"
-        raise ValueError(f"{source}: {_expected(scans, of)}, found {len(poses)}, and {why} to interpolate at")
+        raise ValueError(
+            f"{source}: {_expected(scans, of)}, found {len(poses)}, and {why} to interpolate at (row numbers "
+            "0, 1, 2, ... are not times)"
+        )
     kept, positions = interpolate(stamps, poses[:, :3, 3], times)
     if kept.mean() < LEAST_SHARE:
         raise ValueError(_other_clock(source, stamps, times, of))
@@ -72,7 +75,7 @@ def unturned(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:
 
 def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
     """Description of a match row by row, or None if the times contradict it."""
-    if stamps is None or times is None or np.array_equal(stamps, np.arange(len(stamps))):
+    if stamps is None or times is None:
         return ""
     behind = times - stamps
     if np.abs(behind).max() <= SAME_S:
@@ -100,6 +103,6 @@ def _other_clock(source: str, stamps: Float[np.ndarray, " m"], times: Float[np.n
     found = f"found {len(stamps)} from {stamps[0]:.1f} to {stamps[-1]:.1f} s"
     by_row = "; if row i belongs to scan i nevertheless, write 12 numbers a line, without times"
     return (
-        f"{source}: {_expected(len(times), of)}, at its time, or poses at most {WIDEST_S:g} s apart that cover the "
-        f"scans, {times[0]:.1f} to {times[-1]:.1f} s, {found}{by_row if len(stamps) == len(times) else ''}"
+        f"{source}: {_expected(len(times), of)}, at its time, or poses at most {widest_gap_s(stamps):.2g} s apart that "
+        f"cover the scans, {times[0]:.1f} to {times[-1]:.1f} s, {found}{by_row if len(stamps) == len(times) else ''}"
     )

@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-WIDEST_S = 1.0
-"""Maximum time between two poses for interpolation, in seconds."""
+WIDEST_S = (1.0, 2.0)
+"""Maximum time between two poses for interpolation, in seconds: the least and the greatest value (`widest_gap_s`)."""
+JITTER = 1.5
+"""Maximum time between two poses for interpolation, as a multiple of the median time between them."""
 BEYOND_S = 0.1
 """Maximum time of a scan before the first pose or after the last one, in seconds."""
 
@@ -77,6 +79,16 @@ class Interpolated(NamedTuple):
     """Positions in metres, valid where `kept` is true."""
 
 
+def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
+    """Maximum time between two poses for interpolation, in seconds. It follows from the rate of ordered `stamps`.
+
+    It is 1.5 s for poses at 1 Hz, to allow for jitter, and from 1 s to 2 s for other rates.
+    """
+    steps = np.diff(stamps)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    return float(np.clip(JITTER * usual, *WIDEST_S))
+
+
 def interpolate(
     stamps: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " q"]
 ) -> Interpolated:
@@ -86,7 +98,7 @@ def interpolate(
     order = np.argsort(stamps, kind="stable")
     stamps, positions = stamps[order], positions[order]
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    near = stamps[later] - stamps[later - 1] <= WIDEST_S
+    near = stamps[later] - stamps[later - 1] <= widest_gap_s(stamps)
     within = (times >= stamps[0] - BEYOND_S) & (times <= stamps[-1] + BEYOND_S)
     return Interpolated(near & within, np.stack([np.interp(times, stamps, axis) for axis in positions.T], axis=1))
 

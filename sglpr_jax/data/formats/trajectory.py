@@ -14,19 +14,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.choices import PoseFormat
-from sglpr_jax.data.formats.pose_files import (
-    check_positions,
-    check_quaternions,
-    check_times,
-    columns_of,
-    read_poses,
-    read_rows,
-    read_times,
-)
+from sglpr_jax.data.choices import PoseFormat, TimeUnit
+from sglpr_jax.data.formats.pose_files import check_positions, columns_of, read_kitti, read_rows, read_times, read_tum
+from sglpr_jax.data.times import times_of
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value
-from sglpr_jax.poses import positions_from_camera
 
 MOST_HEIGHT_M = 100.0
 """Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
@@ -61,6 +53,7 @@ def read_trajectory(
     *,
     format: PoseFormat = "auto",
     times: Path | None = None,
+    time_unit: TimeUnit = "auto",
     twelve_numbers: Literal["kitti", "lidar"] | None = None,
 ) -> Trajectory:
     """Read a pose file with one row per frame. Warns if the heights look wrong.
@@ -68,7 +61,8 @@ def read_trajectory(
     Arguments:
       path: Pose file.
       format: Format of the pose file. "auto" recognises csv by its ending and tum by its 8 numbers a line.
-      times: File of timestamps in seconds, one number a line. They replace the times of the pose file.
+      times: File of timestamps, one number a line. They replace the times of the pose file.
+      time_unit: Unit of the times in both files (`times_of`).
       twelve_numbers: Format of files with 12 numbers a line, for "auto". It cannot be detected, and horizontal
         distances depend on it.
 
@@ -78,14 +72,16 @@ def read_trajectory(
         format.
     """
     check_value(format, PoseFormat, f"{path}, format")
-    trajectory = READERS[_format_of(path, twelve_numbers) if format == "auto" else format](path)
+    check_value(time_unit, TimeUnit, f"{path}, time_unit")
+    unit = "s" if times is not None and time_unit == "auto" else time_unit  # times that are replaced are not judged
+    trajectory = _read(path, _format_of(path, twelve_numbers) if format == "auto" else format, unit)
     if len(trajectory.positions) == 0:
         raise ValueError(f"{path}: expected at least one pose, found none")
     check_height(trajectory.positions, path=path)
     if times is None:
         return trajectory
-    clock = read_times(times)
-    if len(clock) != len(trajectory.positions):
+    clock = read_times(times, unit=time_unit)
+    if clock is not None and len(clock) != len(trajectory.positions):
         raise ValueError(f"{times}: expected {len(trajectory.positions)} times, one per pose, found {len(clock)}")
     return replace(trajectory, times=clock, by_row=True)
 
@@ -144,30 +140,23 @@ def _format_of(path: Path, twelve_numbers: str | None) -> str:
     return "tum"
 
 
-def _read_kitti(path: Path) -> Trajectory:
-    return Trajectory(positions_from_camera(read_poses(path)), None, _said(path, "camera"))
+def _read(path: Path, format: str, unit: TimeUnit) -> Trajectory:
+    if format == "csv":
+        return _read_csv(path, unit)
+    if format == "tum":
+        poses, times = read_tum(path, time_unit=unit)
+        return Trajectory(poses[:, :3, 3], times, _said(path, "TUM"))
+    camera = format == "kitti"
+    poses = read_kitti(path, camera=camera)
+    return Trajectory(poses[:, :3, 3], None, _said(path, "camera" if camera else "z up"))
 
 
-def _read_lidar(path: Path) -> Trajectory:
-    return Trajectory(read_poses(path)[:, :, 3], None, _said(path, "z up"))
-
-
-def _read_tum(path: Path) -> Trajectory:
-    rows = read_rows(path, columns=8)
-    check_times(path, rows[:, 0])
-    check_positions(path, rows[:, 1:4])
-    check_quaternions(path, rows[:, 4:])
-    return Trajectory(rows[:, 1:4], rows[:, 0], _said(path, "TUM"))
-
-
-def _read_csv(path: Path) -> Trajectory:
+def _read_csv(path: Path, unit: TimeUnit) -> Trajectory:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a pose file, found none")
     names, clock = _header(path)
     columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
-    times = None if clock is None else columns[clock]
-    if times is not None:
-        check_times(path, times)
+    times = None if clock is None else times_of(columns[clock], source=path, unit=unit)
     positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
     check_positions(path, positions)
     return Trajectory(positions, times, _said(path, "csv"))
@@ -193,6 +182,3 @@ def _header(path: Path) -> tuple[list[str], str | None]:
 def _said(path: Path, format: str) -> str:
     """Short description of the file for tables: the last two parts of its path, and the format."""
     return f"{Path(*path.parts[-2:])} ({format})"
-
-
-READERS = {"kitti": _read_kitti, "lidar": _read_lidar, "tum": _read_tum, "csv": _read_csv}

@@ -8,12 +8,13 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight
+from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.listing import left_aside
 from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import check_jumps, check_order
 
 
 @functools.cache
@@ -46,6 +47,7 @@ def open_recording(
     poses: Path | str | None = None,
     pose_format: PoseFormat = "auto",
     times: Path | str | None = None,
+    time_unit: TimeUnit = "auto",
     pose_topic: str | None = None,
 ) -> Recording:
     """Open one sequence of `root`, in any supported layout.
@@ -59,12 +61,14 @@ def open_recording(
         some scans. "auto" estimates them only if the layout does not define the mounting.
       poses: Pose file of a plain folder, if it is not beside the scans.
       pose_format: Format of the pose file of a plain folder.
-      times: File of timestamps of a plain folder in seconds, if it is not beside the scans.
+      times: File of timestamps of a plain folder, if it is not beside the scans.
+      time_unit: Unit of the times in text files of a plain folder or of KITTI's layout. "auto" expects seconds.
       pose_topic: Pose topic of a bag. By default, the topic that covers most scans is used.
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, or if `poses`, `times` or `pose_topic` does not apply to the layout.
+      ValueError: If a file is malformed, if times decrease, or if `poses`, `times` or `pose_topic` does not apply to
+        the layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 
     Example:
@@ -83,8 +87,11 @@ def open_recording(
     if pose_topic is not None and not reader.takes_pose_topic:
         raise ValueError(f"{root}: expected a bag with the pose topic {pose_topic}, found {reader.layout}")
     pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
-    options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, pose_topic)
+    options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, time_unit, pose_topic)
     recording = reader.open(root, name, options)
+    if recording.times is not None:
+        check_order(recording.times, source=f"{root}, sequence {name}")
+        check_jumps(recording.times, source=f"{root}, sequence {name}")
     return mounted(recording, sensor_height, known=reader.knows_mounting)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.choices import PoseChoice, ScanFormat
+from sglpr_jax.data.choices import PoseChoice, ScanFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import described
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
 from sglpr_jax.data.formats.record_size import unusual_record
@@ -38,7 +38,12 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(
-    root: Path, name: str, *, pose_source: PoseChoice = "auto", format: ScanFormat = "auto"
+    root: Path,
+    name: str,
+    *,
+    pose_source: PoseChoice = "auto",
+    format: ScanFormat = "auto",
+    time_unit: TimeUnit = "auto",
 ) -> Recording:
     """Open `root/sequences/<name>`.
 
@@ -48,6 +53,7 @@ def open_recording(
       pose_source: Choice of the pose file, as in `read_trajectory`.
       format: Format of the scans. With "auto", scans that do not fit KITTI's record but clearly fit another record are
         read as the other one (`unusual_record`).
+      time_unit: Unit of times.txt (`times_of`).
 
     Raises:
       FileNotFoundError: If the scans or the poses are missing.
@@ -58,7 +64,7 @@ def open_recording(
     if not scan_paths:
         raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
     ids = tuple(path.stem for path in scan_paths)
-    positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source)
+    positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source, time_unit=time_unit)
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
     reading, mounting = _read(scan_paths, format), _mounting(root)
     if mounting is not None:
@@ -103,7 +109,7 @@ def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
 
 
 def read_trajectory(
-    root: Path, name: str, *, pose_source: PoseChoice = "auto"
+    root: Path, name: str, *, pose_source: PoseChoice = "auto", time_unit: TimeUnit = "auto"
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " m"] | None, str]:
     """Read the trajectory of a sequence. The scans are not needed.
 
@@ -111,6 +117,7 @@ def read_trajectory(
       root: Folder of the dataset.
       name: Name of the sequence.
       pose_source: Choice of the pose file. "auto" prefers SemanticKITTI's.
+      time_unit: Unit of times.txt (`times_of`).
 
     Returns:
       Positions of all frames in metres, z up; their times in seconds, or None; and the name of the pose file.
@@ -125,13 +132,15 @@ def read_trajectory(
     if pose_file is None:
         raise FileNotFoundError(f"{root}: expected poses in {' or '.join(candidates)}, found none")
     times_path = root / "sequences" / name / "times.txt"
-    times = read_times(times_path) if times_path.is_file() else None
+    times = read_times(times_path, unit=time_unit) if times_path.is_file() else None
     return positions_from_camera(read_poses(root / pose_file)), times, pose_file
 
 
 READER = Reader(
     layout="sequences/NN/velodyne/*.bin (KITTI)",
     recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name, pose_source=options.pose_source, format=options.format),
+    open=lambda root, name, options: open_recording(
+        root, name, pose_source=options.pose_source, format=options.format, time_unit=options.time_unit
+    ),
     rank=0,
 )

@@ -71,6 +71,7 @@ def open_recording(root: Path, name: str, *, max_gap_s: float = MAX_GAP_S) -> Re
         read=scan_record,
         mounting=BODY,
         found=("sensor: coordinates are relative to the ground below it",),
+        rows=np.flatnonzero(matched.kept),
     )
 
 

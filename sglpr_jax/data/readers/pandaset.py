@@ -18,11 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.arrays import read_npy
-from sglpr_jax.data.formats.pose_files import check_positions, check_times, rotations_of, rows_of
+from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import check_order
 from sglpr_jax.files import read_json
 
 PICKLES = ".pkl.gz"
@@ -56,7 +57,7 @@ def open_recording(root: Path, name: str) -> Recording:
     rows = rows_of(ids, rows=len(positions), path=folder / "poses.json")
     times = _times(folder / "timestamps.json")
     seconds = times[rows_of(ids, rows=len(times), path=folder / "timestamps.json")]
-    check_times(folder / "timestamps.json", seconds)
+    check_order(seconds, source=folder / "timestamps.json")
     poses = {path: (rotations[row], positions[row]) for path, row in zip(paths, rows, strict=True)}
     left = f", {len(pickles) - len(paths)} pickles not converted" if len(pickles) > len(paths) else ""
     return Recording(

@@ -1,7 +1,8 @@
 """Reader of ROS bags: a .bag, an .mcap, a ROS 2 folder (metadata.yaml), or a folder of .bag or .mcap files.
 
 Each point cloud topic is a recording. A single recording has the name of the bag. If the bag has several topics, each
-recording has the name of its topic, with _ instead of /.
+recording has the name of its topic, with _ instead of /. Bags of a folder that follow each other are parts of a drive.
+After a pause another drive begins, with recordings of its own, whose names begin with the name of its first bag.
 
 The poses come from the pose topic that covers most scans. They are interpolated at the times of the scans and
 transformed to the LiDAR frame by tf. If tf does not contain the mounting of the LiDAR, the poses are not transformed.
@@ -18,13 +19,18 @@ from jaxtyping import Bool, Float
 from sglpr_jax.data.formats.ros_bag import RosBag
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform
 from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
-from sglpr_jax.data.formats.trajectory import check_height
+from sglpr_jax.data.formats.trajectory import check_height, check_order
 from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.readable import only
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import doubt
+from sglpr_jax.data.warning import warn
 
 ENDINGS = (".bag", ".mcap", ".db3")
+PAUSE_NS = 60 * 10**9
+"""Minimum pause between two drives in a folder of bags, in nanoseconds. Parts of a drive follow each other at once."""
 LEAST_SHARE = 0.5
 """Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
 
@@ -36,8 +42,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
       ValueError: If a bag has no point cloud topic or is broken.
       ImportError: If the extra `ros` is not installed.
     """
-    paths = bag_files(root)
-    return tuple(_topics(root, RosBag(paths))) if paths else ()
+    return tuple(_recordings(root)) if bag_files(root) else ()
 
 
 def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> Recording:
@@ -55,8 +60,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
       ValueError: If the bag is broken, the topic has no messages, or `pose_topic` does not cover most scans.
       ImportError: If the extra `ros` is not installed.
     """
-    bag = RosBag(bag_files(root))
-    topic = _topics(root, bag)[name]
+    bag, topic = _recordings(root)[name]
     stamps = bag.stamps(topic)
     recorded = stamps.recorded
     if not len(recorded):
@@ -69,7 +73,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
         name=name,
         ids=ids,
         positions=None,
-        times=stamps.seconds,
+        times=_times(stamps, f"{root}, {topic}"),
         pose_source=None,
         paths=tuple(Path(scan) for scan in ids),
         read=partial(_read, bag=bag, topic=topic, where=where),
@@ -78,6 +82,14 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
     )
     lidar = bag.frame(topic, int(recorded[0])).strip("/")
     return _with_poses(recording, bag, stamps, pose_topic, lidar)
+
+
+def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
+    """Times of the scans in seconds, or None with a warning if neither headers nor recorder have seconds."""
+    if found := doubt(stamps.seconds):
+        warn(f"{source}: expected times in seconds in the headers or of the recorder, found {found}; not used")
+        return None
+    return stamps.seconds
 
 
 def bag_files(root: Path) -> tuple[Path, ...]:
@@ -89,12 +101,30 @@ def bag_files(root: Path) -> tuple[Path, ...]:
     return files_in(root, ".bag") or files_in(root, ".mcap")
 
 
-def _topics(root: Path, bag: RosBag) -> dict[str, str]:
-    """Point cloud topics, by the names of their recordings."""
-    topics = bag.cloud_topics
-    if len(topics) == 1:
-        return {root.resolve().stem if root.is_file() else root.resolve().name: topics[0]}
-    return {topic.strip("/").replace("/", "_"): topic for topic in topics}
+def _recordings(root: Path) -> dict[str, tuple[RosBag, str]]:
+    """Bag and point cloud topic of each recording, by name."""
+    whole = RosBag(bag_files(root))
+    drives = [bag for bag in _drives(whole) if bag.has_clouds] or [whole]
+    lone = root.resolve().stem if root.is_file() else root.resolve().name
+    found = {}
+    for bag in drives:
+        for topic in bag.cloud_topics:
+            parts = [bag.paths[0].stem] if len(drives) > 1 else []
+            parts += [topic.strip("/").replace("/", "_")] if len(bag.cloud_topics) > 1 else []
+            found["_".join(parts) or lone] = bag, topic
+    return found
+
+
+def _drives(bag: RosBag) -> list[RosBag]:
+    """The bags of each drive. Poses of one drive have no meaning in another one."""
+    drives: list[list[Path]] = []
+    last = 0
+    for path, start, end in sorted(bag.parts, key=lambda part: part[1]):
+        if not drives or start - last > PAUSE_NS:
+            drives.append([])
+        drives[-1].append(path)
+        last = max(last, end)
+    return [bag] if len(drives) < 2 else [RosBag(paths) for paths in drives]
 
 
 class _Placed(NamedTuple):
@@ -136,16 +166,17 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
         return recording
     kept, positions = placed[used].kept, placed[used].positions
     check_height(positions[kept], path=bag.paths[0])
+    check_order(positions[kept], [recording.ids[i] for i in np.flatnonzero(kept)], path=bag.paths[0])
+    if dropped := tracks[used].dropped:
+        found = f"{dropped} of {len(tracks[used]) + dropped} without finite position or without rotation"
+        warn(f"{bag.paths[0]}: expected valid poses on {used}, found {found}; these are dropped")
     poses, how = _of_lidar(placed[used], transforms, lidar)
     missing = len(kept) - int(kept.sum())
     left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
-    rows = np.flatnonzero(kept)
+    chosen = recording if not missing else only(recording, np.flatnonzero(kept).tolist())
     return dataclasses.replace(
-        recording,
-        ids=tuple(recording.ids[i] for i in rows),
-        paths=tuple(recording.paths[i] for i in rows),
+        chosen,
         positions=positions[kept] if poses is None else poses[kept, :3, 3],
-        times=scans.seconds[kept],
         pose_source=f"{used} ({tracks[used]}, {how}{left_out})",
         world_from_lidar=None if poses is None else poses[kept],
     )

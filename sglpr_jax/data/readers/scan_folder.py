@@ -2,14 +2,14 @@
 
 - `my_scans/full0.bin`, `full1.bin`, ..., `full10.bin`: scans in the order of their numbers. Hidden files are ignored.
 - `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `poses.tum` and `poses.csv` work, too.
-- `my_scans/times.txt`: timestamps in seconds, one number a line.
+- `my_scans/times.txt`: timestamps, one number a line, in seconds unless `time_unit` names another unit.
 """
 
 from collections import Counter
 from functools import partial
 from pathlib import Path
 
-from sglpr_jax.data.choices import PoseFormat, RecordFormat, ScanFormat
+from sglpr_jax.data.choices import PoseFormat, RecordFormat, ScanFormat, TimeUnit
 from sglpr_jax.data.formats.bin_records import described, is_record
 from sglpr_jax.data.formats.folder_poses import POSE_FILES, TIMES_FILE, folder_trajectory
 from sglpr_jax.data.formats.record_size import check_record, find_record
@@ -33,6 +33,7 @@ def open_recording(
     poses: Path | None = None,
     pose_format: PoseFormat = "auto",
     times: Path | None = None,
+    time_unit: TimeUnit = "auto",
 ) -> Recording:
     """Open the folder `root`. Warns if the format looks wrong or consecutive poses are far apart.
 
@@ -43,6 +44,7 @@ def open_recording(
       poses: Pose file (`folder_trajectory`), if it is not beside the scans. Without poses, `positions` is `None`.
       pose_format: Format of the pose file.
       times: File of timestamps, if it is not beside the scans.
+      time_unit: Unit of the times (`times_of`).
 
     Raises:
       FileNotFoundError: If the folder has no scans, or `poses` or `times` does not exist.
@@ -54,7 +56,7 @@ def open_recording(
         raise FileNotFoundError(f"{root}: expected scans ({_endings()}), found none")
     ids = _ids(root, paths)
     positions, seconds, source = folder_trajectory(
-        root, scans=len(paths), poses=poses, pose_format=pose_format, times=times
+        root, scans=len(paths), poses=poses, pose_format=pose_format, times=times, time_unit=time_unit
     )
     records, kinds = _formats(paths, format)
     if positions is not None:
@@ -113,7 +115,12 @@ READER = Reader(
     layout=f"single scans ({_endings()})",
     recording_names=recording_names,
     open=lambda root, name, options: open_recording(
-        root, format=options.format, poses=options.poses, pose_format=options.pose_format, times=options.times
+        root,
+        format=options.format,
+        poses=options.poses,
+        pose_format=options.pose_format,
+        times=options.times,
+        time_unit=options.time_unit,
     ),
     knows_mounting=False,
     rank=9,

@@ -64,6 +64,7 @@ def stamped_recording(
         paths=kept,
         read=partial(_read, read_points=read_points),
         found=(f"format: {format}",),
+        rows=np.flatnonzero(matched.kept),
     )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated, Literal
 
 from sglpr_jax.fields import Bounds, Count, CountOrNone, NotNegative, Share, check_fields
-from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M
+from sglpr_jax.same_place import NEGATIVE_M, POSITIVE_M, SAME_PASS_FRAMES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,7 @@ class TupleConfig:
     """Minimum distance of a negative from its anchor, in metres."""
     revisit_fraction: Share = 0.5
     """Fraction of tuples with positives from another visit. In the other tuples, positives are neighbouring frames."""
-    revisit_gap: CountOrNone = 50
+    revisit_gap: CountOrNone = SAME_PASS_FRAMES
     """Maximum difference of the frame numbers within one visit."""
     cluster: Count = 1
     """Number of consecutive tuples with anchors near each other. If tuples share negatives, neighbouring places of a

@@ -138,7 +138,7 @@ def _pairs(found: FoundLoops) -> str:
     if not figures.can_draw():
         return missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
     rows = np.unique(np.linspace(0, len(found.loops) - 1, SHOWN_PAIRS).astype(int))
-    pictures = {_title(found.loops[row]): _overlay(found, found.loops[row]) for row in rows}
+    pictures = {_title(found, found.loops[row]): _overlay(found, found.loops[row]) for row in rows}
     caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
     return figure_html(figures.overlays(pictures), "Pairs of images", caption=caption)
 
@@ -148,8 +148,9 @@ def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
     return overlaid(query, match, upright_poses(loop.match_from_query, found.recording.mounting))
 
 
-def _title(loop: Loop) -> str:
-    return f"query {loop.query}, match {loop.match}"
+def _title(found: FoundLoops, loop: Loop) -> str:
+    numbers = found.recording.numbers
+    return f"query {numbers[loop.query]}, match {numbers[loop.match]}"
 
 
 def _rejected(found: FoundLoops) -> str:

@@ -1,0 +1,102 @@
+"""Times of scans and poses: unit, order, and row numbers that are not times."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.choices import TimeUnit
+from sglpr_jax.data.warning import warn
+
+PER_SECOND = {"auto": 1.0, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Ticks of each unit in a second. "auto" expects seconds."""
+NAMES = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+LATEST_S = 1e11
+"""Maximum time in seconds, after the year 5000. Larger numbers are milli-, micro- or nanoseconds."""
+SLOWEST_S = 10.0
+"""Maximum median step of scans and poses, in seconds: keyframes at 0.1 Hz."""
+FASTEST_S = 0.005
+"""Minimum mean step of scans, in seconds: twice the rate of the fastest LiDARs (100 Hz)."""
+PROOF = 5
+"""Number of steps from which the unit is judged. Fewer steps prove nothing."""
+EPOCH = 1e8
+"""Whole numbers below this one may number frames. Whole seconds since 1970 are larger since 1973."""
+PAUSE_S = 3600.0
+"""Minimum step that is reported as a jump of the times, in seconds."""
+ADVICE = "state the unit with --time-unit s, ms, us or ns (Python: time_unit)"
+
+
+def times_of(
+    values: Float[np.ndarray, " n"], *, source: Path | str, unit: TimeUnit = "auto"
+) -> Float[np.ndarray, " n"] | None:
+    """Convert times to seconds. With "auto", row numbers 0, 1, 2, ... or 1, 2, 3, ... are not times.
+
+    Arguments:
+      values: Times in `unit`, in the order of the rows.
+      source: File of the times, for messages.
+      unit: Unit of the values. "auto" expects seconds and rejects values whose steps contradict this.
+
+    Returns:
+      Times in seconds, or None for row numbers.
+
+    Raises:
+      ValueError: If a time is smaller than the previous one, or if the values are not in this unit.
+    """
+    seconds = values / PER_SECOND[unit]
+    check_order(seconds, source=source)
+    if unit != "auto":
+        return seconds
+    if counts_rows(seconds):
+        return None
+    if found := doubt(seconds):
+        raise ValueError(f"{source}: expected times in seconds, found {found}; {ADVICE}")
+    return seconds
+
+
+def doubt(times: Float[np.ndarray, " n"]) -> str:
+    """Describes why times cannot be seconds of scans or poses. Empty if they can, or if they are too few to judge."""
+    if len(times) and abs(times[-1]) > LATEST_S:
+        return f"{times[-1]:g}, after the year 5000"
+    steps = np.diff(times)
+    if len(steps) < PROOF:
+        return ""
+    if counts_rows(times):
+        return f"row numbers ({times[0]:g}, {times[1]:g}, {times[2]:g}, ...)"
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    if usual > SLOWEST_S:
+        unit = next((unit for unit in NAMES if usual <= SLOWEST_S * PER_SECOND[unit]), "ns")
+        return f"steps of {usual:g}, which fit {NAMES[unit]}"
+    if usual >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
+        return f"whole numbers from {times[0]:g} to {times[-1]:g}, as of frames"
+    return ""
+
+
+def counts_rows(times: Float[np.ndarray, " n"]) -> bool:
+    """Whether times merely count the rows: 0, 1, 2, ... or 1, 2, 3, ..."""
+    return bool(len(times) and times[0] in (0, 1) and (np.diff(times) == 1).all())
+
+
+def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
+    """Raise ValueError if a time in seconds exceeds `LATEST_S` or is smaller than the previous one."""
+    late = np.flatnonzero(np.abs(times) > LATEST_S)
+    if late.size:
+        raise ValueError(
+            f"{source}, row {late[0] + 1}: expected seconds, found {times[late[0]]:g}; is it in a smaller unit? "
+            f"{ADVICE[0].upper()}{ADVICE[1:]}"
+        )
+    backwards = np.flatnonzero(np.diff(times) < 0)
+    if backwards.size:
+        row = int(backwards[0]) + 2
+        raise ValueError(f"{source}, row {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
+
+
+def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:
+    """Warn if two consecutive times of a recording are more than an hour apart, as after a change of the clock."""
+    steps = np.diff(times)
+    far = np.flatnonzero(steps > PAUSE_S)
+    if far.size:
+        row = int(far[0])
+        warn(
+            f"{source}: expected one drive, found {steps[row] / 3600:.3g} h between scans {row} and {row + 1} "
+            f"({far.size} jumps); scans before and after a jump count as separate visits of a place"
+        )

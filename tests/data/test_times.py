@@ -1,0 +1,131 @@
+"""Times in seconds are kept, row numbers are dropped, and other units are one clear error unless they are stated."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats.pose_files import read_times, read_tum
+from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, doubt, times_of
+from sglpr_jax.data.warning import DataWarning
+
+SECONDS = np.arange(280) / 10
+"""A drive at 10 Hz."""
+UNITS = {"ms": "steps of 100, which fit milliseconds", "us": "100000, .*microseconds", "ns": r"1e\+08, .*nanoseconds"}
+
+
+@pytest.mark.parametrize("start", [0.0, 12.5, 1.7e9])
+@pytest.mark.parametrize("hertz", [0.1, 1, 2, 9.6, 20, 100, 400])
+def test_seconds_of_lidars_keyframes_and_odometry_are_kept(start, hertz):
+    times = start + 0.003 + np.arange(40) / hertz
+    np.testing.assert_array_equal(times_of(times, source="a"), times)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("hertz", [0.5, 2, 10, 95])
+def test_other_units_are_refused_and_named_and_converted_if_stated(unit, hertz):
+    times = np.arange(40) / hertz
+    with pytest.raises(ValueError, match=r"a\.txt: expected times in seconds, found steps of .*--time-unit"):
+        times_of(times * PER_SECOND[unit], source="a.txt")
+    np.testing.assert_allclose(times_of(times * PER_SECOND[unit], source="a.txt", unit=unit), times)
+    with pytest.raises(ValueError, match=r"a\.txt, row 1: expected seconds, found 1\.7e\+.*smaller unit.*--time-unit"):
+        times_of((1.7e9 + times) * PER_SECOND[unit], source="a.txt")
+
+
+@pytest.mark.parametrize(("unit", "found"), UNITS.items())
+def test_the_unit_is_guessed_in_the_message(unit, found):
+    with pytest.raises(ValueError, match=found):
+        times_of(SECONDS * PER_SECOND[unit], source="a")
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_row_numbers_are_not_times_unless_seconds_are_stated(first):
+    rows = np.arange(first, first + 280.0)
+    assert counts_rows(rows) and times_of(rows, source="a") is None
+    np.testing.assert_array_equal(times_of(rows, source="a", unit="s"), rows)
+    assert not counts_rows(rows[:-1] + np.arange(279) / 1e4) and not counts_rows(np.array([5.0, 6.0]))
+
+
+def test_numbers_of_keyframes_are_not_seconds():
+    with pytest.raises(ValueError, match="expected times in seconds, found whole numbers from 70 to 349, as of frames"):
+        times_of(70 + np.arange(0.0, 280, 3), source="a")
+    epoch = 1.7e9 + np.arange(50)
+    np.testing.assert_array_equal(times_of(epoch, source="a"), epoch)
+
+
+def test_few_steps_and_stops_prove_nothing():
+    assert doubt(np.array([0.0, 500.0, 900.0])) == "" and doubt(np.zeros(50)) == "" and doubt(np.zeros(0)) == ""
+    stops = np.repeat(SECONDS, 3) + np.repeat(np.arange(28), 30) * 60.0
+    assert doubt(stops) == ""
+
+
+def test_times_that_go_back_name_their_row():
+    with pytest.raises(ValueError, match=r"a, row 3: expected a time >= 0\.2, found 0\.1"):
+        times_of(np.array([0.0, 200, 100]), source="a", unit="ms")
+
+
+def write_tum(path, stamps):
+    path.write_text("".join(f"{t:.9f} {i} 0 0 0 0 0 1\n" for i, t in enumerate(stamps)))
+    return path
+
+
+def folder_of_scans(folder, scans):
+    folder.mkdir()
+    for i in range(scans):
+        np.zeros((3, 4), "<f4").tofile(folder / f"{i:03d}.bin")
+    return folder
+
+
+def test_every_file_of_times_follows_the_rule(tmp_path):
+    rows, table = tmp_path / "times.txt", tmp_path / "poses.csv"
+    for unit in UNITS:
+        stamps = SECONDS * PER_SECOND[unit]
+        np.savetxt(rows, stamps)
+        np.savetxt(table, np.stack([stamps, *np.zeros((3, 280))], 1), header="t,x,y,z", comments="", delimiter=",")
+        tum = write_tum(tmp_path / "poses.tum", stamps)
+        for read in (read_times, read_tum, read_trajectory):
+            with pytest.raises(ValueError, match="expected times in seconds, found steps"):
+                read(rows if read is read_times else tum)
+        with pytest.raises(ValueError, match=r"poses\.csv: expected times in seconds, found steps"):
+            read_trajectory(table)
+        np.testing.assert_allclose(read_times(rows, unit=unit), SECONDS)
+        np.testing.assert_allclose(read_tum(tum, time_unit=unit)[1], SECONDS)
+        np.testing.assert_allclose(read_trajectory(table, time_unit=unit).times, SECONDS)
+        np.testing.assert_allclose(read_trajectory(table, times=rows, time_unit=unit).times, SECONDS)
+    np.savetxt(rows, np.arange(280))
+    with pytest.warns(DataWarning, match=r"times\.txt: expected times, found row numbers .*not used; state the unit"):
+        assert read_times(rows) is None
+    assert read_tum(write_tum(tmp_path / "poses.tum", range(280)))[1] is None
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_folder_of_scans_takes_the_unit_of_its_files(tmp_path, unit):
+    folder = folder_of_scans(tmp_path / "scans", 12)
+    write_tum(folder / "poses.tum", SECONDS[:12] * PER_SECOND[unit])
+    with pytest.raises(ValueError, match=r"poses\.tum: expected times in seconds, found steps"):
+        open_recording(folder, sensor_height=1.7)
+    np.testing.assert_allclose(open_recording(folder, sensor_height=1.7, time_unit=unit).times, SECONDS[:12])
+
+
+def test_an_unknown_unit_is_named(tmp_path, as_installed):
+    with pytest.raises(ValueError, match="time_unit: expected one of 'auto', 's', 'ms', 'us', 'ns', found 'h'"):
+        open_recording(folder_of_scans(tmp_path / "scans", 2), time_unit="h")
+
+
+def test_poses_beside_scans_that_count_rows_give_no_times(tmp_path):
+    folder = folder_of_scans(tmp_path / "scans", 12)
+    write_tum(folder / "poses.tum", range(12))
+    recording = open_recording(folder, sensor_height=1.7)
+    assert recording.times is None and recording.positions[:, 0].tolist() == list(range(12))
+    np.testing.assert_array_equal(open_recording(folder, sensor_height=1.7, time_unit="s").times, np.arange(12))
+
+
+def test_a_change_of_the_clock_is_told_for_every_layout(tmp_path):
+    folder = folder_of_scans(tmp_path / "scans", 12)
+    np.savetxt(folder / "times.txt", SECONDS[:12] + 86400.0 * (np.arange(12) >= 7))
+    said = (
+        r"scans: expected one drive, found 24 h between scans 6 and 7 \(1 jumps\); scans before and after a jump"
+    )
+    with pytest.warns(DataWarning, match=said):
+        open_recording(folder, sensor_height=1.7)
+    check_jumps(np.array([0.0, 600.0, 1200.0]), source="stops")
