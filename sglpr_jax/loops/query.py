@@ -4,8 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.data.formats.record_size import unusual_record
-from sglpr_jax.data.formats.scan_files import says_its_format
+from sglpr_jax.data.formats.scan_files import found_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.record import Record, scan_record
@@ -34,7 +33,7 @@ def read_query(
         raise IsADirectoryError(f"{path}: expected one scan or image, found a folder; name a file in it")
     if path.suffix == ".png":
         return Record(image=read_image(path))
-    record = scan_record(path, format=_found(path) if format == "auto" else format)
+    record = scan_record(path, format=found_format(path) if format == "auto" else format)
     if sensor_height == "auto":
         return dataclasses.replace(record, mounting=places.mounting())
     if sensor_height != "estimate":
@@ -44,9 +43,3 @@ def read_query(
     if found is None:
         raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")
     return dataclasses.replace(record, mounting=found)
-
-
-def _found(path: Path) -> ScanFormat:
-    """Format of a .bin whose name does not state it, if its content differs from what "auto" assumes."""
-    unsaid = path.is_file() and not says_its_format(path)
-    return (unusual_record([path]) if unsaid else None) or "auto"
