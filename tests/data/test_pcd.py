@@ -36,7 +36,7 @@ def test_binary_with_padding_and_double_fields(tmp_path):
     record = np.dtype([("ring", "<u2"), ("_", "u1", 6), ("z", "<f8"), ("y", "<f8"), ("x", "<f8")])
     cloud = np.zeros(2, dtype=record)
     cloud["x"], cloud["y"], cloud["z"] = [1, 2], [3, 4], [5, 6]
-    layout = {"fields": "ring _ z y x", "sizes": "2 1 8 8 8", "types": "U U F F F", "counts": "1 6 1 1 1", "points": 2}
+    layout = {"fields": "ring _ z y x", "sizes": "2 1 8 8 8", "types": "U U f F F", "counts": "1 6 1 1 1", "points": 2}
     np.testing.assert_array_equal(
         read_pcd(write(tmp_path / "a.pcd", cloud.tobytes(), **layout)), [[1, 3, 5], [2, 4, 6]]
     )
@@ -104,18 +104,19 @@ def test_lines_may_end_with_carriage_returns(tmp_path):
         (
             CLOUD.tobytes(),
             {"types": "F F Q F"},
-            "expected z of TYPE F, I or U, SIZE 1 to 8 .* found TYPE Q, SIZE 4",
+            "expected z of TYPE F, I or U and SIZE 1 to 8, .* found TYPE Q, SIZE 4",
         ),
         (CLOUD.tobytes(), {"sizes": "4 4 x 4"}, "expected a whole number as SIZE, found 'x'"),
         (CLOUD.tobytes(), {"fields": ""}, "found no FIELDS"),
-        (CLOUD.tobytes(), {"types": "F C F F", "sizes": "4 8 4 4"}, "expected y of TYPE F, I or U, .* found TYPE C"),
-        (CLOUD.tobytes(), {"types": ",F F F F"}, "expected x of TYPE F, I or U, .* found TYPE ,F"),
+        (CLOUD.tobytes(), {"types": "F C F F", "sizes": "4 8 4 4"}, "expected y of TYPE F, I or U and .* found TYPE C"),
+        (CLOUD.tobytes(), {"types": ",F F F F"}, "expected x of TYPE F, I or U and .* found TYPE ,F"),
         (CLOUD.tobytes(), {"counts": "1 1 1 99999999999999999999"}, "expected a whole number as COUNT, found '9999"),
         (CLOUD.tobytes(), {"counts": "1 1 1 999999999999"}, "expected a scan of at most 536870912 bytes, found"),
         (CLOUD.tobytes(), {"points": 99999999}, "expected a scan of at most 16777216 points, found 99999999"),
         (CLOUD.tobytes(), {"points": "3_0"}, "expected a whole number as POINTS, found '3_0'"),
         (CLOUD.tobytes(), {"counts": "1 1 0 1"}, "expected z of .* found TYPE F, SIZE 4 and COUNT 0"),
-        (CLOUD.tobytes(), {"sizes": "4 4 4 3"}, "expected 3 points of 15 bytes, found 48 bytes"),
+        (CLOUD.tobytes(), {"sizes": "4 4 4 3"}, "expected intensity of TYPE F, I or U and SIZE 1 to 8, .* SIZE 3"),
+        (CLOUD.tobytes(), {"sizes": "4 4 4 2", "types": "F F F U"}, "expected 3 points of 14 bytes, found 48 bytes"),
         (CLOUD.tobytes(), {"fields": "x y z x"}, "expected the fields x, y and z, found x y z x"),
         (CLOUD.tobytes(), {"points": "3\nSIZE 4 4 4 2"}, "expected each line of the header once, found SIZE again"),
         (b"1 2 3 4\n1 2 3 4\n1 2 3_0 4\n", {"data": "ascii"}, "could not convert string '3_0'"),

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.data.formats.scan_size import MOST_POINTS, check_bytes
+from sglpr_jax.files import in_short
 
 NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 """Names of the array with the points in an .npz file with several arrays, in order of preference."""
@@ -30,7 +31,7 @@ def read_npy(path: Path) -> Float32[np.ndarray, "n 3"]:
         with path.open("rb") as stream:
             array = _read(stream, size=path.stat().st_size)
     except Exception as error:  # numpy and tokenize raise many types for broken files
-        raise ValueError(f"{path}: expected a numpy array, found none ({error})") from error
+        raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
     return _points(path, array)
 
 
@@ -49,7 +50,7 @@ def read_npz(path: Path) -> Float32[np.ndarray, "n 3"]:
                 with archive.open(member) as stream:
                     array = _read(stream, size=member.file_size)
     except Exception as error:  # zipfile and zlib raise many types, too
-        raise ValueError(f"{path}: expected a numpy array, found none ({error})") from error
+        raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
     if chosen is None:
         found = ", ".join(names) or "none"
         raise ValueError(f"{path}: expected one array, or one named {', '.join(NAMES)}, found {found}")

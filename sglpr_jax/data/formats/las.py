@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.data.formats.scan_size import check_points
+from sglpr_jax.files import in_short
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record before and after the points, in bytes."""
@@ -36,7 +37,7 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
         with np.errstate(over="ignore", invalid="ignore"):
             return np.stack([np.asarray(axis) for axis in (found.x, found.y, found.z)], axis=1).astype(np.float32)
     except Exception as error:  # laspy raises struct.error, MemoryError and others
-        raise ValueError(f"{path}: expected a .las file, found an unreadable one ({error})") from error
+        raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
 
 
 def _check_sizes(path: Path) -> None:

@@ -19,6 +19,7 @@ _NUMBERS = {
     **{("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8"},
 }
 """Numpy types by TYPE and SIZE."""
+AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -116,24 +117,24 @@ def _parse_fields(words: dict[str, list[str]]) -> tuple[_Field, ...]:
     if not len(names) == len(words["SIZE"]) == len(words["TYPE"]) == len(counts):
         raise ValueError(f"expected one SIZE, TYPE and COUNT for each of {len(names)} FIELDS, found others")
     fields = tuple(
-        _Field(name, kind, whole_number(size, of="SIZE"), whole_number(count, of="COUNT"))
+        _Field(name, kind.upper(), whole_number(size, of="SIZE"), whole_number(count, of="COUNT"))
         for name, kind, size, count in zip(names, words["TYPE"], words["SIZE"], counts, strict=True)
     )
-    for axis in "xyz":
-        found = [field for field in fields if field.name == axis]
-        if len(found) != 1:
-            raise ValueError(f"expected the fields x, y and z, found {' '.join(names)}")
-        if found[0].count != 1 or (found[0].kind, found[0].size) not in _NUMBERS:
+    if any(names.count(axis) != 1 for axis in AXES):
+        raise ValueError(f"expected the fields x, y and z, found {' '.join(names)}")
+    for field in fields:
+        ignored = field.name == "_" or not field.count
+        if (field.name in AXES and field.count != 1) or (not ignored and (field.kind, field.size) not in _NUMBERS):
             raise ValueError(
-                f"expected {axis} of TYPE F, I or U, SIZE 1 to 8 and COUNT 1, found TYPE {found[0].kind},"
-                f" SIZE {found[0].size} and COUNT {found[0].count}"
+                f"expected {field.name} of TYPE F, I or U and SIZE 1 to 8, and COUNT 1 for x, y and z, found TYPE"
+                f" {field.kind}, SIZE {field.size} and COUNT {field.count}"
             )
     return fields
 
 
 def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
     offsets = list(accumulate((field.width for field in header.fields), initial=0))
-    axes = {field.name: column for column, field in enumerate(header.fields) if field.name in ("x", "y", "z")}
+    axes = {field.name: column for column, field in enumerate(header.fields) if field.name in AXES}
     record = np.dtype(
         {
             "names": list(axes),
@@ -146,7 +147,7 @@ def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
     if len(body) < end or body[end:].strip(b"\0\r\n\t "):  # some programs fill the last page with zeros
         raise ValueError(f"expected {header.points} points of {record.itemsize} bytes, found {len(body)} bytes")
     points = np.frombuffer(body, record, header.points)
-    return _rows([points[axis] for axis in "xyz"])
+    return _rows([points[axis] for axis in AXES])
 
 
 def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -167,9 +168,9 @@ def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3
     found = {
         field.name: np.frombuffer(columns, _number(field), count=header.points, offset=start)
         for field, start in zip(fitting[0], starts, strict=False)
-        if field.name in ("x", "y", "z")
+        if field.name in AXES
     }
-    return _rows([found[axis] for axis in "xyz"])
+    return _rows([found[axis] for axis in AXES])
 
 
 def _decode_ascii(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -180,7 +181,7 @@ def _decode_ascii(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
     offsets = list(accumulate((field.count for field in fields), initial=0))
     rows = number_rows(lines, rows=header.points, columns=offsets[-1])
     names = [field.name for field in fields]
-    return _rows([rows[:, offsets[names.index(axis)]] for axis in "xyz"])
+    return _rows([rows[:, offsets[names.index(axis)]] for axis in AXES])
 
 
 def _number(field: _Field) -> str:

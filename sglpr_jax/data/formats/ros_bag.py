@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.bounded_file import BoundedPath
 from sglpr_jax.data.formats.livox import CUSTOM_MSG, POINT, read_custom_msg
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
 from sglpr_jax.data.formats.ros_message import RosMessage
 from sglpr_jax.data.formats.ros_poses import POSES, TRANSFORMS, read_transforms
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, tracks_of
+from sglpr_jax.files import in_short
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
 """Message types of scans."""
@@ -142,9 +144,9 @@ class _broken:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, ImportError | FileNotFoundError):
-            said = str(error) or type(error).__name__
             raise ValueError(
-                f"{self._path}: expected an intact ROS bag, found a broken one ({said}){_about_metadata(self._path)}"
+                f"{self._path}: expected an intact ROS bag, found a broken one ({in_short(error)})"
+                f"{_about_metadata(self._path)}"
             ) from error
 
 
@@ -167,6 +169,6 @@ def _open(paths: tuple[Path, ...]) -> Any:
     if paths[0].name.endswith(COMPRESSED):
         raise ValueError(f"{paths[0]}: expected a file that is not compressed{_about_metadata(paths[0])}")
     with _broken(paths[0]):
-        reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([BoundedPath(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
         return reader
