@@ -36,5 +36,5 @@ def check_cloud(points: Float32[np.ndarray, "n _"], *, name: str = "") -> None:
         raise ValueError(
             f"{where}expected metres, with most points within {FARTHEST_M:g}, found half of the points beyond"
             f" {np.median(largest):.4g} and the farthest at {largest.max():.4g}; are the coordinates in millimetres,"
-            " or is --format wrong?"
+            " or is the format of the scan wrong (--format, for .bin files)?"
         )

@@ -74,6 +74,8 @@ def write_g2o(
 def read_g2o(path: Path | str) -> Graph:
     """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Other lines are ignored.
 
+    Edges without an information matrix get the unit matrix.
+
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
@@ -90,13 +92,20 @@ def read_g2o(path: Path | str) -> Graph:
                 raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
             graph.poses[frame] = _pose(values[1:], where)
         elif words and words[0] == EDGE:
-            values = numbers_of(words[1:], columns=30, where=where)
-            information = np.zeros((6, 6))
-            information[UPPER] = values[9:]
-            information = np.triu(information, 1).T + information
+            values = numbers_of(words[1:], columns=9 if len(words) == 10 else 30, where=where)
+            information = _information(values[9:])
             first, second = _frames(values[:2], where)
             graph.edges.append((first, second, _pose(values[2:9], where), information))
     return graph
+
+
+def _information(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "6 6"]:
+    """Symmetric matrix of its 21 upper numbers, or the unit matrix if an edge has none."""
+    if not len(values):
+        return np.eye(6)
+    upper = np.zeros((6, 6))
+    upper[UPPER] = values
+    return np.triu(upper, 1).T + upper
 
 
 def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:

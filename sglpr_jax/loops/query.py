@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.data.formats.record_size import unusual_record
-from sglpr_jax.data.formats.scan_files import says_its_format
+from sglpr_jax.data.formats.scan_files import found_format
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.readers.bev_images import read_image
 from sglpr_jax.data.record import Record, scan_record
@@ -42,7 +41,7 @@ def read_query(
         raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")
     if path.suffix == ".png":
         return Record(image=read_image(path))
-    record = scan_record(path, format=_found(path) if format == "auto" else format)
+    record = scan_record(path, format=found_format(path) if format == "auto" else format)
     if sensor_height == "auto":
         return dataclasses.replace(record, mounting=places.mounting())
     if sensor_height != "estimate":
@@ -64,9 +63,3 @@ def query_of(recording: Recording, frame: int) -> Record:
         there = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"
         raise ValueError(f"{recording.name}: expected the number of a scan, found {frame}; it has {there}")
     return recording.record(int(rows[0]), labels=False)
-
-
-def _found(path: Path) -> ScanFormat:
-    """Format of a .bin whose name does not state it, if its content differs from what "auto" assumes."""
-    unsaid = path.is_file() and not says_its_format(path)
-    return (unusual_record([path]) if unsaid else None) or "auto"

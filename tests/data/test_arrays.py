@@ -1,9 +1,15 @@
 """Points from .npy, .npz and .las files, and folders in which such files are something else."""
 
+import io
+import struct
+import zipfile
+
 import laspy
 import numpy as np
 import pytest
+from laspy.vlrs.vlrlist import VLRList
 
+from sglpr_jax.data.formats import scan_size
 from sglpr_jax.data.formats.arrays import read_npy, read_npz
 from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.readers.scan_folder import open_recording
@@ -61,6 +67,43 @@ def test_several_arrays_broken_files_and_objects_are_refused(tmp_path):
         read_npy(tmp_path / "d.npy")
 
 
+def header_of(shape, dtype="<f4"):
+    """The beginning of an .npy file."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("shape", [(2**30, 3), (5, 3), (3, 3), (2**62, 2**62), (-4, 3)])
+def test_headers_that_declare_another_size_than_the_file_has(tmp_path, shape):
+    content = header_of(shape) + CLOUD.tobytes()
+    (tmp_path / "a.npy").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("points.npy", content)
+    for read, name in ((read_npy, "a.npy"), (read_npz, "a.npz")):
+        with pytest.raises(ValueError, match=rf"{name}: expected a numpy array, .*expected .* by its header"):
+            read(tmp_path / name)
+
+
+def test_an_archive_that_inflates_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(scan_size, "MOST_BYTES", 10**6)
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("memory was allocated"))
+    np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3), np.float32))
+    assert (tmp_path / "a.npz").stat().st_size < 10**4
+    with pytest.raises(ValueError, match=r"a\.npz: .*expected a scan of at most 1000000 bytes, found 1200128"):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_other_files_in_an_archive_are_no_arrays(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("points.txt", b"1 2 3")
+    with pytest.raises(ValueError, match=r"a\.npz: expected one array, or one named points, .* found none"):
+        read_npz(tmp_path / "a.npz")
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
+        archive.writestr("lidar.npy", header_of((4, 3)) + CLOUD.tobytes())
+    np.testing.assert_array_equal(read_npz(tmp_path / "a.npz"), CLOUD)
+
+
 def write_las(path, points):
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.scales, header.offsets = [0.001] * 3, [100.0, 0, 0]
@@ -84,6 +127,44 @@ def test_las_is_scaled_and_moved_as_its_header_says(tmp_path):
         read_las(write_las(tmp_path / "e.las", np.zeros((0, 3))))
     with pytest.raises(FileNotFoundError, match=r"d\.las: expected a \.las file, found none"):
         read_las(tmp_path / "d.las")
+
+
+@pytest.mark.parametrize(
+    ("at", "number", "message"),
+    [
+        (100, 2**32 - 1, "expected 4294967295 and 0 records by the header, found 363 bytes in total"),
+        (107, 2**32 - 1, "expected a scan of at most 16777216 points, found 4294967295"),
+        (107, 5, "expected 5 points by the header, found 4"),
+        (107, 3, "expected 3 points by the header, found 4"),
+        (96, 2**32 - 1, "expected 4 points by the header, found 0"),
+    ],
+    ids=["records", "points", "one more", "one less", "offset"],
+)
+def test_a_las_header_that_lies_is_refused(tmp_path, monkeypatch, at, number, message):
+    path = write_las(tmp_path / "a.las", CLOUD.astype(np.float64))
+    whole = bytearray(path.read_bytes())
+    whole[at : at + 4] = struct.pack("<I", number)
+    path.write_bytes(whole)
+    monkeypatch.setattr(laspy, "open", lambda path: pytest.fail("the file was read"))
+    with pytest.raises(ValueError, match=rf"a\.las: {message}"):
+        read_las(path)
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+def test_every_version_of_las(tmp_path, version):
+    las = laspy.LasData(laspy.LasHeader(point_format=6 if version == "1.4" else 3, version=version))
+    las.x, las.y, las.z = CLOUD.astype(np.float64).T
+    las.vlrs.append(laspy.VLR("mine", 7, "a record", b"12345"))
+    if version == "1.4":
+        las.evlrs = VLRList([laspy.VLR("mine", 8, "behind the points", b"12345")])
+    las.write(tmp_path / "a.las")
+    np.testing.assert_allclose(read_las(tmp_path / "a.las"), CLOUD, atol=0.01)
+    whole = bytearray((tmp_path / "a.las").read_bytes())
+    if version == "1.4":
+        whole[243:247] = struct.pack("<I", 2**32 - 1)
+        (tmp_path / "a.las").write_bytes(whole)
+        with pytest.raises(ValueError, match=r"a\.las: expected 1 and 4294967295 records by the header"):
+            read_las(tmp_path / "a.las")
 
 
 @pytest.mark.parametrize("ending", ["npy", "npz", "las"])

@@ -52,13 +52,19 @@ def test_poses_of_kitti_are_taken_where_there_are_no_others(kitti_root):
         open_recording(kitti_root, "08", pose_source="semantickitti")
 
 
-def test_missing_poses_name_both_places(kitti_root):
+def test_a_sequence_without_poses_opens_and_those_that_were_asked_for_are_named(kitti_root):
     (kitti_root / "sequences/08/poses.txt").unlink()
     (kitti_root / "poses/08.txt").unlink()
+    sequence = open_recording(kitti_root, "08")
+    assert sequence.positions is None and sequence.pose_source is None
+    np.testing.assert_array_equal(sequence.times, [0, 0.2, 0.3])
+    assert len(sequence.points(1)) == 5
+    with pytest.raises(FileNotFoundError, match=r"expected poses in poses/08\.txt, found none"):
+        open_recording(kitti_root, "08", pose_source="kitti")
     with pytest.raises(
         FileNotFoundError, match=r"expected poses in sequences/08/poses\.txt or poses/08\.txt, found none"
     ):
-        open_recording(kitti_root, "08")
+        read_trajectory(kitti_root, "08")
 
 
 @pytest.mark.parametrize("file, what", [("poses.txt", "poses"), ("times.txt", "times")])

@@ -173,6 +173,21 @@ def test_kitti_raw_without_gps_and_with_broken_times(raw_root):
             open_recording(raw_root)
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\xff\xfe4\x009\x00", "expected 30 numbers, found"),
+        (b"4_9" + b" 8" * 29, "expected numbers, found '4_9"),
+        (b"90" + b" 8" * 29, "expected a latitude below 90 degrees, found 90.0"),
+    ],
+)
+def test_kitti_raw_names_the_file_of_an_invalid_position(raw_root, content, message):
+    oxts = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync" / "oxts" / "data"
+    (oxts / "0000000002.txt").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"0000000002\.txt: {message}"):
+        open_recording(raw_root)
+
+
 def test_kitti_raw_leaves_the_line_of_a_missing_scan_blank(raw_root):
     file = raw_root / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps.txt"
     first, _, last = file.read_text().splitlines()
@@ -194,6 +209,8 @@ def test_what_is_missing_or_malformed_is_named(mulran_root, boreas_root, reader)
     for text, message in (
         ("", "expected rows of a time and 12 numbers, found none"),
         (whole.replace("20.0", "nan").replace("200.0", "nan"), "line . ?: expected a time and 12 finite numbers"),
+        (whole + "9" + ",1_0" * 12 + "\n", "expected a time and 12 finite numbers, found '9,1_0"),
+        (whole + "9" + ",１" * 12 + "\n", "expected a time and 12 finite numbers, found '9,"),
         (whole + "1,2,3\n", "expected a time and 12 finite numbers, found 3 words"),
         (whole + "noon" + ",1" * 12 + "\n", "expected a time and 12 finite numbers, found 'noon,1"),
     ):

@@ -36,7 +36,7 @@ def test_binary_with_padding_and_double_fields(tmp_path):
     record = np.dtype([("ring", "<u2"), ("_", "u1", 6), ("z", "<f8"), ("y", "<f8"), ("x", "<f8")])
     cloud = np.zeros(2, dtype=record)
     cloud["x"], cloud["y"], cloud["z"] = [1, 2], [3, 4], [5, 6]
-    layout = {"fields": "ring _ z y x", "sizes": "2 1 8 8 8", "types": "U U F F F", "counts": "1 6 1 1 1", "points": 2}
+    layout = {"fields": "ring _ z y x", "sizes": "2 1 8 8 8", "types": "U U f F F", "counts": "1 6 1 1 1", "points": 2}
     np.testing.assert_array_equal(
         read_pcd(write(tmp_path / "a.pcd", cloud.tobytes(), **layout)), [[1, 3, 5], [2, 4, 6]]
     )
@@ -45,6 +45,41 @@ def test_binary_with_padding_and_double_fields(tmp_path):
 def test_ascii(tmp_path):
     body = b"1 2 3 0.5\nnan nan nan -1\n-4 5.5 6 0.25\n"
     np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data="ascii")), CLOUD[:, :3])
+
+
+def test_ascii_of_windows_spells_nan_in_words(tmp_path):
+    body = b"1 2 3 0.5\n-nan(ind) 1.#QNAN -1.#IND -1\n-4 5.5 6 nan(0x1)\n"
+    np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data="ascii")), CLOUD[:, :3])
+
+
+EMPTY_FIELD = {"fields": "none x y z", "sizes": "4 4 4 4", "types": "F F F F", "counts": "0 1 1 1"}
+PADDED = {"fields": "x _ y z _", "sizes": "4 1 4 4 3", "types": "F - F F U", "counts": "1 4 1 1 1"}
+
+
+@pytest.mark.parametrize("data", ["binary", "binary_compressed", "ascii"])
+@pytest.mark.parametrize("layout", [EMPTY_FIELD, PADDED], ids=["empty field", "padding left out"])
+def test_fields_without_numbers(tmp_path, data, layout):
+    """The Point Cloud Library leaves padding out of text and of compressed data."""
+    columns = CLOUD[:, :3].T.tobytes()
+    padded = np.zeros(3, [("x", "f4"), ("_", "u1", 4), ("y", "f4"), ("z", "f4"), ("more", "u1", 3)])
+    padded["x"], padded["y"], padded["z"] = CLOUD[:, :3].T
+    body = {
+        "binary": padded.tobytes() if layout is PADDED else CLOUD[:, :3].tobytes(),
+        "binary_compressed": compressed(columns),
+        "ascii": b"1 2 3\nnan nan nan\n-4 5.5 6\n",
+    }[data]
+    np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data=data, **layout)), CLOUD[:, :3])
+
+
+def test_padding_in_text(tmp_path):
+    body = b"1 9 9 9 9 2 3 9\nnan 9 9 9 9 nan nan 9\n-4 9 9 9 9 5.5 6 9\n"
+    np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data="ascii", **PADDED)), CLOUD[:, :3])
+
+
+def test_the_end_may_be_filled_with_zeros_but_not_with_points(tmp_path):
+    np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", CLOUD.tobytes() + bytes(99))), CLOUD[:, :3])
+    with pytest.raises(ValueError, match=r"a\.pcd: .*expected 3 points of 16 bytes, found 64 bytes"):
+        read_pcd(write(tmp_path / "a.pcd", CLOUD.tobytes() + CLOUD[:1].tobytes()))
 
 
 def test_lines_may_end_with_carriage_returns(tmp_path):
@@ -58,7 +93,7 @@ def test_lines_may_end_with_carriage_returns(tmp_path):
     [
         (b"", {}, "expected 3 points of 16 bytes, found 0 bytes"),
         (CLOUD.tobytes()[:-1], {}, "expected 3 points of 16 bytes, found 47 bytes"),
-        (b"", {"points": 0}, "expected at least one point, found POINTS 0"),
+        (b"", {"points": 0}, "expected at least one point, found none"),
         (
             CLOUD.tobytes(),
             {"data": "binary_packed"},
@@ -66,11 +101,32 @@ def test_lines_may_end_with_carriage_returns(tmp_path):
         ),
         (CLOUD.tobytes(), {"fields": "a b c d"}, "expected the fields x, y and z, found a b c d"),
         (CLOUD.tobytes(), {"sizes": "4 4 4"}, "expected one SIZE, TYPE and COUNT for each of 4 FIELDS"),
-        (CLOUD.tobytes(), {"types": "F F Q F"}, "data type '<q4' not understood"),
-        (CLOUD.tobytes(), {"sizes": "4 4 x 4"}, "data type '<fx' not understood"),
+        (
+            CLOUD.tobytes(),
+            {"types": "F F Q F"},
+            "expected z of TYPE F, I or U and SIZE 1 to 8, .* found TYPE Q, SIZE 4",
+        ),
+        (CLOUD.tobytes(), {"sizes": "4 4 x 4"}, "expected a whole number as SIZE, found 'x'"),
         (CLOUD.tobytes(), {"fields": ""}, "found no FIELDS"),
+        (CLOUD.tobytes(), {"types": "F C F F", "sizes": "4 8 4 4"}, "expected y of TYPE F, I or U and .* found TYPE C"),
+        (CLOUD.tobytes(), {"types": ",F F F F"}, "expected x of TYPE F, I or U and .* found TYPE ,F"),
+        (CLOUD.tobytes(), {"counts": "1 1 1 99999999999999999999"}, "expected a whole number as COUNT, found '9999"),
+        (CLOUD.tobytes(), {"counts": "1 1 1 999999999999"}, "expected a scan of at most 536870912 bytes, found"),
+        (CLOUD.tobytes(), {"points": 99999999}, "expected a scan of at most 16777216 points, found 99999999"),
+        (CLOUD.tobytes(), {"points": "3_0"}, "expected a whole number as POINTS, found '3_0'"),
+        (CLOUD.tobytes(), {"counts": "1 1 0 1"}, "expected z of .* found TYPE F, SIZE 4 and COUNT 0"),
+        (CLOUD.tobytes(), {"sizes": "4 4 4 3"}, "expected intensity of TYPE F, I or U and SIZE 1 to 8, .* SIZE 3"),
+        (CLOUD.tobytes(), {"sizes": "4 4 4 2", "types": "F F F U"}, "expected 3 points of 14 bytes, found 48 bytes"),
+        (CLOUD.tobytes(), {"fields": "x y z x"}, "expected the fields x, y and z, found x y z x"),
+        (CLOUD.tobytes(), {"points": "3\nSIZE 4 4 4 2"}, "expected each line of the header once, found SIZE again"),
+        (b"1 2 3 4\n1 2 3 4\n1 2 3_0 4\n", {"data": "ascii"}, "could not convert string '3_0'"),
+        (b"1 2 3 4\n1 2 3 4\n1 2 3\n", {"data": "ascii"}, "expected 3 lines of 4 numbers, found others"),
         (b"1 2 3 4\n", {"data": "ascii"}, "expected 3 lines of 4 numbers, found 1 lines"),
-        (b"1 2 3 4\n1 2 3 4\n1 2 c 4\n", {"data": "ascii"}, "could not convert string to float: 'c'"),
+        (
+            b"1 2 3 4\n1 2 3 4\n1 2 c 4\n",
+            {"data": "ascii"},
+            "expected 3 lines of 4 numbers, .*could not convert string 'c'",
+        ),
     ],
 )
 def test_a_bad_file_is_named(tmp_path, body, changed, message):

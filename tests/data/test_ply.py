@@ -52,6 +52,32 @@ def test_elements_in_front_and_behind(tmp_path, format):
     np.testing.assert_array_equal(read_ply(path), CLOUD)
 
 
+@pytest.mark.parametrize("format", ["ascii", *ORDERS])
+def test_a_comment_that_names_the_end_and_a_property_twice(tmp_path, format):
+    path = write(tmp_path / "a.ply", format=format)
+    header = path.read_bytes().replace(b"comment made by a test", b"comment end_header follows\nobj_info mine")
+    path.write_bytes(header.replace(b"uchar ring", b"uchar intensity"))
+    np.testing.assert_array_equal(read_ply(path), CLOUD)
+
+
+@pytest.mark.parametrize("format", ORDERS)
+def test_a_binary_file_ends_with_its_last_element(tmp_path, format):
+    after = "element camera 1\nproperty int id\n"
+    path = write(tmp_path / "a.ply", format=format, after=after)
+    whole = path.read_bytes() + bytes(4)
+    path.write_bytes(whole)
+    np.testing.assert_array_equal(read_ply(path), CLOUD)
+    path.write_bytes(whole + b"1")
+    with pytest.raises(ValueError, match=r"a\.ply: .*expected at most 67 bytes after the header, found 68"):
+        read_ply(path)
+
+
+def test_nan_as_windows_spells_it(tmp_path):
+    path = write(tmp_path / "a.ply")
+    path.write_bytes(path.read_bytes().replace(b" nan", b" -nan(ind)"))
+    np.testing.assert_array_equal(read_ply(path), CLOUD)
+
+
 def test_carriage_returns(tmp_path):
     path = write(tmp_path / "a.ply")
     path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
@@ -66,10 +92,24 @@ def test_carriage_returns(tmp_path):
         (lambda text: b"", "expected a header"),
         (lambda text: text.replace(b"ascii", b"utf9"), "expected format ascii"),
         (lambda text: text.replace(b"vertex 3", b"point 3"), "expected an element vertex, found point"),
-        (lambda text: text.replace(b"vertex 3", b"vertex 0"), "expected at least one vertex"),
+        (lambda text: text.replace(b"vertex 3", b"vertex 0"), "expected at least one point, found none"),
         (lambda text: text.replace(b"vertex 3", b"vertex 4"), "expected 4 lines of 5 numbers, found 3"),
-        (lambda text: text.replace(b"vertex 3", b"vertex three"), "invalid literal"),
+        (
+            lambda text: text.replace(b"vertex 3", b"vertex three"),
+            "whole number as number of vertex, found 'three'",
+        ),
         (lambda text: text.replace(b"float y", b"float v"), "expected vertices with x, y and z, found ring x v"),
+        (lambda text: text.replace(b"vertex 3", b"vertex 3_0"), "expected a whole number as number of vertex"),
+        (lambda text: text.replace(b"vertex 3", b"vertex 99999999"), "expected a scan of at most 16777216 points"),
+        (lambda text: text.replace(b"vertex 3", b"vertex 2"), "expected at most 2 lines after the header, found 3"),
+        (lambda text: text + b"1 2 3 4 5\n", "expected at most 3 lines after the header, found 4"),
+        (lambda text: text.replace(b"property float32", b"propesty float32"), "found 'propesty float32 intensity'"),
+        (lambda text: text.replace(b"element vertex", b"element"), "in the header, found 'element 3'"),
+        (lambda text: text.replace(b"element vertex 3\n", b""), "in the header, found 'property uchar ring'"),
+        (lambda text: text.replace(b"ascii 1.0", b"ascii 2.0"), "in the header, found 'format ascii 2.0'"),
+        (lambda text: text.replace(b"comment", b"format ascii 1.0\ncomment"), "found ascii and ascii"),
+        (lambda text: text.replace(b"float y", b"float x"), "expected vertices with x, y and z, found ring x x"),
+        (lambda text: text.replace(b"5.5", b"5_5"), "could not convert string '5_5'"),
         (lambda text: text[:-12], "expected 3 lines of 5 numbers"),
         (lambda text: text.replace(b"5.5", b"east"), "could not convert"),
     ],

@@ -195,6 +195,39 @@ def test_a_record_can_be_named_for_one_scan(tmp_path, format):
     np.testing.assert_array_equal(read_scan(tmp_path / "0.bin", format=format), points[:, :3].astype(np.float32))
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_one_scan_is_read_as_a_folder_with_it(tmp_path, layout):
+    records = columns(scan(0), LAYOUTS[layout]).astype("<f8" if layout.startswith("float64") else "<f4")
+    records.tofile(tmp_path / "0.bin")
+    points = read_scan(tmp_path / "0.bin")
+    np.testing.assert_array_equal(points, scan(0).astype(np.float32))
+    np.testing.assert_array_equal(points, open_recording(tmp_path).points(0))
+
+
+def test_one_scan_that_fits_nothing_is_named(tmp_path):
+    columns(scan(0) * 1000, "0").astype("<f4").tofile(tmp_path / "0.bin")
+    with pytest.raises(ValueError, match=r"0\.bin: expected scans that fit exactly one format, found 0; pass --format"):
+        read_scan(tmp_path / "0.bin")
+
+
+def test_one_scan_with_few_points_is_kittis(tmp_path):
+    columns(scan(0)[:150], "i").astype("<f4").tofile(tmp_path / "0.bin")
+    assert read_scan(tmp_path / "0.bin").shape == (150, 3)
+    (tmp_path / "0.bin").write_bytes(bytes(17))
+    with pytest.raises(ValueError, match=r"0\.bin: expected 16 bytes for each point \(kitti"):
+        read_scan(tmp_path / "0.bin")
+
+
+def test_more_points_than_a_scan_has_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(np, "fromfile", lambda *_, **__: pytest.fail("memory was allocated"))
+    path = tmp_path / "0.bin"
+    path.touch()
+    with path.open("r+b") as stream:
+        stream.truncate(16 * (2**24 + 1))  # a file with a hole, which takes no space
+    with pytest.raises(ValueError, match=r"0\.bin: expected a scan of at most 16777216 points, found 16777217"):
+        read_records(path, "kitti")
+
+
 def test_real_scans(shared, tmp_path):
     """Real scans of four sensors in every layout."""
     samples = shared / "data/samples"

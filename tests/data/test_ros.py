@@ -1,18 +1,21 @@
 """Bags of both ROSes and mcap, written here: every driver's fields, times, several topics, none, broken files."""
 
+import struct
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
+from sglpr_jax.data.readable import readable
 from sglpr_jax.data.readers import ros
+from sglpr_jax.data.warning import DataWarning
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 DRIVERS = {
@@ -86,6 +89,47 @@ def test_broken_clouds(change, message):
         read_point_cloud2(broken)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "expected a scan of at most 16777216 points, found 1844674"),
+        ({"width": 2**20, "point_step": 2**31}, "expected a scan of at most 536870912 bytes"),
+        ({"point_step": 0, "row_step": 0}, "expected 1 rows of 24 points of 0 bytes, found 528 bytes"),
+    ],
+)
+def test_sizes_that_no_cloud_has(change, message):
+    broken = cloud(points_of(0))
+    vars(broken).update(change)
+    with pytest.raises(ValueError, match=message):
+        read_point_cloud2(broken)
+
+
+def test_an_offset_beyond_every_size():
+    broken = cloud(points_of(0))
+    broken.fields[0].offset = 2**32 - 1
+    with pytest.raises(ValueError, match="expected fields within 22 bytes, found others"):
+        read_point_cloud2(broken)
+
+
+@pytest.mark.parametrize("driver", ["velodyne", "turned about"])
+def test_a_big_endian_flag_on_little_endian_points(driver):
+    flagged = cloud(points_of(0), driver)
+    flagged.is_bigendian = True
+    with pytest.warns(DataWarning, match=r"drive: expected big-endian points, as is_bigendian states, found little"):
+        found = read_point_cloud2(flagged, name="drive")
+    np.testing.assert_array_equal(found.points, points_of(0))
+    np.testing.assert_array_equal(found.lasers, np.arange(24) % 16)
+
+
+def test_lasers_that_are_no_numbers():
+    """A ring of float32, as some converters write it."""
+    with_ring = cloud(points_of(0))
+    with_ring.fields[-1].datatype, with_ring.fields[-1].offset = CODES["f4"], 12
+    records = with_ring.data.view(np.dtype({"names": ["r"], "formats": ["<f4"], "offsets": [12], "itemsize": 22}))
+    records["r"] = [np.nan, *range(1, 24)]
+    np.testing.assert_array_equal(read_point_cloud2(with_ring).lasers[1:], np.arange(1, 24))
+
+
 def test_fields_of_other_types_are_refused():
     broken = cloud(points_of(0))
     broken.fields[0].datatype = 9
@@ -94,12 +138,25 @@ def test_fields_of_other_types_are_refused():
     assert described_fields(broken) == "x y z intensity ring (22 bytes a point)"
 
 
-def write(path, kind, *, topics=("/velodyne_points",), scans=3, stamps=None, imu=False):
-    """A bag with `scans` clouds on each topic, 0.1 s apart."""
+def write(
+    path,
+    kind,
+    *,
+    topics=("/velodyne_points",),
+    scans=3,
+    stamps=None,
+    imu=False,
+    compression=None,
+    change=lambda i, c: c,
+):
+    """A bag with `scans` clouds on each topic, 0.1 s apart, each changed by `change`."""
     one = kind == "ros1"
     types = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     storage = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-    with Writer1(path) if one else Writer2(path, version=9, storage_plugin=storage) as bag:
+    writer = Writer1(path) if one else Writer2(path, version=9, storage_plugin=storage)
+    if compression:
+        writer.set_compression(*compression)
+    with writer as bag:
         serialize = types.serialize_ros1 if one else types.serialize_cdr
         if imu:
             bag.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=types)
@@ -107,7 +164,10 @@ def write(path, kind, *, topics=("/velodyne_points",), scans=3, stamps=None, imu
             connection = bag.add_connection(topic, "sensor_msgs/msg/PointCloud2", typestore=types)
             for i in range(scans):
                 message = ros_message(
-                    types, cloud(points_of(i), "ouster"), 100.0 + i / 10 if stamps is None else stamps[i], one
+                    types,
+                    change(i, cloud(points_of(i), "ouster")),
+                    100.0 + i / 10 if stamps is None else stamps[i],
+                    one,
                 )
                 bag.write(connection, 10**9 * 200 + i * 10**8, serialize(message, connection.msgtype))
     return path
@@ -147,6 +207,82 @@ def test_a_bag_is_a_recording(tmp_path, kind):
         np.testing.assert_array_equal(record.points, points_of(i))
         np.testing.assert_array_equal(record.lasers, np.arange(24) % 16)
     assert recording.record(0).lasers is None
+
+
+COMPRESSIONS = {
+    "ros1, bz2": ("ros1", (Writer1.CompressionFormat.BZ2,)),
+    "ros1, lz4": ("ros1", (Writer1.CompressionFormat.LZ4,)),
+    "ros2, files": ("ros2", (CompressionMode.FILE, CompressionFormat.ZSTD)),
+    "ros2, messages": ("ros2", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
+    "mcap, files": ("mcap", (CompressionMode.FILE, CompressionFormat.ZSTD)),
+    "mcap, messages": ("mcap", (CompressionMode.MESSAGE, CompressionFormat.ZSTD)),
+    "mcap, chunks": ("mcap", (CompressionMode.STORAGE, CompressionFormat.ZSTD)),
+}
+
+
+@pytest.mark.parametrize("name", COMPRESSIONS)
+def test_compressed_bags(tmp_path, name):
+    kind, compression = COMPRESSIONS[name]
+    root = write(tmp_path / KINDS[kind], kind, compression=compression)
+    recording = open_recording(root)
+    for i in range(3):
+        np.testing.assert_array_equal(recording.points(i), points_of(i))
+    if kind == "ros1":
+        return
+    for path in root.glob("drive.*.zstd"):
+        with pytest.raises(ValueError, match=r"drive\.\w+\.zstd: .* open the folder with .*drive/metadata\.yaml$"):
+            open_recording(path)
+    (root / "metadata.yaml").unlink()
+    if name == "mcap, chunks":
+        np.testing.assert_array_equal(open_recording(root).points(1), points_of(1))
+    else:
+        with pytest.raises(ValueError, match=r"drive\.(mcap|db3).*: expected .*metadata\.yaml is missing"):
+            open_recording(root)
+
+
+@pytest.mark.parametrize("kind", ["ros2", "mcap"])
+def test_a_recording_of_a_killed_recorder_has_no_metadata(tmp_path, kind):
+    root = write(tmp_path / "drive", kind)
+    (root / "metadata.yaml").unlink()
+    for i in range(3):
+        np.testing.assert_array_equal(open_recording(root).points(i), points_of(i))
+    (file,) = root.iterdir()
+    assert open_recording(file).name == "drive"
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"drive\.\w+: expected an intact ROS bag, .*metadata\.yaml is missing"):
+        open_recording(root)
+    (root / "metadata.yaml").touch()
+    with pytest.raises(ValueError, match=r"drive: expected an intact ROS bag, .*; metadata\.yaml or a file that it"):
+        open_recording(root)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_empty_cloud_among_others_is_named_and_can_be_skipped(tmp_path, kind):
+    def emptied(i, found):
+        if i == 1:
+            found.width, found.row_step, found.data = 0, 0, np.zeros(0, np.uint8)
+        return found
+
+    recording = open_recording(write(tmp_path / KINDS[kind], kind, change=emptied))
+    np.testing.assert_array_equal(recording.points(2), points_of(2))
+    with pytest.raises(ValueError, match=r"scan 000001: .*drive.*: expected a cloud with points on /velodyne_points"):
+        recording.points(1)
+    told = []
+    assert readable(recording, on_bad_scan=lambda scan, error: told.append(scan)).ids == ("000000", "000002")
+    assert told == ["000001"]
+
+
+def test_fewer_messages_than_the_statistics_declare(tmp_path):
+    root = write(tmp_path / "drive", "mcap")
+    (root / "metadata.yaml").unlink()
+    (file,) = root.iterdir()
+    content = file.read_bytes()
+    at = content.rindex(struct.pack("<IHQ", 10, 1, 3))  # messages of each channel: three of the first
+    file.write_bytes(content[:at] + struct.pack("<IHQ", 10, 1, 4) + content[at + 14 :])
+    with pytest.raises(
+        ValueError, match=r"drive\.mcap: .*expected 4 messages on /velodyne_points by its statistics, f"
+    ):
+        open_recording(root)
 
 
 def test_a_lone_mcap_and_folders_of_bags(tmp_path):

@@ -1,6 +1,7 @@
 """Ways to damage a file that know what is in it. Each says whether its result can still be read as it was meant."""
 
 import json
+import re
 import struct
 from collections.abc import Callable, Mapping
 from random import Random
@@ -61,6 +62,37 @@ def other_kind(content: bytes, draw: Random) -> Damaged:
         b"\xff\xfe1\0",
     )
     return Damaged(draw.choice((*kinds, draw.randbytes(draw.randint(1, 200)))), "either")
+
+
+SIZES = (0, 1, 2**16 - 1, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1, 10**30)
+"""Sizes that a header may declare and no file has."""
+HEADER = 400
+"""Number of bytes at the start of a file, with its header."""
+
+
+def declare(content: bytes, draw: Random) -> Damaged:
+    """A number in the text of a header is another size, or none."""
+    numbers = list(re.finditer(rb"[0-9]+", content[:HEADER]))
+    if not numbers:
+        return extreme(content, draw)
+    found = draw.choice(numbers)
+    number = draw.choice((*SIZES, -1, "1_0", "x", "", "0x7", "1e9", "９"))
+    return Damaged(content[: found.start()] + str(number).encode() + content[found.end() :], "either")
+
+
+def extreme(content: bytes, draw: Random) -> Damaged:
+    """A number of 1 to 8 bytes is another size, in a header or anywhere."""
+    size, order = draw.choice((1, 2, 4, 8)), draw.choice(("little", "big"))
+    at = draw.randrange(min(len(content), HEADER) if draw.random() < 0.5 else len(content))
+    number = (draw.choice(SIZES) % 256**size).to_bytes(size, order)  # pyright: ignore[reportArgumentType]
+    return Damaged((content[:at] + number + content[at + size :])[: len(content)], "either")
+
+
+def flip_header(content: bytes, draw: Random) -> Damaged:
+    """One bit of a header: a name, a type or a size."""
+    damaged = bytearray(content)
+    damaged[draw.randrange(min(len(content), HEADER))] ^= 1 << draw.randrange(8)
+    return Damaged(bytes(damaged), "either")
 
 
 BYTES: Mapping[str, Damage] = {f.__name__: f for f in (flip, cut, overwrite, repeat, other_kind)}

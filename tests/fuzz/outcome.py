@@ -1,6 +1,7 @@
 """What became of a damaged file: it was refused in one good line, read rightly, or something that may never be."""
 
 import contextlib
+import resource
 import signal
 import traceback
 import warnings
@@ -12,7 +13,9 @@ from sglpr_jax.data.warning import DataWarning
 
 from .damage import Damaged
 
-LONGEST_S = 20
+LONGEST_S = 60
+MOST_BYTES = 2**31
+"""Memory that a reader may ask for, beyond that of the process."""
 
 
 class Outcome(NamedTuple):
@@ -22,7 +25,7 @@ class Outcome(NamedTuple):
     text: str
 
 
-KINDS = ("refused", "right", "told", "silent", "traceback", "bad message", "new file", "hang")
+KINDS = ("refused", "right", "told", "silent", "traceback", "bad message", "new file", "hang", "memory")
 ALLOWED = ("refused", "right", "told")
 """Told: read, with a warning that names the file."""
 
@@ -46,6 +49,8 @@ def _outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Ca
             result = read(path)
     except (ValueError, OSError) as error:
         line = str(error)
+        if _for_want_of_memory(error):
+            return Outcome("memory", line)
         good = path.name in line and "expected" in line and "found" in line and len(line) < 1000 and "\n" not in line
         if damaged.expected == "same":
             return Outcome("bad message", f"refused what is the same: {line}")
@@ -62,15 +67,29 @@ def _outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Ca
     return Outcome("silent", repr(result)[:300])
 
 
+def _for_want_of_memory(error: BaseException | None) -> bool:
+    """Whether an error comes from one of memory. A reader checks sizes before it asks for memory."""
+    return error is not None and (isinstance(error, MemoryError) or _for_want_of_memory(error.__context__))
+
+
 @contextlib.contextmanager
 def _limited() -> Iterator[None]:
+    """Limit time and memory."""
+
     def stop(number, frame):
         raise Hang
 
-    before = signal.signal(signal.SIGALRM, stop)
+    before, memory = signal.signal(signal.SIGALRM, stop), resource.getrlimit(resource.RLIMIT_AS)
     signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+    resource.setrlimit(resource.RLIMIT_AS, (_address_space() + MOST_BYTES, memory[1]))
     try:
         yield
     finally:
+        resource.setrlimit(resource.RLIMIT_AS, memory)
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+
+
+def _address_space() -> int:
+    """Bytes that this process has mapped."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -60,6 +60,17 @@ def test_the_numbers_of_an_edge_by_hand(tmp_path):
     assert line == "EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1 " + "1 0 0 0 0 0 4 0 0 0 0 5 0 0 0 10 0 0 20 0 25"
 
 
+def test_edges_without_information_have_the_unit_matrix(tmp_path):
+    path = tmp_path / "a.g2o"
+    path.write_text("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nFIX 0\nEDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1\n")
+    ((first, second, pose, information),) = read_g2o(path).edges
+    assert (first, second, pose[:3, 3].tolist()) == (3, 7, [1, 2, 3])
+    np.testing.assert_array_equal(information, np.eye(6))
+    path.write_text("EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1 1 0 0\n")
+    with pytest.raises(ValueError, match=r"a\.g2o, line 1: expected 30 numbers, found 12"):
+        read_g2o(path)
+
+
 def test_trajectories_come_back_and_are_those_the_readers_see(tmp_path, poses):
     times = np.arange(6) / 10 + 1_300_000_000
     poses = poses.copy()

@@ -1,11 +1,16 @@
 """Reads points from numpy files: .npy and .npz."""
 
-from collections.abc import Callable, Sequence
+import math
+import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
+
+from sglpr_jax.data.formats.scan_size import MOST_POINTS, check_bytes
+from sglpr_jax.files import in_short
 
 NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 """Names of the array with the points in an .npz file with several arrays, in order of preference."""
@@ -21,7 +26,13 @@ def read_npy(path: Path) -> Float32[np.ndarray, "n 3"]:
       FileNotFoundError: If the file does not exist.
       ValueError: If the file contains something else.
     """
-    return _points(path, _load(path, lambda array: array))
+    _check_exists(path)
+    try:
+        with path.open("rb") as stream:
+            array = _read(stream, size=path.stat().st_size)
+    except Exception as error:  # numpy and tokenize raise many types for broken files
+        raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
+    return _points(path, array)
 
 
 def read_npz(path: Path) -> Float32[np.ndarray, "n 3"]:
@@ -29,33 +40,44 @@ def read_npz(path: Path) -> Float32[np.ndarray, "n 3"]:
 
     Raises what `read_npy` raises, and ValueError if the file has several arrays and no name matches.
     """
-    return _points(path, _load(path, lambda archive: archive[_name(path, archive.files)]))
-
-
-def _name(path: Path, names: Sequence[str]) -> str:
-    """Name of the array with the points."""
-    name = next((name for name in NAMES if name in names), names[0] if len(names) == 1 else None)
-    if name is None:
+    _check_exists(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+            chosen = _chosen(names)
+            if chosen is not None:
+                member = archive.getinfo(f"{chosen}.npy")
+                with archive.open(member) as stream:
+                    array = _read(stream, size=member.file_size)
+    except Exception as error:  # zipfile and zlib raise many types, too
+        raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
+    if chosen is None:
         found = ", ".join(names) or "none"
-        raise _NotOne(f"{path}: expected one array, or one named {', '.join(NAMES)}, found {found}")
-    return name
+        raise ValueError(f"{path}: expected one array, or one named {', '.join(NAMES)}, found {found}")
+    return _points(path, array)
 
 
-class _NotOne(ValueError):
-    """Raised if an archive has no single array with points. `_load` does not wrap it."""
-
-
-def _load(path: Path, choose: Callable[[Any], np.ndarray]) -> np.ndarray:
-    """Load a file with numpy and select an array with `choose`. Raises ValueError if numpy cannot read the file."""
+def _check_exists(path: Path) -> None:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a numpy file, found none")
-    try:
-        with path.open("rb") as stream:
-            return choose(np.load(stream, allow_pickle=False))
-    except _NotOne:
-        raise
-    except Exception as error:  # numpy, zipfile, zlib and tokenize raise many types for broken files
-        raise ValueError(f"{path}: expected a numpy array, found none ({error})") from error
+
+
+def _chosen(names: Sequence[str]) -> str | None:
+    """Name of the array with the points, or None."""
+    return next((name for name in NAMES if name in names), names[0] if len(names) == 1 else None)
+
+
+def _read(stream: Any, *, size: int) -> np.ndarray:
+    """Read an array of `size` bytes with its header. A header may declare more than a file or an archive contains."""
+    shorter = np.lib.format.read_magic(stream) == (1, 0)
+    read_header = np.lib.format.read_array_header_1_0 if shorter else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(stream)
+    declared = stream.tell() + math.prod(shape) * dtype.itemsize
+    if declared != size:
+        raise ValueError(f"expected {declared} bytes by its header, found {size}")
+    check_bytes(size)
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _points(path: Path, array: np.ndarray) -> Float32[np.ndarray, "n 3"]:
@@ -63,7 +85,7 @@ def _points(path: Path, array: np.ndarray) -> Float32[np.ndarray, "n 3"]:
     if {"x", "y", "z"} <= set(array.dtype.names or ()):
         array = np.stack([array[axis].reshape(-1) for axis in "xyz"], axis=1)
     numbers = array.dtype.kind in "fiu"
-    if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not len(array):
+    if not numbers or array.ndim != 2 or not 3 <= array.shape[1] <= 32 or not 0 < len(array) <= MOST_POINTS:
         raise ValueError(
             f"{path}: expected points as rows of 3 to 32 numbers, found {array.dtype} of shape {array.shape}"
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.choices import RecordFormat
+from sglpr_jax.data.formats.scan_size import check_points
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 NCLT_UNIT_M = 0.005
@@ -54,7 +55,7 @@ def read_records(path: Path, format: RecordFormat) -> Records:
     """Read a file of records.
 
     Raises:
-      ValueError: If the file is empty or its size is not a multiple of the record size.
+      ValueError: If the file is empty or too large, or its size is not a multiple of the record size.
 
     Example:
       points = read_records(path, "float32x6").points
@@ -67,6 +68,10 @@ def read_records(path: Path, format: RecordFormat) -> Records:
             f"{path}: expected {dtype.itemsize} bytes for each point ({format}), found {size} bytes in total; the file"
             f" is truncated, or has another format ({others} bytes a point; pcd has a header)"
         )
+    try:
+        check_points(size // dtype.itemsize, bytes_each=dtype.itemsize)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     records = np.fromfile(path, dtype=dtype)
     lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
     with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers

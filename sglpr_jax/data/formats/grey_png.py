@@ -17,8 +17,10 @@ from sglpr_jax.files import in_short
 
 _MODES = {8: "L", 16: "I;16"}
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-LARGEST_SIDE = 1 << 14
-"""Maximum width and height of an image, in pixels."""
+LARGEST_SIDE = 1 << 13
+"""Maximum width and height of an image, in pixels. Pillow accepts images of this size."""
+_ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+"""First column and row, and steps of columns and rows, of each pass of an interlaced image."""
 
 
 def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
@@ -48,10 +50,7 @@ def read_grey_png(path: Path, *, bits: int) -> UInt[np.ndarray, "h w"]:
 
 
 def _check_whole(content: bytes) -> None:
-    """Raise ValueError if a checksum is wrong or pixels are missing. Pillow reports neither.
-
-    The pixels of interlaced images are not counted. This project writes no interlaced images.
-    """
+    """Raise ValueError if a checksum is wrong or pixels are missing or too many. Pillow reports none of these."""
     if not content.startswith(_SIGNATURE):
         raise ValueError("no PNG signature")
     chunks = list(_chunks(content))
@@ -60,10 +59,19 @@ def _check_whole(content: bytes) -> None:
     width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", chunks[0][1])
     if max(width, height) > LARGEST_SIDE:
         raise ValueError(f"the header declares {width} x {height} pixels, more than {LARGEST_SIDE} a side")
-    pixels = zlib.decompress(b"".join(data for kind, data in chunks if kind == b"IDAT"))
-    channels = {2: 3, 4: 2, 6: 4}.get(colour, 1)
-    if not interlaced and len(pixels) != height * (1 + (width * channels * depth + 7) // 8):
+    bits = depth * {2: 3, 4: 2, 6: 4}.get(colour, 1)
+    size = sum(_pass_bytes(width, height, bits, step) for step in (_ADAM7 if interlaced else ((0, 0, 1, 1),)))
+    unpacking = zlib.decompressobj()
+    pixels = unpacking.decompress(b"".join(data for kind, data in chunks if kind == b"IDAT"), size + 1)
+    if len(pixels) != size or not unpacking.eof:
         raise ValueError(f"the header declares {width} x {height} pixels, but the data has another size")
+
+
+def _pass_bytes(width: int, height: int, bits: int, steps: tuple[int, int, int, int]) -> int:
+    """Size of one pass over an image in bytes. Each row begins with the number of its filter."""
+    x, y, dx, dy = steps
+    columns, rows = -((x - width) // dx), -((y - height) // dy)
+    return rows * (1 + (columns * bits + 7) // 8) if columns > 0 and rows > 0 else 0
 
 
 def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:

@@ -1,6 +1,7 @@
 """Reads points from .pcd files, the format of the Point Cloud Library."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -9,6 +10,49 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.data.formats.lzf import decompress_lzf
+from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
+from sglpr_jax.data.formats.scan_size import check_points, read_content
+
+_NUMBERS = {
+    **{("F", 4): "<f4", ("F", 8): "<f8"},
+    **{("I", 1): "<i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8"},
+    **{("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8"},
+}
+"""Numpy types by TYPE and SIZE."""
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class _Field:
+    """Field of a point."""
+
+    name: str
+    """Name. Padding has the name `_`."""
+    kind: str
+    """TYPE: F, I or U."""
+    size: int
+    """Size of a number in bytes."""
+    count: int
+    """Number of numbers. Some programs write fields without numbers."""
+
+    @property
+    def width(self) -> int:
+        """Size of the field in bytes."""
+        return self.size * self.count
+
+
+@dataclass(frozen=True)
+class _Header:
+    """Header of a .pcd file."""
+
+    points: int
+    """Number of points."""
+    fields: tuple[_Field, ...]
+
+    @property
+    def unpadded(self) -> tuple[_Field, ...]:
+        """Fields without padding. The Point Cloud Library writes padding only with `DATA binary`."""
+        return tuple(field for field in self.fields if field.name != "_")
 
 
 def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
@@ -21,27 +65,13 @@ def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a .pcd file, found none")
     try:
-        return _decode(path.read_bytes())
-    except (ValueError, TypeError) as error:  # TypeError: a TYPE unknown to numpy
+        return _decode(read_content(path))
+    except ValueError as error:
         raise ValueError(f"{path}: expected a readable .pcd file, found an invalid one: {error}") from error
 
 
-@dataclass(frozen=True)
-class _Header:
-    """Header of a .pcd file."""
-
-    points: int
-    """Number of points."""
-    fields: tuple[str, ...]
-    """Names of the fields of a point."""
-    dtypes: tuple[np.dtype, ...]
-    """Numpy type of each field."""
-    counts: tuple[int, ...]
-    """Number of elements of each field."""
-
-
 def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
-    data = re.search(rb"^DATA\s+(\w+)[^\n]*\n", content, flags=re.MULTILINE)
+    data = re.search(rb"^DATA[ \t]+(\w+)[^\n]*\n", content, flags=re.MULTILINE)
     if data is None:
         raise ValueError("expected a header that ends with a DATA line, found none")
     header = _parse_header(content[: data.start()].decode("ascii", errors="replace"))
@@ -52,53 +82,72 @@ def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
         return _decode_compressed(header, body)
     if encoding == b"ascii":
         return _decode_ascii(header, body)
-    raise ValueError(f"expected DATA binary, binary_compressed or ascii, found {encoding.decode()}")
+    raise ValueError(f"expected DATA binary, binary_compressed or ascii, found {encoding.decode(errors='replace')}")
 
 
 def _parse_header(text: str) -> _Header:
-    words = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.strip()}
+    words = _keywords(text)
     missing = [keyword for keyword in ("FIELDS", "SIZE", "TYPE", "POINTS") if not words.get(keyword)]
     if missing:
         raise ValueError(f"expected a header with FIELDS, SIZE, TYPE and POINTS, found no {', '.join(missing)}")
-    fields = words["FIELDS"]
-    counts = words.get("COUNT", ["1"] * len(fields))
-    if not {"x", "y", "z"} <= set(fields):
-        raise ValueError(f"expected the fields x, y and z, found {' '.join(fields)}")
-    if not len(fields) == len(words["SIZE"]) == len(words["TYPE"]) == len(counts):
-        raise ValueError(f"expected one SIZE, TYPE and COUNT for each of {len(fields)} FIELDS, found others")
-    if int(words["POINTS"][0]) < 1:
-        raise ValueError(f"expected at least one point, found POINTS {words['POINTS'][0]}")
-    width, height = (words.get(side) or ["1"] for side in ("WIDTH", "HEIGHT"))
-    if "WIDTH" in words and int(width[0]) * int(height[0]) != int(words["POINTS"][0]):
-        raise ValueError(f"expected POINTS of WIDTH x HEIGHT, {width[0]} x {height[0]}, found {words['POINTS'][0]}")
-    if any(int(count) < 1 for count in counts):
-        raise ValueError(f"expected a COUNT of 1 or more for each field, found {' '.join(counts)}")
-    return _Header(
-        points=int(words["POINTS"][0]),
-        fields=tuple(fields),
-        dtypes=tuple(
-            np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(words["TYPE"], words["SIZE"], strict=True)
-        ),
-        counts=tuple(int(count) for count in counts),
+    fields = _parse_fields(words)
+    points = whole_number(words["POINTS"][0], of="POINTS")
+    sides = [whole_number((words.get(side) or ["1"])[0], of=side) for side in ("WIDTH", "HEIGHT")]
+    if "WIDTH" in words and sides[0] * sides[1] != points:
+        raise ValueError(f"expected POINTS of WIDTH x HEIGHT, {sides[0]} x {sides[1]}, found {points}")
+    check_points(points, bytes_each=sum(field.width for field in fields))
+    return _Header(points, fields)
+
+
+def _keywords(text: str) -> dict[str, list[str]]:
+    """Words after each keyword of a header."""
+    words: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        keyword, *values = line.split() or ["#"]
+        if keyword in words:
+            raise ValueError(f"expected each line of the header once, found {keyword[:40]} again")
+        if not keyword.startswith("#"):
+            words[keyword] = values
+    return words
+
+
+def _parse_fields(words: dict[str, list[str]]) -> tuple[_Field, ...]:
+    names = words["FIELDS"]
+    counts = words.get("COUNT", ["1"] * len(names))
+    if not len(names) == len(words["SIZE"]) == len(words["TYPE"]) == len(counts):
+        raise ValueError(f"expected one SIZE, TYPE and COUNT for each of {len(names)} FIELDS, found others")
+    fields = tuple(
+        _Field(name, kind.upper(), whole_number(size, of="SIZE"), whole_number(count, of="COUNT"))
+        for name, kind, size, count in zip(names, words["TYPE"], words["SIZE"], counts, strict=True)
     )
+    if any(names.count(axis) != 1 for axis in AXES):
+        raise ValueError(f"expected the fields x, y and z, found {' '.join(names)}")
+    for field in fields:
+        ignored = field.name == "_" or not field.count
+        if (field.name in AXES and field.count != 1) or (not ignored and (field.kind, field.size) not in _NUMBERS):
+            raise ValueError(
+                f"expected {field.name} of TYPE F, I or U and SIZE 1 to 8, and COUNT 1 for x, y and z, found TYPE"
+                f" {field.kind}, SIZE {field.size} and COUNT {field.count}"
+            )
+    return fields
 
 
 def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
-    widths = [dtype.itemsize * count for dtype, count in zip(header.dtypes, header.counts, strict=True)]
-    offsets = list(accumulate(widths, initial=0))
-    columns = [header.fields.index(axis) for axis in "xyz"]
+    offsets = list(accumulate((field.width for field in header.fields), initial=0))
+    axes = {field.name: column for column, field in enumerate(header.fields) if field.name in AXES}
     record = np.dtype(
         {
-            "names": ["x", "y", "z"],
-            "formats": [header.dtypes[column] for column in columns],
-            "offsets": [offsets[column] for column in columns],
+            "names": list(axes),
+            "formats": [_number(header.fields[column]) for column in axes.values()],
+            "offsets": [offsets[column] for column in axes.values()],
             "itemsize": offsets[-1],
         }
     )
-    if len(body) < header.points * record.itemsize:
+    end = header.points * record.itemsize
+    if len(body) < end or body[end:].strip(b"\0\r\n\t "):  # some programs fill the last page with zeros
         raise ValueError(f"expected {header.points} points of {record.itemsize} bytes, found {len(body)} bytes")
-    records = np.frombuffer(body, dtype=record, count=header.points)
-    return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    points = np.frombuffer(body, record, header.points)
+    return _rows([points[axis] for axis in AXES])
 
 
 def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
@@ -106,24 +155,40 @@ def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3
     if len(body) < 8:
         raise ValueError(f"expected two sizes before the points, found {len(body)} bytes")
     packed, size = (int(number) for number in np.frombuffer(body, "<u4", count=2))
-    widths = [dtype.itemsize * count for dtype, count in zip(header.dtypes, header.counts, strict=True)]
-    if size != header.points * sum(widths) or len(body) < 8 + packed:
+    layouts = (header.fields, header.unpadded)
+    widths = [sum(field.width for field in fields) for fields in layouts]
+    fitting = [fields for fields, width in zip(layouts, widths, strict=True) if size == header.points * width]
+    end = 8 + packed
+    if not fitting or len(body) < end or body[end:].strip(b"\0\r\n\t "):
         raise ValueError(
-            f"expected {header.points} points of {sum(widths)} bytes in {packed} bytes, found {size} in {len(body) - 8}"
+            f"expected {header.points} points of {widths[0]} bytes in {packed} bytes, found {size} in {len(body) - 8}"
         )
-    columns = decompress_lzf(body[8 : 8 + packed], size=size)
-    starts = [header.points * offset for offset in accumulate(widths, initial=0)]
-    found = [
-        np.frombuffer(columns, header.dtypes[field], count=header.points * header.counts[field], offset=starts[field])
-        for field in map(header.fields.index, "xyz")
-    ]
-    return np.stack([column[:: len(column) // header.points] for column in found], axis=1).astype(np.float32)
+    columns = decompress_lzf(body[8:end], size=size)
+    starts = [header.points * offset for offset in accumulate((field.width for field in fitting[0]), initial=0)]
+    found = {
+        field.name: np.frombuffer(columns, _number(field), count=header.points, offset=start)
+        for field, start in zip(fitting[0], starts, strict=False)
+        if field.name in AXES
+    }
+    return _rows([found[axis] for axis in AXES])
 
 
 def _decode_ascii(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
-    offsets = list(accumulate(header.counts, initial=0))
-    rows = [line.split() for line in body.decode("ascii", errors="replace").splitlines() if line.strip()]
-    if len(rows) != header.points or any(len(row) != offsets[-1] for row in rows):
-        raise ValueError(f"expected {header.points} lines of {offsets[-1]} numbers, found {len(rows)} lines or others")
-    columns = [offsets[header.fields.index(axis)] for axis in "xyz"]
-    return np.array([[row[column] for column in columns] for row in rows], dtype=np.float32)
+    lines = text_lines(body)
+    words = len(lines[0].split()) if lines else 0
+    padded = words == sum(field.count for field in header.fields)
+    fields = header.fields if padded or words != sum(field.count for field in header.unpadded) else header.unpadded
+    offsets = list(accumulate((field.count for field in fields), initial=0))
+    rows = number_rows(lines, rows=header.points, columns=offsets[-1])
+    names = [field.name for field in fields]
+    return _rows([rows[:, offsets[names.index(axis)]] for axis in AXES])
+
+
+def _number(field: _Field) -> str:
+    return _NUMBERS[field.kind, field.size]
+
+
+def _rows(axes: Sequence[np.ndarray]) -> Float32[np.ndarray, "n 3"]:
+    """Points of the columns x, y and z."""
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid points are dropped by the callers
+        return np.stack([axis.astype(np.float32) for axis in axes], axis=1)

@@ -1,10 +1,16 @@
 """Reads the vertices of .ply files (Stanford format), in text or in binary of either byte order."""
 
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
+
+from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
+from sglpr_jax.data.formats.scan_size import check_points, read_content
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -21,8 +27,27 @@ class _Element:
     name: str
     count: int
     """Number of instances in the file."""
-    properties: list[tuple[str, str | None]]
+    properties: list[tuple[str, str | None]] = field(default_factory=list)
     """Name and type of each property. The type of a list of variable length is `None`."""
+
+    @property
+    def sizes(self) -> list[int]:
+        """Size of each property in bytes. Raises ValueError if a property is not a number."""
+        wrong = next((name for name, kind in self.properties if kind not in _TYPES), None)
+        if wrong is not None:
+            found = dict(self.properties)[wrong]
+            raise ValueError(f"expected numbers for {wrong} of {self.name}, found {found or 'a list'}")
+        return [np.dtype(_TYPES[str(kind)]).itemsize for _, kind in self.properties]
+
+    @property
+    def is_list(self) -> bool:
+        """Whether the size of an instance varies."""
+        return any(kind is None for _, kind in self.properties)
+
+    @property
+    def bytes(self) -> int:
+        """Size of all instances in a binary file."""
+        return self.count * sum(self.sizes) if self.count else 0
 
 
 def read_ply(path: Path) -> Float32[np.ndarray, "n 3"]:
@@ -35,77 +60,99 @@ def read_ply(path: Path) -> Float32[np.ndarray, "n 3"]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a .ply file, found none")
     try:
-        return _decode(path.read_bytes())
-    except (ValueError, IndexError, KeyError) as error:
+        return _decode(read_content(path))
+    except ValueError as error:
         raise ValueError(f"{path}: expected a readable .ply file, found an invalid one: {error}") from error
 
 
 def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
-    header, mark, body = content.partition(b"end_header")
-    lines = header.decode("ascii", errors="replace").splitlines()
-    if not mark or lines[0].strip() != "ply":
+    end = re.search(rb"^end_header[ \t\r]*\n", content, flags=re.MULTILINE)  # not a comment that contains the word
+    lines = content[: end.start()].decode("ascii", errors="replace").splitlines() if end else []
+    if end is None or not lines or lines[0].strip() != "ply":
         raise ValueError("expected a header from `ply` to `end_header`, found none")
-    body = body.partition(b"\n")[2]
     order, elements = _parse_header(lines[1:])
-    before, vertices = _until_vertices(elements)
-    names = [name for name, _ in vertices.properties]
-    if not {"x", "y", "z"} <= set(names):
-        raise ValueError(f"expected vertices with x, y and z, found {' '.join(names) or 'none'}")
-    if vertices.count < 1:
-        raise ValueError("expected at least one vertex, found none")
+    at = _index_of_vertices(elements)
+    before, vertices, behind = elements[:at], elements[at], elements[at + 1 :]
+    columns = _columns(vertices)
+    check_points(vertices.count, bytes_each=sum(vertices.sizes))
+    body = content[end.end() :]
     if order == "ascii":
-        return _read_text(body, vertices, skipped=sum(element.count for element in before))
-    skipped = sum(element.count * _record(element, order).itemsize for element in before)
-    return _read_binary(body[skipped:], vertices, _record(vertices, order))
+        return _read_text(body, before, vertices, behind)[:, columns]
+    return _read_binary(body[sum(element.bytes for element in before) :], vertices, behind, _ORDERS[order], columns)
 
 
-def _parse_header(lines: list[str]) -> tuple[str, list[_Element]]:
-    order, elements = "", []
+def _parse_header(lines: Sequence[str]) -> tuple[str, list[_Element]]:
+    """Format and elements. An unknown line is an error: it may be a damaged property, which would shift the others."""
+    orders, elements = [], []
     for line in lines:
         match line.split():
-            case ["format", found, *_]:
-                order = found
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", found, "1.0"]:
+                orders.append(found)
             case ["element", name, count]:
-                elements.append(_Element(name, int(count), []))
-            case ["property", "list", _, _, name]:
+                elements.append(_Element(name, whole_number(count, of=f"number of {name}")))
+            case ["property", "list", _, _, name] if elements:
                 elements[-1].properties.append((name, None))
-            case ["property", kind, name]:
-                elements[-1].properties.append((name, kind))
-    if order not in _ORDERS:
-        raise ValueError(f"expected format {', '.join(_ORDERS)}, found {order or 'none'}")
-    return order, elements
+            case ["property", kind, *name] if elements and name:
+                elements[-1].properties.append((" ".join(name), kind))
+            case _:
+                raise ValueError(f"expected format, element, property or comment in the header, found {line[:80]!r}")
+    if len(orders) != 1 or orders[0] not in _ORDERS:
+        raise ValueError(f"expected format {', '.join(_ORDERS)}, found {' and '.join(orders)[:80] or 'none'}")
+    return orders[0], elements
 
 
-def _until_vertices(elements: list[_Element]) -> tuple[list[_Element], _Element]:
-    """Elements before the vertices, and the vertices."""
+def _index_of_vertices(elements: Sequence[_Element]) -> int:
     names = [element.name for element in elements]
-    if "vertex" not in names:
+    if names.count("vertex") != 1:
         raise ValueError(f"expected an element vertex, found {' '.join(names) or 'none'}")
-    return elements[: names.index("vertex")], elements[names.index("vertex")]
+    return names.index("vertex")
 
 
-def _record(element: _Element, order: str) -> np.dtype:
-    kinds = []
-    for name, kind in element.properties:
-        if kind not in _TYPES:
-            raise ValueError(f"expected numbers for {name} of {element.name}, found {kind or 'a list'}")
-        kinds.append((name, _ORDERS[order] + _TYPES[kind]))
-    return np.dtype(kinds)
+def _columns(vertices: _Element) -> list[int]:
+    """Columns of x, y and z. Other properties may appear twice."""
+    names = [name for name, _ in vertices.properties]
+    if any(names.count(axis) != 1 for axis in "xyz"):
+        raise ValueError(f"expected vertices with x, y and z, found {' '.join(names) or 'none'}")
+    return [names.index(axis) for axis in "xyz"]
 
 
-def _read_binary(body: bytes, vertices: _Element, record: np.dtype) -> Float32[np.ndarray, "n 3"]:
-    if len(body) < vertices.count * record.itemsize:
+def _read_binary(
+    body: bytes, vertices: _Element, behind: Sequence[_Element], order: str, columns: Sequence[int]
+) -> Float32[np.ndarray, "n 3"]:
+    offsets = list(accumulate(vertices.sizes, initial=0))
+    kinds = [order + _TYPES[str(kind)] for _, kind in vertices.properties]
+    record = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [kinds[column] for column in columns],
+            "offsets": [offsets[column] for column in columns],
+            "itemsize": offsets[-1],
+        }
+    )
+    if len(body) < vertices.bytes:
         raise ValueError(f"expected {vertices.count} points of {record.itemsize} bytes, found {len(body)} bytes")
+    if not any(element.is_list for element in behind):  # the size of lists is not known
+        _check_end(len(body), vertices.bytes + sum(element.bytes for element in behind), unit="bytes")
     records = np.frombuffer(body, record, count=vertices.count)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
 
 
-def _read_text(body: bytes, vertices: _Element, *, skipped: int) -> Float32[np.ndarray, "n 3"]:
-    lines = [line for line in body.decode("ascii", errors="replace").splitlines() if line.strip()]
-    rows = [line.split() for line in lines[skipped : skipped + vertices.count]]
-    width = len(vertices.properties)
-    if len(rows) != vertices.count or any(len(row) != width for row in rows):
-        raise ValueError(f"expected {vertices.count} lines of {width} numbers, found {len(rows)} lines or others")
-    columns = [[name for name, _ in vertices.properties].index(axis) for axis in "xyz"]
-    return np.array([[row[column] for column in columns] for row in rows], dtype=np.float32)
+def _read_text(
+    body: bytes, before: Sequence[_Element], vertices: _Element, behind: Sequence[_Element]
+) -> Float32[np.ndarray, "n columns"]:
+    """All properties of the vertices. Each instance of an element is a line."""
+    skipped = sum(element.count for element in before)
+    lines = text_lines(body)
+    _check_end(len(lines), skipped + vertices.count + sum(element.count for element in behind), unit="lines")
+    rows = number_rows(lines[skipped : skipped + vertices.count], rows=vertices.count, columns=len(vertices.properties))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return rows.astype(np.float32)
+
+
+def _check_end(found: int, most: int, *, unit: str) -> None:
+    """Raise ValueError if a file is longer than its header declares: the header may be damaged."""
+    if found > most:
+        raise ValueError(f"expected at most {most} {unit} after the header, found {found}")

@@ -81,9 +81,20 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     )
     wanted = " or ".join(simplest) if simplest else "one of these"
     raise ValueError(
-        f"{paths[0].parent}: expected scans that fit exactly one format, found {len(simplest)}; pass --format {wanted},"
-        f" or nuscenes or nclt ({tried})"
+        f"{paths[0] if len(paths) == 1 else paths[0].parent}: expected scans that fit exactly one format, found"
+        f" {len(simplest)}; pass --format {wanted}, or nuscenes or nclt ({tried})"
     )
+
+
+def record_of_scan(path: Path) -> RecordFormat:
+    """Detect the format of one headerless scan: KITTI's if the scan fits it or has too few points, or else another.
+
+    Raises ValueError if no format fits, or several others do, like `find_record`.
+    """
+    chosen = _some([path])
+    if not chosen or not strangeness(chosen, "kitti"):
+        return "kitti"
+    return find_record(chosen)[0] or "kitti"
 
 
 def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> RecordFormat | None:

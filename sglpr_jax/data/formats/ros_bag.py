@@ -10,14 +10,21 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.bounded_file import BoundedPath
 from sglpr_jax.data.formats.livox import CUSTOM_MSG, POINT, read_custom_msg
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
 from sglpr_jax.data.formats.ros_message import RosMessage
 from sglpr_jax.data.formats.ros_poses import POSES, TRANSFORMS, read_transforms
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, tracks_of
+from sglpr_jax.files import in_short
 
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *CUSTOM_MSG)
 """Message types of scans."""
+METADATA = "metadata.yaml"
+"""File that describes a ROS 2 recording. The recorder writes it at the end."""
+COMPRESSED = (".db3.zstd", ".mcap.zstd")
+"""Endings of compressed files, which only their metadata describe."""
+REINDEX = "ros2 bag reindex writes it"
 
 
 class RosBag:
@@ -88,11 +95,22 @@ class RosBag:
             return next(self._messages(topic, time))[1].header().frame
 
     def cloud(self, topic: str, time: int, nth: int) -> Records:
-        """Return the `nth` cloud among those of a topic recorded at `time` (ns). Raises ValueError if it is broken."""
+        """Return the `nth` cloud among those of a topic recorded at `time` (ns).
+
+        Raises ValueError if the bag or the cloud is broken, or the cloud is empty.
+        """
+        livox = self.topics[topic] in CUSTOM_MSG
         with self._lock, _broken(self.paths[0]):
-            if self.topics[topic] in CUSTOM_MSG:
-                return read_custom_msg(next(itertools.islice(self._messages(topic, time), nth, None))[1])
-            return read_point_cloud2(self._point_cloud2(topic, time, nth))
+            if livox:
+                message = next(itertools.islice(self._messages(topic, time), nth, None))[1]
+            else:
+                message = self._point_cloud2(topic, time, nth)
+        try:
+            return read_custom_msg(message) if livox else read_point_cloud2(message, name=str(self.paths[0]))
+        except ValueError as error:
+            raise ValueError(
+                f"{self.paths[0]}: expected a cloud with points on {topic}, found an invalid one ({error})"
+            ) from error
 
     def fields(self, topic: str, time: int) -> str:
         """Return a description of the fields of a cloud."""
@@ -102,14 +120,24 @@ class RosBag:
             return described_fields(self._point_cloud2(topic, time, 0))
 
     def _messages(self, topic: str, time: int | None = None) -> Iterator[tuple[int, RosMessage]]:
-        """Messages of a topic, or only those recorded at one time (ns), with their times."""
+        """Messages of a topic, or only those recorded at one time (ns), with their times.
+
+        Raises ValueError after the last message if the bag declares more.
+        """
+        found = 0
         for _, recorded, raw in self._raw(topic, time):
+            found += 1
             yield recorded, RosMessage(raw, cdr=self._reader.is2)
+        declared = sum(connection.msgcount for connection in self._connections(topic))
+        if time is None and found < declared:
+            raise ValueError(f"expected {declared} messages on {topic} by its statistics, found {found}")
 
     def _raw(self, topic: str, time: int | None) -> Any:
-        connections = [connection for connection in self._reader.connections if connection.topic == topic]
         stop = None if time is None else time + 1
-        return self._reader.messages(connections=connections, start=time, stop=stop)
+        return self._reader.messages(connections=self._connections(topic), start=time, stop=stop)
+
+    def _connections(self, topic: str) -> list[Any]:
+        return [connection for connection in self._reader.connections if connection.topic == topic]
 
     def _point_cloud2(self, topic: str, time: int, nth: int) -> Any:
         connection, _, raw = next(itertools.islice(self._raw(topic, time), nth, None))
@@ -127,8 +155,20 @@ class _broken:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, ImportError | FileNotFoundError):
-            said = str(error) or type(error).__name__
-            raise ValueError(f"{self._path}: expected an intact ROS bag, found a broken one ({said})") from error
+            raise ValueError(
+                f"{self._path}: expected an intact ROS bag, found a broken one ({in_short(error)})"
+                f"{_about_metadata(self._path)}"
+            ) from error
+
+
+def _about_metadata(path: Path) -> str:
+    """Hint about the metadata of a broken ROS 2 recording. A recorder that is killed writes none."""
+    metadata = path.parent / METADATA
+    if path.is_dir():
+        return f"; {METADATA} or a file that it lists is damaged"
+    if path.suffix == ".bag":
+        return ""
+    return f"; open the folder with {metadata}" if metadata.is_file() else f"; {metadata} is missing ({REINDEX})"
 
 
 def _open(paths: tuple[Path, ...]) -> Any:
@@ -137,7 +177,9 @@ def _open(paths: tuple[Path, ...]) -> Any:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ImportError(f"{paths[0]}: bags need the extra `ros` (pip install 'sglpr-jax[ros]')") from error
+    if paths[0].name.endswith(COMPRESSED):
+        raise ValueError(f"{paths[0]}: expected a file that is not compressed{_about_metadata(paths[0])}")
     with _broken(paths[0]):
-        reader = AnyReader(list(paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([BoundedPath(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
         return reader

@@ -12,6 +12,7 @@ from sglpr_jax.data.formats.bin_records import is_record, read_records
 from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.formats.pcd import read_pcd
 from sglpr_jax.data.formats.ply import read_ply
+from sglpr_jax.data.formats.record_size import record_of_scan
 from sglpr_jax.fields import check_value
 
 READERS: dict[ScanFormat, Callable[[Path], Float32[np.ndarray, "n 3"]]] = {
@@ -53,6 +54,14 @@ def says_its_format(path: Path) -> bool:
     return guess_format(path) != "kitti"
 
 
+def found_format(path: Path) -> ScanFormat:
+    """Return the format of one scan by its name or, for a .bin whose name does not define it, by its content.
+
+    Raises ValueError if the content fits no format, as for a folder of scans.
+    """
+    return guess_format(path) if says_its_format(path) else record_of_scan(path)
+
+
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
     """Return the points (n, 3) of one scan in metres: x forward, y left, z up. Intensities are dropped.
 
@@ -67,23 +76,24 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
 
     Arguments:
       path: File of the scan.
-      format: Format of the scan. "auto" uses the name of the file. If the name does not define the format, a .bin file
-        is read as kitti. (`find_record` detects the format from the content of several files.)
+      format: Format of the scan. "auto" uses the name of the file. If the name does not define the format of a .bin
+        file, the content does (`found_format`), as for a folder of scans.
 
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If the format is unknown, or the file is empty or malformed.
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
-    return read_points_and_lasers(Path(path), format=format)[0]
+    path = Path(path)
+    return read_points_and_lasers(path, format=found_format(path) if format == "auto" else format)[0]
 
 
 def read_points_and_lasers(
     path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti"
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """Return the points as `read_scan` does, and the laser number of each point.
+    """Return the points of a scan of a recording in metres, and the laser number of each point.
 
-    Raises what `read_scan` raises.
+    Raises what `read_scan` raises, except that `format` "auto" does not use the content.
 
     Arguments:
       path: File of the scan.

@@ -4,7 +4,7 @@
 - `sequences/08/labels/000000.label`: SemanticKITTI's labels, optional for each frame.
 - `sequences/08/times.txt`: timestamps in seconds, one line per frame (optional).
 - `sequences/08/poses.txt`: SemanticKITTI's poses. Their loops are also closed in height.
-- `poses/08.txt`: KITTI's ground truth. Its height drifts.
+- `poses/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
 
 Both pose files contain poses of the left camera. Positions are computed without `calib.txt`.
 """
@@ -50,13 +50,14 @@ def open_recording(
     Arguments:
       root: Folder of the dataset.
       name: Name of the sequence.
-      pose_source: Choice of the pose file, as in `read_trajectory`.
+      pose_source: Choice of the pose file, as in `read_trajectory`. With "auto", a sequence needs no poses. Without
+        them, `positions` is `None`.
       format: Format of the scans. With "auto", scans that do not fit KITTI's record but clearly fit another record are
         read as the other one (`unusual_record`).
       time_unit: Unit of times.txt (`times_of`).
 
     Raises:
-      FileNotFoundError: If the scans or the poses are missing.
+      FileNotFoundError: If the scans or the poses of the given `pose_source` are missing.
       ValueError: If a file is malformed, has too few rows, or a scan is not named by its row.
     """
     folder = root / "sequences" / name
@@ -64,7 +65,10 @@ def open_recording(
     if not scan_paths:
         raise FileNotFoundError(f"{folder / 'velodyne'}: expected scans (*.bin), found none")
     ids = tuple(path.stem for path in scan_paths)
-    positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source, time_unit=time_unit)
+    if pose_source == "auto" and _pose_file(root, name, pose_source) is None:
+        positions, times, pose_file = None, _times(root, name, time_unit), None
+    else:
+        positions, times, pose_file = read_trajectory(root, name, pose_source=pose_source, time_unit=time_unit)
     labels = {path.stem: path for path in files_in(folder / "labels", ".label")}
     reading, mounting = _read(scan_paths, format), _mounting(root)
     if mounting is not None:
@@ -72,7 +76,9 @@ def open_recording(
     return Recording(
         name=name,
         ids=ids,
-        positions=positions[rows_of(ids, rows=len(positions), path=root / pose_file)],
+        positions=None
+        if positions is None
+        else positions[rows_of(ids, rows=len(positions), path=root / str(pose_file))],
         times=None if times is None else times[rows_of(ids, rows=len(times), path=folder / "times.txt")],
         pose_source=pose_file,
         paths=scan_paths,
@@ -126,14 +132,26 @@ def read_trajectory(
       FileNotFoundError: If the pose file does not exist.
       ValueError: If a file is malformed.
     """
-    pose_files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
-    candidates = list(pose_files.values()) if pose_source == "auto" else [pose_files[pose_source]]
-    pose_file = next((file for file in candidates if (root / file).is_file()), None)
+    pose_file = _pose_file(root, name, pose_source)
     if pose_file is None:
-        raise FileNotFoundError(f"{root}: expected poses in {' or '.join(candidates)}, found none")
-    times_path = root / "sequences" / name / "times.txt"
-    times = read_times(times_path, unit=time_unit) if times_path.is_file() else None
-    return positions_from_camera(read_poses(root / pose_file)), times, pose_file
+        raise FileNotFoundError(f"{root}: expected poses in {' or '.join(_pose_files(name, pose_source))}, found none")
+    return positions_from_camera(read_poses(root / pose_file)), _times(root, name, time_unit), pose_file
+
+
+def _pose_files(name: str, pose_source: PoseChoice) -> list[str]:
+    files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
+    return list(files.values()) if pose_source == "auto" else [files[pose_source]]
+
+
+def _pose_file(root: Path, name: str, pose_source: PoseChoice) -> str | None:
+    """First existing pose file, or None."""
+    return next((file for file in _pose_files(name, pose_source) if (root / file).is_file()), None)
+
+
+def _times(root: Path, name: str, unit: TimeUnit) -> Float[np.ndarray, " m"] | None:
+    """Times of all frames in seconds, or None if the file does not exist."""
+    path = root / "sequences" / name / "times.txt"
+    return read_times(path, unit=unit) if path.is_file() else None
 
 
 READER = Reader(

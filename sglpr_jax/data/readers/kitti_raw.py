@@ -24,6 +24,7 @@ from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0
 OXTS_COLUMNS = 30
+POLE_DEG = 90.0
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -39,7 +40,7 @@ def open_recording(root: Path, name: str) -> Recording:
 
     Raises:
       FileNotFoundError: If there are no scans.
-      ValueError: If the timestamps or GPS positions are malformed.
+      ValueError: If the timestamps or GPS positions are malformed or invalid.
     """
     folder = next(folder for folder in _drives(root) if folder.name == name)
     paths = files_in(folder / "velodyne_points" / "data", ".bin")
@@ -69,8 +70,16 @@ def _drives(root: Path) -> tuple[Path, ...]:
 
 def _positions(files: list[Path]) -> Float[np.ndarray, "n 3"]:
     """Positions relative to the first GPS position, in metres east, north and up."""
-    numbers = [numbers_of(file.read_text().split(), columns=OXTS_COLUMNS, where=str(file)) for file in files]
+    texts = (file.read_text(errors="replace") for file in files)
+    numbers = [
+        numbers_of(text.split(), columns=OXTS_COLUMNS, where=str(file)) for file, text in zip(files, texts, strict=True)
+    ]
     latitude, longitude, altitude = np.array(numbers)[:, :3].T
+    wrong = np.flatnonzero(np.abs(latitude) >= POLE_DEG)
+    if wrong.size:
+        raise ValueError(
+            f"{files[wrong[0]]}: expected a latitude below {POLE_DEG:g} degrees, found {latitude[wrong[0]]}"
+        )
     scale = math.cos(math.radians(latitude[0]))
     east = scale * EARTH_M * np.radians(longitude)
     north = scale * EARTH_M * np.log(np.tan(np.radians(90 + latitude) / 2))

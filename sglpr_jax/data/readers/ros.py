@@ -1,4 +1,4 @@
-"""Reader of ROS bags: a .bag, an .mcap, a ROS 2 folder (metadata.yaml), or a folder of .bag or .mcap files.
+"""Reader of ROS bags: a .bag, an .mcap, a .db3, a ROS 2 folder (metadata.yaml), or a folder of bags.
 
 Each point cloud topic is a recording. A single recording has the name of the bag. If the bag has several topics, each
 recording has the name of its topic, with _ instead of /. Bags of a folder that follow each other are parts of a drive.
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.formats.ros_bag import RosBag
+from sglpr_jax.data.formats.ros_bag import COMPRESSED, METADATA, RosBag
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform
 from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.formats.trajectory import check_height, check_order
@@ -94,11 +94,12 @@ def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
 
 def bag_files(root: Path) -> tuple[Path, ...]:
     """Return the paths that rosbags opens together, or an empty tuple if `root` is not a bag."""
+    endings = (*ENDINGS, *COMPRESSED)
     if root.is_file():
-        return (root,) if root.suffix in ENDINGS else ()
-    if (root / "metadata.yaml").is_file():
+        return (root,) if root.name.endswith(endings) else ()
+    if (root / METADATA).is_file():
         return (root,)
-    return files_in(root, ".bag") or files_in(root, ".mcap")
+    return next((paths for ending in endings if (paths := files_in(root, ending))), ())
 
 
 def _recordings(root: Path) -> dict[str, tuple[RosBag, str]]:

@@ -93,6 +93,8 @@ def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int6
         where = f"{path}, line {number + 1}: expected a time and {columns - 1} finite numbers"
         if len(words) != columns:
             raise ValueError(f"{where}, found {len(words)} words")
+        if "_" in line or not line.isascii():  # Python parses 1_0 as 10
+            raise ValueError(f"{where}, found {line[:60]!r}")
         try:
             whole, _, fraction = words[0].partition(".")
             times.append(int(whole) if not fraction.strip("0") else round(float(words[0])))

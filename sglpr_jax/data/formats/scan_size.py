@@ -1,0 +1,34 @@
+"""Bounds of the size of a scan. Headers may declare any size, so readers check it before they allocate memory."""
+
+from pathlib import Path
+
+MOST_POINTS = 1 << 24
+"""Maximum number of points of a scan. A LiDAR of 128 beams returns about 2**18 points a turn."""
+MOST_BYTES = 32 * MOST_POINTS
+"""Maximum size of a scan in bytes, not compressed."""
+
+
+def check_points(points: int, *, bytes_each: int = 1) -> None:
+    """Raise ValueError if a header declares no points, or more points or bytes than a scan has.
+
+    Arguments:
+      points: Declared number of points.
+      bytes_each: Declared size of a point, in bytes.
+    """
+    if points < 1:
+        raise ValueError(f"expected at least one point, found {points or 'none'}")
+    if points > MOST_POINTS:
+        raise ValueError(f"expected a scan of at most {MOST_POINTS} points, found {points}")
+    check_bytes(points * bytes_each)
+
+
+def check_bytes(size: int) -> None:
+    """Raise ValueError if the declared size of a scan in bytes exceeds `MOST_BYTES`."""
+    if size > MOST_BYTES:
+        raise ValueError(f"expected a scan of at most {MOST_BYTES} bytes, found {size}")
+
+
+def read_content(path: Path) -> bytes:
+    """Return the content of a scan file. Raises ValueError if the file exceeds `MOST_BYTES`."""
+    check_bytes(path.stat().st_size)
+    return path.read_bytes()
