@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.files import in_short
+from sglpr_jax.fields import Size
+from sglpr_jax.files import in_short, parse_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index_rows import (
     MOST,
@@ -21,14 +22,18 @@ from sglpr_jax.retrieval.index_rows import (
     check_asked,
     check_weights,
     checked_rows,
+    given_flags,
     nearest_of,
     new_places,
     places_of,
 )
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
+from sglpr_jax.schema import check_about
 
 FORMAT = "sglpr-jax fleet index 1"
 """Format in every table."""
+ABOUT = {"width": Size, "weights_hash": str}
+"""JSON values in the metadata of every table."""
 TABLE = "places"
 SPARE = 16
 """Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
@@ -129,6 +134,7 @@ class FleetIndex:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
+        exclude = given_flags(exclude)
         if exclude is not None or not 1 <= k <= MOST:
             check_asked(k, exclude, places=len(self) if exclude is None else min(len(self), exclude.size))
         rows = np.full((len(queries), k), -1)
@@ -173,17 +179,16 @@ class FleetIndex:
         return pyarrow.table({**rows, **stored}).replace_schema_metadata({"about": json.dumps(about)})
 
     def _check_about(self, weights_hash: str | None) -> None:
-        """Reads the metadata of the table. Raises ValueError if they contradict the arguments."""
+        """Reads the metadata and columns of the table. Raises ValueError if they are invalid or contradict the
+        arguments."""
+        text = (self.table.schema.metadata or {}).get(b"about", b"null")
+        about = parse_json(text, source=f"{self.place}, `about`")
         try:
-            about = json.loads((self.table.schema.metadata or {}).get(b"about", b"{}"))
-        except ValueError:
-            about = {}
-        if about.get("format") != FORMAT:
-            raise ValueError(f"{self.place}: expected format {FORMAT!r}, found {about.get('format')!r}")
-        if about["width"] != self.width:
-            raise ValueError(f"{self.place}: expected descriptors of {self.width} numbers, found {about['width']}")
-        try:
+            check_about(about, ABOUT, format=FORMAT)
+            if about["width"] != self.width:
+                raise ValueError(f"expected descriptors of {self.width} numbers, found {about['width']}")
             check_weights(about["weights_hash"], weights_hash)
+            _check_types({field.name: str(field.type) for field in self.table.schema}, self.width)
         except ValueError as error:
             raise ValueError(f"{self.place}: {error}") from error
         self.weights_hash = about["weights_hash"]
@@ -200,6 +205,20 @@ class FleetIndex:
 
 _STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"}
 """Table columns for the columns of `NewPlaces`."""
+
+
+def _check_types(found: dict[str, str], width: int) -> None:
+    """Raises ValueError if a column is missing or has another type. Columns of other names are ignored."""
+    needed = {"row": ("int64",), "id": ("string",), "descriptor": _vector_types("float", width)}
+    known = needed | {"time": ("double",), "position": _vector_types("double", 3)}
+    for name, types in known.items():
+        if found.get(name, types[0] if name not in needed else "none") not in types:
+            raise ValueError(f"expected a column {name} of {types[0]}, found {found.get(name, 'none')}")
+
+
+def _vector_types(kind: str, size: int) -> tuple[str, ...]:
+    """Names of Arrow's type of a vector. Its versions name the item differently."""
+    return tuple(f"fixed_size_list<{item}: {kind}>[{size}]" for item in ("item", "element"))
 
 
 def _without(exclude: Bool[np.ndarray, " n"]) -> str:
