@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from sglpr_jax.fields import Size
 from sglpr_jax.files import in_short, parse_json
@@ -93,11 +94,11 @@ class FleetIndex:
 
     def add(
         self,
-        descriptors: Float[np.ndarray, "*n d"],
+        descriptors: ArrayLike,
         *,
         ids: Sequence[str] | str | None = None,
-        times: Float[np.ndarray, " n"] | float | None = None,
-        positions: Float[np.ndarray, "*n 3"] | None = None,
+        times: ArrayLike | float | None = None,
+        positions: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> None:
         """Add places like `Index.add`, atomically. Adding many places at once is faster than one by one."""
@@ -120,10 +121,10 @@ class FleetIndex:
 
     def query(
         self,
-        descriptors: Float[np.ndarray, "*q d"],
+        descriptors: ArrayLike,
         k: int = 1,
         *,
-        exclude: Bool[np.ndarray, " n"] | None = None,
+        exclude: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> Found:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d), like `Index.query`.
@@ -134,12 +135,12 @@ class FleetIndex:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
-        exclude = given_flags(exclude)
-        if exclude is not None or not 1 <= k <= MOST:
-            check_asked(k, exclude, places=len(self) if exclude is None else min(len(self), exclude.size))
+        excluded = given_flags(exclude)
+        if excluded is not None or not 1 <= k <= MOST:
+            check_asked(k, excluded, places=len(self) if excluded is None else min(len(self), excluded.size))
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
-        where = "" if exclude is None else _without(exclude)
+        where = "" if excluded is None else _without(excluded)
         for i, query in enumerate(queries if self.table is not None else ()):
             near, vectors = self._candidates(query, k + SPARE, where)
             found, apart = nearest_of(query, vectors, near, k)

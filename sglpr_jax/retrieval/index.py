@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import safetensors
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.fields import Size
@@ -103,11 +104,11 @@ class Index:
 
     def add(
         self,
-        descriptors: Float[np.ndarray, "*n d"],
+        descriptors: ArrayLike,
         *,
         ids: Sequence[str] | str | None = None,
-        times: Float[np.ndarray, " n"] | float | None = None,
-        positions: Float[np.ndarray, "*n 3"] | None = None,
+        times: ArrayLike | float | None = None,
+        positions: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> None:
         """Add one place, or several in order.
@@ -138,18 +139,18 @@ class Index:
 
     def query(
         self,
-        descriptors: Float[np.ndarray, "*q d"],
+        descriptors: ArrayLike,
         k: int = 1,
         *,
-        exclude: Bool[np.ndarray, " n"] | None = None,
+        exclude: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> Found:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d).
 
         Arguments:
-          descriptors: Descriptors to search for.
+          descriptors: One descriptor (d,) or several (q, d).
           k: Number of places for each descriptor.
-          exclude: Whether each place is excluded (see `recent`).
+          exclude: Flag of each place, whether it is excluded (see `recent`).
           weights_hash: Hash of the weights that made the descriptors. None skips the check.
 
         Returns:
@@ -161,9 +162,9 @@ class Index:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
-        exclude = given_flags(exclude)
-        check_asked(k, exclude, places=len(self))
-        allowed = np.ones(len(self), bool) if exclude is None else ~exclude
+        excluded = given_flags(exclude)
+        check_asked(k, excluded, places=len(self))
+        allowed = np.ones(len(self), bool) if excluded is None else ~excluded
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         there = min(k, int(allowed.sum()))
