@@ -230,8 +230,9 @@ def fake_finder(seed: int = 0, frames: int = 5) -> CandidateFinder:
 
 def fake_candidates(seed: int = 0) -> list[Candidate]:
     draw = np.random.default_rng(seed)
-    alignment = Alignment(*draw.normal(size=3).tolist(), np.eye(3), 0.5, 0.4)
-    return [Candidate(4, 1, alignment, Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields)).tolist())))]
+    x, y, yaw = map(np.asarray, draw.normal(size=3))
+    evidence = Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields))))
+    return [Candidate(4, 1, Alignment(x, y, yaw, np.eye(3), np.array(0.5), np.array(0.4)), evidence)]
 
 
 def recalled(folder: Path, wanted: dict) -> list:
