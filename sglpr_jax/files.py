@@ -27,6 +27,10 @@ ABANDONED_S = 3600
 """Age of unchanged temporary files, in seconds, after which they are considered left by a killed process."""
 
 
+_HIDDEN = re.compile(r"\.[0-9a-f]{32}\.tmp$")
+"""End of the names of temporary files."""
+
+
 class WriteError(OSError):
     """A file cannot be written. The message names it."""
 
@@ -116,9 +120,12 @@ def _locked_by_file(folder: Path, busy: str) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file completely or not at all. Raises WriteError if it cannot be written."""
+    """Write a text file in UTF-8, completely or not at all. Raises WriteError if it cannot be written.
+
+    Names of files that are not UTF-8 are escaped.
+    """
     with replacing(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -200,9 +207,9 @@ def writing(path: Path, *others: Path) -> Iterator[None]:
         raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def half_written(folder: Path, name: str = "*") -> list[Path]:
-    """Return the hidden paths of `replacing` for `name` that killed processes left in `folder` and below."""
-    return list(folder.rglob(f".{name}.*.tmp"))
+def half_written(folder: Path) -> list[Path]:
+    """Return the hidden paths of `replacing` that killed processes left in `folder` and below."""
+    return list(folder.rglob(".*.tmp"))
 
 
 def remove_half_written(folder: Path) -> None:
@@ -219,10 +226,15 @@ def _hidden(path: Path) -> Path:
 def _sweep(folder: Path) -> None:
     """Removes the hidden paths that killed processes left in a folder, once in each process."""
     for left in folder.glob(".*.tmp"):
-        with contextlib.suppress(FileNotFoundError):  # another process may also remove it
-            newest = max(path.stat().st_mtime for path in (left, *left.rglob("*")))
-            if re.search(r"\.[0-9a-f]{32}\.tmp$", left.name) and time.time() - newest > ABANDONED_S:
+        with contextlib.suppress(OSError):  # another process may also remove it, or it may be unreadable
+            if _HIDDEN.search(left.name) and time.time() - _newest(left) > ABANDONED_S:
                 _remove(left)
+
+
+def _newest(path: Path) -> float:
+    """Time of the last change of a path and of everything below it. Links are not followed."""
+    inside = () if path.is_symlink() else path.rglob("*")
+    return max(one.lstat().st_mtime for one in (path, *inside))
 
 
 def _put(new: Path, path: Path, *, keep: bool) -> None:
@@ -242,7 +254,7 @@ def _put(new: Path, path: Path, *, keep: bool) -> None:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         with contextlib.suppress(OSError):  # after success it does not exist; its parent may not be a folder

@@ -21,6 +21,7 @@ from sglpr_jax.files import (
     remove_half_written,
     replacing,
     write_json,
+    write_text,
     writing,
 )
 
@@ -147,9 +148,32 @@ def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     (tmp_path / "run" / "test").mkdir()
     for name in (".config.json.2.tmp", "test/.a.png.3.tmp", "test/a.png"):
         (tmp_path / "run" / name).write_text("")
-    assert [path.name for path in half_written(tmp_path, "a.png")] == [".a.png.3.tmp"]
+    assert [path.name for path in half_written(tmp_path / "run" / "test")] == [".a.png.3.tmp"]
     remove_half_written(tmp_path)
     assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]
+
+
+@pytest.mark.parametrize("name", [".x.tmp", f".x.{32 * 'a'}.tmp"])
+def test_a_link_to_itself_does_not_stop_the_writing_in_its_folder(tmp_path, name):
+    (tmp_path / name).symlink_to(name)
+    write_text(tmp_path / "t.txt", "x")
+    assert (tmp_path / "t.txt").read_text() == "x"
+
+
+def test_an_old_link_with_the_name_of_a_temporary_file_goes_and_what_it_leads_to_stays(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a").write_text("kept")
+    link = tmp_path / "out" / f".x.{32 * 'a'}.tmp"
+    link.parent.mkdir()
+    link.symlink_to(tmp_path / "mine")
+    os.utime(link, (0, 0), follow_symlinks=False)
+    write_text(tmp_path / "out" / "t.txt", "x")
+    assert names(tmp_path / "out") == ["t.txt"] and (tmp_path / "mine" / "a").read_text() == "kept"
+
+
+def test_a_name_that_is_not_utf_8_is_written_escaped(tmp_path):
+    write_text(tmp_path / "t.txt", "Zürich n\udcff")
+    assert (tmp_path / "t.txt").read_text(encoding="utf-8") == "Zürich n\\udcff"
 
 
 def test_json_comes_back(tmp_path):

@@ -45,6 +45,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
     from sglpr_jax.files import write_json
     from sglpr_jax.models.weights_file import load
+    from sglpr_jax.names import file_name
     from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
 
     recording, least = command.source.open(command.data), command.min_confidence
@@ -56,7 +57,7 @@ def segment_recording(command: SegmentCommand) -> Path:
     confusion = np.zeros((classes, classes), np.int64)
     with progress_bar(f"segment {recording.name}", len(recording)) as show:
         for row, record, found in semantic_maps(params, recording, min_confidence=least, on_progress=show):
-            path = command.out / f"{recording.ids[row]}.png"
+            path = command.out / f"{file_name(recording.ids[row])}.png"
             save_map(path, found, record, categories=categories)
             confusion += map_confusion(found, categories=categories)
             labelled, cells = labelled + found.seen.sum(), cells + (found.counts > 0).sum()

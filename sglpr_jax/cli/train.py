@@ -21,6 +21,7 @@ from sglpr_jax.cli.runtime import (
 )
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
 from sglpr_jax.methods.names import BESIDE, BesideName
+from sglpr_jax.names import file_name
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.presets import load_preset, preset_names
 
@@ -126,7 +127,7 @@ def train_and_test(command: TrainCommand, *, go_on: str = GO_ON) -> Path:
 
 def run_folder(command: TrainCommand) -> Path:
     """Return the folder of the run."""
-    return command.out or Path("runs") / f"{Path(command.preset).stem}-{command.seq}"
+    return command.out or Path("runs") / f"{Path(command.preset).stem}-{file_name(command.seq)}"
 
 
 def settings(command: TrainCommand) -> dict[str, object]:

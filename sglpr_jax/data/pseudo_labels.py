@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.names import file_name
 
 
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:
@@ -18,7 +19,7 @@ def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Re
     Raises:
       FileNotFoundError: If `folder` has no label image for any recording.
     """
-    labelled = [_labelled(recording, folder / recording.name) for recording in recordings]
+    labelled = [_labelled(recording, folder / file_name(recording.name)) for recording in recordings]
     if not any(new is not old for new, old in zip(labelled, recordings, strict=True)):
         wanted = [each.name for each in recordings if each.has_images and not each.has_labels]
         raise FileNotFoundError(
@@ -32,5 +33,5 @@ def _labelled(recording: Recording, folder: Path) -> Recording:
     if not recording.has_images or recording.has_labels:
         return recording
     there = {path.stem: path for path in folder.glob("*.png")}
-    label_paths = tuple(there.get(image) for image in recording.ids)
+    label_paths = tuple(there.get(file_name(image)) for image in recording.ids)
     return dataclasses.replace(recording, label_paths=label_paths) if any(label_paths) else recording

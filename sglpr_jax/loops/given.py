@@ -12,7 +12,7 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.files import in_short
-from sglpr_jax.poses import are_rotations
+from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
 
 MOST_COLUMNS = 8
 """Arrays with 4 to this number of columns are points with intensity or more, not images, which are wider."""
@@ -85,8 +85,9 @@ def given_time(time: Any, *, unit: TimeUnit = "auto") -> float | None:
 
 
 def _are_poses(poses: Float[np.ndarray, "*n 4 4"]) -> Bool[np.ndarray, "*n"]:
-    """Whether each matrix is finite and contains a rotation."""
-    return np.asarray(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[..., :3, :3]))
+    """Whether each matrix is finite, contains a rotation, and has the last row 0 0 0 1."""
+    last = np.abs(poses[..., 3, :] - [0, 0, 0, 1]).max(-1, initial=0) < ROTATION_TOLERANCE
+    return np.asarray(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[..., :3, :3]) & last)
 
 
 def _numbers(values: Any, dtype: type, expected: str, *, by: str) -> np.ndarray:

@@ -19,7 +19,7 @@ from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Compare
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.pose_search import Peak, VerificationConfig, occupied, query_spectra, search_spectra
+from sglpr_jax.loops.pose_search import Peak, VerificationConfig, occupied, query_spectra, search_spectra, within_reach
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.rivals import RivalConfig, distance_share, rival_share
 from sglpr_jax.loops.transforms import inverse, transform
@@ -27,11 +27,17 @@ from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.upright import check_level, upright_from_lidar
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
+from sglpr_jax.poses import ROTATION_TOLERANCE
 from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.same_place import NEGATIVE_M
+from sglpr_jax.schema import Column, check_columns
 
-ARRAYS = ("images", "world_from_place", "mountings")
+ARRAYS = {
+    "images": Column("uint8", ("n", "h", "h")),
+    "world_from_place": Column("float64", ("n", 4, 4)),
+    "mountings": Column("float64", ("n", 4)),
+}
 """Arrays of a map's file in addition to the index."""
 RIVALS = 10
 """Maximum number of rivals of a query."""
@@ -159,6 +165,8 @@ class PlaceMap:
         finder = CandidateFinder(params)
         record = given_record(record, mounting=self.mounting() if len(self) else None)
         descriptor, image, mounting = finder.seen(record)
+        if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
+            raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
         exclude = np.full(len(self), finder.is_empty(image))
         found = self.index.query(descriptor, candidates, exclude=exclude, weights_hash=finder.index.weights_hash)
         rows, distances = (values[found.rows >= 0] for values in found)
@@ -189,11 +197,15 @@ class PlaceMap:
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
-        """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has only an index."""
+        """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
         index, more = Index.load_with(path, weights_hash=weights_hash)
         left_out = [name for name in ARRAYS if name not in more]
         if left_out:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
+        try:
+            _check_map(index, more)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
         return cls(index, *(more[name] for name in ARRAYS))
 
     def _names_of(self, other: "PlaceMap", new: list[int], drive: Mapping[str, Float[np.ndarray, "4 4"]]) -> list[str]:
@@ -244,6 +256,20 @@ class PlaceMap:
                 break
             chosen.append(int(left.argmin()))
         return np.array(chosen[1:], np.int64)
+
+
+def _check_map(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises ValueError if the content of a file is not that of a map."""
+    if index.distance != "l2":
+        raise ValueError(f"expected descriptors compared by l2, found {index.distance}")
+    check_columns(arrays, ARRAYS, n=len(index))
+    if arrays["images"].shape[1] % 2:
+        raise ValueError(f"expected images of an even number of cells, found {arrays['images'].shape[1:]}")
+    given_poses(arrays["world_from_place"], of="world_from_place")
+    for height, *up in np.unique(arrays["mountings"], axis=0).tolist():
+        Mounting(height, tuple(up))
+        if abs(np.linalg.norm(up) - 1) > ROTATION_TOLERANCE:
+            raise ValueError(f"expected up directions of length 1 in mountings, found {up}")
 
 
 def _shared(pairs: list[Relocated]) -> list[Relocated]:

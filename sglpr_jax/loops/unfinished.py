@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
@@ -26,15 +27,26 @@ from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import fingerprint
+from sglpr_jax.schema import Column, check_columns
 
 KIND = "sglpr-jax unfinished loops"
-FORMAT = f"{KIND} 3"
+FORMAT = f"{KIND} 4"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
 OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
 """Names of files of frames, and of temporary files of `files.replacing`."""
 ALIGNMENT_NUMBERS = 14
 """Numbers of an alignment: x, y, yaw, 9 of the covariance, correlation and second-peak ratio."""
+COLUMNS = {
+    "made_from": Column("uint8", (32,)),
+    "shown": Column("int64", ("seen",)),
+    "images": Column("uint8", ("seen", "h", "h")),
+    "pairs": Column("int64", ("candidates", 2)),
+    "alignments": Column("float64", ("candidates", ALIGNMENT_NUMBERS)),
+    "evidence": Column("float64", ("candidates", len(Evidence._fields)), finite=False),
+    "links": Column("float64", ("n", len(Peak._fields)), finite=False),
+}
+"""Arrays of a file of frames. NaN in the evidence is a missing value, and a row of NaN in the links a missing link."""
 FRAMES = 50
 """Number of frames in a file."""
 
@@ -43,7 +55,9 @@ def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray 
     """Settings that determine the content of a checkpoint, as JSON values. `given` are further arguments of the run."""
     found = {
         "format": FORMAT,
+        "name": recording.name,
         "recording": fingerprint(recording),
+        "scans": _sample(recording),
         "sensor": None if recording.mounting is None else dataclasses.asdict(recording.mounting),
         "times": _digest(recording.times),
         "weights": finder.index.weights_hash,
@@ -55,6 +69,15 @@ def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray 
     return json.loads(json.dumps(found))
 
 
+def _sample(recording: Recording) -> str:
+    """Hash the bytes of the first, the middle and the last scan file. Sizes and times of files may agree by chance."""
+    digest = hashlib.sha256()
+    for row in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
+        path = recording.paths[row]
+        digest.update(path.read_bytes() if path.is_file() else b"")
+    return digest.hexdigest()[:16]
+
+
 def _digest(values: np.ndarray | None) -> str | None:
     return None if values is None else hashlib.sha256(values.tobytes()).hexdigest()[:16]
 
@@ -64,6 +87,8 @@ class Unfinished:
     """Checkpoint directory of a search or a map."""
 
     folder: Path
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Settings that determine the content."""
     kept: int = 0
     """Number of stored frames that have been read or written."""
 
@@ -81,7 +106,7 @@ class Unfinished:
             )
             _empty(folder)
         write_json(folder / SETTINGS, wanted)
-        return cls(folder)
+        return cls(folder, wanted)
 
     def recall(
         self,
@@ -93,7 +118,7 @@ class Unfinished:
     ) -> None:
         """Call `add` with each stored frame and its comparisons.
 
-        Stops at the first file that is missing or damaged. With `missing=False`, it also stops at the first frame whose
+        Stops at the first file that is missing, damaged or of another recording. With `missing=False`, it also stops at the first frame whose
         scan could not be read.
 
         Arguments:
@@ -105,6 +130,7 @@ class Unfinished:
         while self._path.is_file():
             try:
                 frames, more = Index.load_with(self._path, weights_hash=finder.index.weights_hash)
+                self._check(frames, more, width=finder.index.width)
             except ValueError:
                 return
             shown, images = set(more["shown"].tolist()), iter(more["images"])
@@ -125,12 +151,32 @@ class Unfinished:
         frames.add(finder.index.descriptors[first:end])
         shown = sorted(set(range(first, end)) - set(finder.missing))
         images = [finder.images[row] for row in shown]
-        more = {"shown": np.array(shown, np.int64), "images": np.stack(images) if images else np.zeros(0, np.uint8)}
+        stacked = np.stack(images) if images else np.zeros((0, 0, 0), np.uint8)
+        more = {"made_from": self._made_from, "shown": np.array(shown, np.int64), "images": stacked}
         new = [one for one in candidates if one.query >= first]
         content = frames.to_bytes(more | columns(new, finder.links[first:end]))
         with replacing(self._path) as temporary:
             temporary.write_bytes(content)
         self.kept = end
+
+    def _check(self, frames: Index, more: dict[str, np.ndarray], *, width: int) -> None:
+        """Raises ValueError if the content of the next file is invalid or was made from something else."""
+        check_columns(more, COLUMNS, n=len(frames))
+        if not len(frames) or frames.width != width or not np.array_equal(more["made_from"], self._made_from):
+            raise ValueError("expected frames of this recording and these settings, found others")
+        first, end = self.kept, self.kept + len(frames)
+        query, match = more["pairs"].T
+        shown_rises = np.all(np.diff(more["shown"], prepend=first - 1, append=end) > 0)
+        if not shown_rises or np.any((query < first) | (query >= end) | (match < 0) | (match >= query)):
+            raise ValueError(f"expected frames {first} to {end - 1} and matches before them, found others")
+        if not np.all(np.isfinite(more["links"]).all(axis=1) | np.isnan(more["links"]).all(axis=1)):
+            raise ValueError("expected finite links, found others")
+
+    @property
+    def _made_from(self) -> UInt8[np.ndarray, "32"]:
+        """SHA-256 of the settings and of the number of the next frame."""
+        text = json.dumps([self.settings, self.kept], sort_keys=True)
+        return np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
 
     @property
     def _path(self) -> Path:

@@ -3,8 +3,9 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -22,8 +23,8 @@ WEIGHTS_FILE = "model.safetensors"
 CHECKSUM = "sha256"
 """Key in the header of the weights file for the `hash_of` the stored values."""
 CHECKED_FOR = "config_sha256"
-"""Key in the header for the checksum of the configuration. If it matches, the expected shapes need not be computed,
-which saves half a second."""
+"""Key in the header for the checksum of the configuration that the weights were saved with. If it matches, the expected
+shapes need not be computed, which saves half a second."""
 STORED = ("F32", "F16")
 """Data types of stored weights, with their safetensors names."""
 
@@ -56,7 +57,7 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
     values = {name: _halved(name, leaf) for name, leaf in values.items()} if half else values
     with replacing(folder) as new:
         new.mkdir()
-        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), CHECKED_FOR: _hash_of(params.config)})
+        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), CHECKED_FOR: _hash_of(dataclasses.asdict(params.config))})
         (new / WEIGHTS_FILE).write_bytes(content)  # save_file hides the OSError of a full disk
         (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
     return folder
@@ -73,7 +74,7 @@ def load(weights: Path | str) -> Params:
 
     Raises:
       FileNotFoundError: If neither exists, or if a file is missing.
-      ValueError: If a file is damaged, or if the weights do not belong to the configuration.
+      ValueError: If a file is damaged, or if the weights were saved with another configuration.
     """
     folder = weights_folder(weights)
     if (folder / "weights").is_dir():
@@ -83,24 +84,31 @@ def load(weights: Path | str) -> Params:
             raise FileNotFoundError(
                 f"{folder}: expected a folder with {CONFIG_FILE} and {WEIGHTS_FILE}, {name} is missing"
             )
-    config = config_from_dict(read_json(folder / CONFIG_FILE), source=folder / CONFIG_FILE)
-    values = _read_tensors(folder / WEIGHTS_FILE, config)
+    stored = read_json(folder / CONFIG_FILE)
+    config = config_from_dict(stored, source=folder / CONFIG_FILE)
+    known = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}  # fields added later are not in older files
+    values = _read_tensors(folder / WEIGHTS_FILE, config, known)
     return Params(as_tree({name: np.asarray(leaf, np.float32) for name, leaf in values.items()}), config)
 
 
-def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
-    """Reads the stored weights and checks their names, shapes, types, values and checksum."""
+def _read_tensors(path: Path, config: ModelConfig, known: Collection[str]) -> dict[str, np.ndarray]:
+    """Reads the stored weights and checks their names, shapes, types, values and checksums.
+
+    `known` are the checksums of the configuration.
+    """
     try:
         with safetensors.safe_open(path, framework="np") as file:
             about = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
             metadata = file.metadata() or {}
-            if metadata.get(CHECKED_FOR) != _hash_of(config):
+            if metadata.get(CHECKED_FOR) not in known:
                 _check_shapes({name: tuple(part.get_shape()) for name, part in about.items()}, config, source=path)
+                if CHECKED_FOR in metadata:  # files of earlier versions have none
+                    raise ValueError(f"{path}: expected the {CONFIG_FILE} that it was saved with, found a changed one")
             for name, part in about.items():
                 if part.get_dtype() not in STORED:
                     raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)}, found {part.get_dtype()}")
             values = {name: file.get_tensor(name) for name in about}
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, UnicodeDecodeError) as error:
         raise ValueError(
             f"{path}: expected a whole safetensors file, found a damaged one ({in_short(error)})"
         ) from error
@@ -112,8 +120,8 @@ def _read_tensors(path: Path, config: ModelConfig) -> dict[str, np.ndarray]:
     return values
 
 
-def _hash_of(config: ModelConfig) -> str:
-    return hashlib.sha256(json.dumps(dataclasses.asdict(config), sort_keys=True).encode()).hexdigest()
+def _hash_of(config: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
 def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, source: Path) -> None:

@@ -10,6 +10,7 @@ from sglpr_jax.data.views import view
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page.recording_pictures import semantic_picture
 from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.names import file_name
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL, NO_SEGMENTATION
 from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.retrieval.heat_maps import heat_maps
@@ -27,7 +28,7 @@ def precision_recall(results: Mapping[str, Mapping[str, Result]]) -> Pictures:
     for seq, of_method in results.items():
         curves = {method: result.curve for method, result in of_method.items() if result.curve is not None}
         if curves:
-            pictures[f"figure5-{seq}.png"] = figures.precision_recall(curves, title=seq)
+            pictures[f"figure5-{file_name(seq)}.png"] = figures.precision_recall(curves, title=seq)
     return pictures
 
 
@@ -37,7 +38,7 @@ def trajectories(runs: Runs, results: Mapping[str, Result]) -> Pictures:
     for seq, result in results.items():
         positions = runs.recording(seq).positions
         if result.decisions is not None and positions is not None:
-            pictures[f"figure6-{seq}.png"] = figures.trajectory(positions, result.decisions, title=seq)
+            pictures[f"figure6-{file_name(seq)}.png"] = figures.trajectory(positions, result.decisions, title=seq)
     return pictures
 
 
@@ -49,7 +50,7 @@ def semantic_maps(runs: Runs, seqs: Sequence[str]) -> Pictures:
         recording = runs.recording(seq)
         row = len(recording) // 2
         shown = semantic_picture(recording, runs.params(FULL, seq), row)
-        pictures[f"figure7-{seq}.png"] = figures.segmentation_panel(
+        pictures[f"figure7-{file_name(seq)}.png"] = figures.segmentation_panel(
             shown.counts,
             shown.truth,
             shown.predicted,
@@ -78,7 +79,7 @@ def feature_heat_maps(runs: Runs, seq: str, recordings: Sequence[Recording]) -> 
             if layer in HEAT_MAPS
         }
         title = f"{recording.name}, scan {recording.ids[row]}, without and with the segmentation branch"
-        pictures[f"figure8-{recording.name}.png"] = figures.heat_maps(image, maps, title=title)
+        pictures[f"figure8-{file_name(recording.name)}.png"] = figures.heat_maps(image, maps, title=title)
     return pictures
 
 

@@ -14,6 +14,7 @@ from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import handcrafted, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights_file import load
+from sglpr_jax.names import file_name
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
@@ -113,7 +114,7 @@ class Runs:
         corruption = ROTATION if rotated else CLEAN
         described_by = network(self.params(method, seq)) if method in VARIANTS else self._handcrafted(method, recording)
         return embed_or_reuse(
-            folder / "descriptors" / f"{recording.name}-{corruption.name}.npz",
+            folder / "descriptors" / f"{file_name(recording.name)}-{corruption.name}.npz",
             described_by,
             recording,
             corruption,
@@ -130,4 +131,4 @@ class Runs:
         return {"seq": seq, "data": str(self.data), "preset": self.preset, "pose_source": self.pose_source}
 
     def _folder(self, variant: str, seq: str) -> Path:
-        return self.folder / variant / seq
+        return self.folder / variant / file_name(seq)

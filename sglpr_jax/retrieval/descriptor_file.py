@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import json_in_short, parse_json, read_arrays, replacing
+from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.schema import Column, check_about, check_columns
 
 FORMAT = "sglpr-jax descriptors 2"
 """Format in every file. The number increases if older readers cannot read the new files."""
@@ -20,6 +22,12 @@ FORMAT_1 = "sglpr-jax descriptors 1"
 REQUIRED = ("about", "ids", "descriptors")
 ABOUT = {"sequence": str, "pose_source": str | None, "config": dict, "weights_hash": str, "distance": str}
 """Fields of `about` besides the format, and their types."""
+COLUMNS = {
+    "descriptors": Column("float32", ("n", "width")),
+    "positions": Column("float64", ("n", 3), optional=True),
+    "times": Column("float64", ("n",), optional=True),
+}
+"""Arrays of descriptor files and of indexes. Positions are in metres, z up, and times in seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +63,11 @@ class DescriptorFile:
         twice = next((name for name, times in Counter(self.ids).items() if times > 1), None)
         if twice is not None:
             raise ValueError(f"expected a unique id for each scan, found {twice!r} {self.ids.count(twice)} times")
-        _check("descriptors", self.descriptors, np.float32, (n, None))
+        arrays = {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+        check_columns(arrays, COLUMNS, n=n)
         if self.descriptors.shape[1] == 0:
             raise ValueError(f"expected descriptors with at least one number, found {self.descriptors.shape}")
-        if self.positions is not None:
-            _check("positions", self.positions, np.float64, (n, 3))
         if self.times is not None:
-            _check("times", self.times, np.float64, (n,))
             backwards = np.flatnonzero(np.diff(self.times) < 0)
             if backwards.size:
                 raise ValueError(f"expected times in ascending order, found an earlier time in row {backwards[0] + 1}")
@@ -123,23 +129,6 @@ class DescriptorFile:
             raise ValueError(f"{path}: {error}") from error
 
 
-def _check(name: str, array: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
-    """Raises ValueError unless `array` is finite and has this type and shape (None: any length)."""
-    fits = len(array.shape) == len(shape) and all(
-        want is None or want == size for want, size in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype != dtype or not fits:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(
-            f"expected {name} as {np.dtype(dtype)} ({wanted}) for {shape[0]} ids, found {array.dtype} {array.shape}"
-        )
-    broken = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
-    if broken.size:
-        raise ValueError(
-            f"expected finite {name}, found NaN or infinity in {broken.size} rows, first in row {broken[0]}"
-        )
-
-
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
     """Raise ValueError unless the descriptors of two files can be compared: same method, model and weights.
 
@@ -170,16 +159,13 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
     if text.ndim != 0 or text.dtype.kind != "U":
         raise ValueError(f"{path}: expected JSON in `about`, found an array {text.dtype} {text.shape}")
     about = parse_json(str(text), source=f"{path}, `about`")
-    found = about.get("format") if isinstance(about, dict) else about
-    if found == FORMAT_1:
-        about = {"distance": "l2", **about}
-    elif found != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT!r}, found {found!r}")
-    if not set(ABOUT) <= set(about):
-        raise ValueError(f"{path}: expected {', '.join(f'`{name}`' for name in ABOUT)}, found {', '.join(about)}")
-    for name, kind in ABOUT.items():
-        if not isinstance(about[name], kind):
-            raise ValueError(f"{path}: expected `{name}` as {kind}, found {about[name]!r:.60}")
+    if isinstance(about, dict) and about.get("format") == FORMAT_1:
+        about = {"distance": "l2", **about, "format": FORMAT}
+    try:
+        check_about(about, ABOUT, format=FORMAT)
+        distance_function(about["distance"])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return about
 
 

@@ -62,5 +62,5 @@ def distance_function(name: str) -> DistanceFn:
     if name not in DISTANCES:
         near = difflib.get_close_matches(name, DISTANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        raise ValueError(f"expected a distance among {', '.join(DISTANCES)}, found {name!r}{hint}")
+        raise ValueError(f"expected a distance among {', '.join(DISTANCES)}, found {name!r:.60}{hint}")
     return DISTANCES[name]

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
-from sglpr_jax.files import in_short
+from sglpr_jax.fields import Size
+from sglpr_jax.files import in_short, parse_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index_rows import (
     MOST,
@@ -21,14 +23,18 @@ from sglpr_jax.retrieval.index_rows import (
     check_asked,
     check_weights,
     checked_rows,
+    given_flags,
     nearest_of,
     new_places,
     places_of,
 )
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, are_recent
+from sglpr_jax.schema import check_about
 
 FORMAT = "sglpr-jax fleet index 1"
 """Format in every table."""
+ABOUT = {"width": Size, "weights_hash": str}
+"""JSON values in the metadata of every table."""
 TABLE = "places"
 SPARE = 16
 """Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
@@ -88,11 +94,11 @@ class FleetIndex:
 
     def add(
         self,
-        descriptors: Float[np.ndarray, "*n d"],
+        descriptors: ArrayLike,
         *,
         ids: Sequence[str] | str | None = None,
-        times: Float[np.ndarray, " n"] | float | None = None,
-        positions: Float[np.ndarray, "*n 3"] | None = None,
+        times: ArrayLike | float | None = None,
+        positions: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> None:
         """Add places like `Index.add`, atomically. Adding many places at once is faster than one by one."""
@@ -115,10 +121,10 @@ class FleetIndex:
 
     def query(
         self,
-        descriptors: Float[np.ndarray, "*q d"],
+        descriptors: ArrayLike,
         k: int = 1,
         *,
-        exclude: Bool[np.ndarray, " n"] | None = None,
+        exclude: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> Found:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d), like `Index.query`.
@@ -129,11 +135,12 @@ class FleetIndex:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
-        if exclude is not None or not 1 <= k <= MOST:
-            check_asked(k, exclude, places=len(self) if exclude is None else min(len(self), exclude.size))
+        excluded = given_flags(exclude)
+        if excluded is not None or not 1 <= k <= MOST:
+            check_asked(k, excluded, places=len(self) if excluded is None else min(len(self), excluded.size))
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
-        where = "" if exclude is None else _without(exclude)
+        where = "" if excluded is None else _without(excluded)
         for i, query in enumerate(queries if self.table is not None else ()):
             near, vectors = self._candidates(query, k + SPARE, where)
             found, apart = nearest_of(query, vectors, near, k)
@@ -171,17 +178,16 @@ class FleetIndex:
         return pyarrow.table({**rows, **stored}).replace_schema_metadata({"about": json.dumps(about)})
 
     def _check_about(self, weights_hash: str | None) -> None:
-        """Reads the metadata of the table. Raises ValueError if they contradict the arguments."""
+        """Reads the metadata and columns of the table. Raises ValueError if they are invalid or contradict the
+        arguments."""
+        text = (self.table.schema.metadata or {}).get(b"about", b"null")
+        about = parse_json(text, source=f"{self.place}, `about`")
         try:
-            about = json.loads((self.table.schema.metadata or {}).get(b"about", b"{}"))
-        except ValueError:
-            about = {}
-        if about.get("format") != FORMAT:
-            raise ValueError(f"{self.place}: expected format {FORMAT!r}, found {about.get('format')!r}")
-        if about["width"] != self.width:
-            raise ValueError(f"{self.place}: expected descriptors of {self.width} numbers, found {about['width']}")
-        try:
+            check_about(about, ABOUT, format=FORMAT)
+            if about["width"] != self.width:
+                raise ValueError(f"expected descriptors of {self.width} numbers, found {about['width']}")
             check_weights(about["weights_hash"], weights_hash)
+            _check_types({field.name: str(field.type) for field in self.table.schema}, self.width)
         except ValueError as error:
             raise ValueError(f"{self.place}: {error}") from error
         self.weights_hash = about["weights_hash"]
@@ -198,6 +204,20 @@ class FleetIndex:
 
 _STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"}
 """Table columns for the columns of `NewPlaces`."""
+
+
+def _check_types(found: dict[str, str], width: int) -> None:
+    """Raises ValueError if a column is missing or has another type. Columns of other names are ignored."""
+    needed = {"row": ("int64",), "id": ("string",), "descriptor": _vector_types("float", width)}
+    known = needed | {"time": ("double",), "position": _vector_types("double", 3)}
+    for name, types in known.items():
+        if found.get(name, types[0] if name not in needed else "none") not in types:
+            raise ValueError(f"expected a column {name} of {types[0]}, found {found.get(name, 'none')}")
+
+
+def _vector_types(kind: str, size: int) -> tuple[str, ...]:
+    """Names of Arrow's type of a vector. Its versions name the item differently."""
+    return tuple(f"fixed_size_list<{item}: {kind}>[{size}]" for item in ("item", "element"))
 
 
 def _without(exclude: Bool[np.ndarray, " n"]) -> str:

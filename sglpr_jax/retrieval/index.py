@@ -14,25 +14,30 @@ from typing import Any
 import numpy as np
 import safetensors
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.files import replacing
-from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.fields import Size
+from sglpr_jax.files import in_short, parse_json, replacing
+from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.retrieval.index_rows import (
-    COLUMNS,
     Found,
     check_asked,
     check_weights,
     checked_rows,
+    given_flags,
     nearest_of,
     new_places,
     places_of,
 )
 from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, are_recent
+from sglpr_jax.schema import check_about, check_columns, check_texts
 
 FORMAT = "sglpr-jax index 1"
 """Format in every file."""
+ABOUT = {"width": Size, "weights_hash": str, "distance": str, "ids": list}
+"""JSON values in the header of every file."""
 FIRST_ROOM = 256
 """Number of rows that an empty index has capacity for."""
 SPARE = 16
@@ -99,11 +104,11 @@ class Index:
 
     def add(
         self,
-        descriptors: Float[np.ndarray, "*n d"],
+        descriptors: ArrayLike,
         *,
         ids: Sequence[str] | str | None = None,
-        times: Float[np.ndarray, " n"] | float | None = None,
-        positions: Float[np.ndarray, "*n 3"] | None = None,
+        times: ArrayLike | float | None = None,
+        positions: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> None:
         """Add one place, or several in order.
@@ -134,18 +139,18 @@ class Index:
 
     def query(
         self,
-        descriptors: Float[np.ndarray, "*q d"],
+        descriptors: ArrayLike,
         k: int = 1,
         *,
-        exclude: Bool[np.ndarray, " n"] | None = None,
+        exclude: ArrayLike | None = None,
         weights_hash: str | None = None,
     ) -> Found:
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d).
 
         Arguments:
-          descriptors: Descriptors to search for.
+          descriptors: One descriptor (d,) or several (q, d).
           k: Number of places for each descriptor.
-          exclude: Whether each place is excluded (see `recent`).
+          exclude: Flag of each place, whether it is excluded (see `recent`).
           weights_hash: Hash of the weights that made the descriptors. None skips the check.
 
         Returns:
@@ -157,8 +162,9 @@ class Index:
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
-        check_asked(k, exclude, places=len(self))
-        allowed = np.ones(len(self), bool) if exclude is None else ~exclude
+        excluded = given_flags(exclude)
+        check_asked(k, excluded, places=len(self))
+        allowed = np.ones(len(self), bool) if excluded is None else ~excluded
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         there = min(k, int(allowed.sum()))
@@ -199,7 +205,7 @@ class Index:
 
         Raises:
           FileNotFoundError: If the file does not exist.
-          ValueError: If the file is damaged, or the index has other weights. The message names the file.
+          ValueError: If the file is damaged or no index, or if the index has other weights. The message names the file.
         """
         return cls.load_with(path, weights_hash=weights_hash)[0]
 
@@ -262,19 +268,31 @@ def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Returns the JSON part and the arrays of an index. Raises ValueError if the checksum is wrong."""
+    """Returns the JSON part and the arrays of an index. Raises ValueError if the file is damaged or no index."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an index, found {'a folder' if path.is_dir() else 'none'}")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected an index, found an invalid safetensors file ({error})") from error
+    except OSError:
+        raise
+    except Exception as error:  # safetensors raises many types of errors, also for types that numpy lacks
+        raise ValueError(f"{path}: expected an index, found an invalid safetensors file ({in_short(error)})") from error
     text = metadata.get("about", "")
     if metadata.get("sha256") != _checksum(text, arrays):
         raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")
-    about = json.loads(text)
-    if about.get("format") != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT!r}, found {about.get('format')!r}")
+    about = parse_json(text, source=f"{path}, `about`")
+    try:
+        _check_index(about, arrays)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return about, arrays
+
+
+def _check_index(about: Any, arrays: dict[str, np.ndarray]) -> None:
+    """Raises ValueError if the content is not that of an index."""
+    check_about(about, ABOUT, format=FORMAT)
+    check_texts(about["ids"], name="ids")
+    distance_function(about["distance"])
+    check_columns(arrays, COLUMNS, n=len(about["ids"]), width=about["width"])

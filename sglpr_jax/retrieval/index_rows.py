@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sglpr_jax.files import in_short
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
-COLUMNS = ("descriptors", "times", "positions")
 MOST = 2**20
 """Maximum number of answers to a query, unless an index has more places."""
 
@@ -86,8 +86,21 @@ def places_of(file: DescriptorFile, *, distance: str) -> dict[str, Any]:
 
 def checked_rows(descriptors: Any, width: int) -> Float[np.ndarray, "n d"]:
     """Return one descriptor or several as float32 rows. Raises ValueError for a wrong width, NaN or infinity."""
-    rows = np.atleast_2d(np.asarray(descriptors, np.float32))
+    try:
+        rows = np.atleast_2d(np.asarray(descriptors, np.float32))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected descriptors of {width} numbers, found others ({in_short(error)})") from error
     return _finite("descriptors", rows, (len(rows), width)).astype(np.float32)
+
+
+def given_flags(exclude: Any) -> Bool[np.ndarray, " n"] | None:
+    """Convert the flags of excluded places to an array. Raises ValueError if they are not booleans."""
+    if exclude is None:
+        return None
+    flags = np.asarray(exclude)
+    if flags.dtype != bool and flags.size:
+        raise ValueError(f"expected flags (True or False) of places to exclude, found {flags.dtype}")
+    return flags.astype(bool)
 
 
 def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, places: int) -> None:

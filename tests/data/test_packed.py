@@ -172,14 +172,44 @@ def test_two_that_pack_at_once_end_with_one_pack(recording, tmp_path):
 
 
 def test_what_a_killed_process_left_is_removed_once_it_is_old(recording, tmp_path):
-    packed(recording, tmp_path / "cache")
-    (name,) = packs(tmp_path / "cache")
-    (tmp_path / "cache" / name).rename(tmp_path / "cache" / f".{name}.old.tmp")
-    (tmp_path / "cache" / f".{name}.new.tmp").mkdir()
-    for path in [*(tmp_path / "cache" / f".{name}.old.tmp").iterdir(), tmp_path / "cache" / f".{name}.old.tmp"]:
+    old, new = (tmp_path / f".08-x.{32 * letter}.tmp" for letter in "ab")
+    for folder in (old, new):
+        folder.mkdir()
+        (folder / "points.bin").write_bytes(b"half")
+    for path in (old / "points.bin", old):
         os.utime(path, (0, 0))
+    packed(recording, tmp_path)
+    assert sorted(packs(tmp_path))[0] == new.name and not old.exists()
+
+
+@pytest.mark.parametrize("name", ["../../escaped", "/escaped", "a/b", "x" * 5000])
+def test_the_pack_of_a_recording_of_any_name_lies_in_the_folder_of_packs(recording, tmp_path, name):
+    cache = tmp_path / "out" / "a" / "cache"
+    found = packed(dataclasses.replace(recording, name=name), cache)
+    assert found.name == name and [path.name for path in cache.parents[1].iterdir()] == ["a"]
+    assert len(list(cache.iterdir())) == 1 and next(cache.iterdir()).joinpath("pack.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda arrays: arrays.update({"../points": arrays.pop("points")}),
+        lambda arrays: arrays.pop("points"),
+        lambda arrays: arrays["points"].update(dtype="<i4"),
+        lambda arrays: arrays["points"].update(row=[1]),
+        lambda arrays: arrays["labels"].update(dtype="<i2"),
+        lambda arrays: arrays["points"].update(offsets=[0, arrays["points"]["offsets"][-1]], checksums=None),
+        lambda arrays: arrays.update(points=[1]),
+    ],
+)
+def test_a_pack_of_another_program_is_refused(recording, tmp_path, change):
     packed(recording, tmp_path / "cache")
-    assert packs(tmp_path / "cache") == [f".{name}.new.tmp", name]
+    (path,) = (tmp_path / "cache").rglob("pack.json")
+    about = json.loads(path.read_text())
+    change(about["arrays"])
+    path.write_text(json.dumps(about))
+    with pytest.raises(ValueError, match=r"cache/08-.*: expected a packed recording, found a damaged one"):
+        packed(recording, tmp_path / "cache")
 
 
 @pytest.mark.parametrize("file", ["points.bin", "pack.json"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -203,3 +204,46 @@ def test_scans_that_stand_still_are_one_place_and_what_does_not_fit_is_refused(f
         places.merged(other)
     with pytest.raises(ValueError, match="expected descriptors of the weights"):
         other.relocate(params, recording.record(0))
+
+
+def small_map(path: Path, *, distance: str = "l2", **change) -> Path:
+    """Write a map of three places, without a network, with a right checksum whatever its content."""
+    index = Index.empty(4, weights_hash="w", distance=distance)
+    index.add(np.eye(3, 4), ids=["a/0", "a/1", "a/2"], positions=POSES[:, :3, 3])
+    arrays = {"images": np.zeros((3, 8, 8), np.uint8), "world_from_place": POSES, "mountings": LEVEL}
+    path.write_bytes(index.to_bytes(arrays | change))
+    return path
+
+
+def changed(array: np.ndarray, where: tuple, value: float) -> np.ndarray:
+    array = array.copy()
+    array[where] = value
+    return array
+
+
+POSES = np.tile(np.eye(4), (3, 1, 1))
+LEVEL = np.tile([1.73, 0, 0, 1], (3, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"world_from_place": changed(POSES, (1, 0, 3), np.nan)}, "expected finite world_from_place, .* first in row 1"),
+        ({"world_from_place": 2 * POSES}, r"expected world_from_place \(n, 4, 4\), with rotations"),
+        ({"world_from_place": changed(POSES, (2, 3, 0), 5)}, r"expected world_from_place .* in row 2"),
+        ({"world_from_place": POSES.astype(np.float32)}, "expected world_from_place as float64"),
+        ({"world_from_place": POSES[:2]}, "expected world_from_place as float64"),
+        ({"images": np.zeros((3, 8, 6), np.uint8)}, r"expected images as uint8 \(3, 8, 8\), found uint8 \(3, 8, 6\)"),
+        ({"images": np.zeros((3, 7, 7), np.uint8)}, "expected images of an even number of cells"),
+        ({"images": np.zeros((2, 8, 8), np.uint8)}, "expected images as uint8"),
+        ({"images": np.zeros((3, 8, 8))}, "expected images as uint8"),
+        ({"mountings": changed(LEVEL, (0, 0), 1000)}, "expected the sensor's height over the ground"),
+        ({"mountings": changed(LEVEL, (0, 3), 2)}, "expected up directions of length 1"),
+        ({"mountings": LEVEL[:, :3]}, "expected mountings as float64"),
+        ({"distance": "cosine"}, "expected descriptors compared by l2, found cosine"),
+    ],
+)
+def test_a_map_of_another_program_is_refused_though_its_checksum_is_right(tmp_path, change, message):
+    assert len(PlaceMap.load(small_map(tmp_path / "good.safetensors"))) == 3
+    with pytest.raises(ValueError, match=rf"town\.safetensors: {message}"):
+        PlaceMap.load(small_map(tmp_path / "town.safetensors", **change))

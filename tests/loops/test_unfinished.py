@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,14 @@ import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find, joint, unfinished
-from sglpr_jax.loops.candidates import CandidateConfig
+from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder
 from sglpr_jax.loops.detector import DetectorConfig
 from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.probability import Curve, LoopModel
+from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.registration import Registration
+from sglpr_jax.loops.verification import Alignment
+from sglpr_jax.retrieval.index import Index
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
@@ -206,6 +210,124 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     found = find_loops(read, params, **options)
     assert found.whole and all(loop.overlap == 0.9 for loop in found.loops)
     assert len(asked) == 2 * len(found.loops)  # for their registration: no scan was looked at again
+
+
+def finder_of(**stored) -> CandidateFinder:
+    """A finder without a network."""
+    finder = object.__new__(CandidateFinder)
+    vars(finder).update(stored)
+    return finder
+
+
+def fake_finder(seed: int = 0, frames: int = 5) -> CandidateFinder:
+    """What a finder stores of some frames, drawn at random; the second frame has no scan."""
+    draw, index = np.random.default_rng(seed), Index.empty(4, weights_hash="w")
+    index.add(draw.normal(size=(frames, 4)))
+    images = list(draw.integers(0, 255, (frames, 6, 6), np.uint8))
+    links = [None, *(Peak(*draw.normal(size=6)) for _ in range(frames - 1))]
+    return finder_of(index=index, images=images, missing=[1], links=links)
+
+
+def fake_candidates(seed: int = 0) -> list[Candidate]:
+    draw = np.random.default_rng(seed)
+    x, y, yaw = map(np.asarray, draw.normal(size=3))
+    evidence = Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields))))
+    return [Candidate(4, 1, Alignment(x, y, yaw, np.eye(3), np.array(0.5), np.array(0.4)), evidence)]
+
+
+def recalled(folder: Path, wanted: dict) -> list:
+    """The frames that a checkpoint directory gives back."""
+    finder, found = finder_of(index=Index.empty(4, weights_hash="w")), []
+
+    def add(seen, compared):
+        found.append((seen, compared))
+        finder.index.add(np.zeros(4) if seen is None else seen.descriptor)
+
+    kept = unfinished.Unfinished.opened(folder, wanted)
+    kept.recall(finder, None, add, missing=True)
+    return found
+
+
+WANTED = {"format": unfinished.FORMAT, "name": "08", "recording": "a"}
+
+
+def keep(folder: Path, wanted: dict, seed: int = 0) -> Path:
+    unfinished.Unfinished.opened(folder, wanted).keep(fake_finder(seed), fake_candidates(seed), all=True)
+    return folder / "000000.safetensors"
+
+
+def test_frames_come_back_as_they_were_kept(tmp_path):
+    keep(tmp_path, WANTED)
+    found, finder = recalled(tmp_path, WANTED), fake_finder()
+    assert [seen is None for seen, _ in found] == [False, True, False, False, False]
+    np.testing.assert_array_equal(found[4][0].image, finder.images[4])
+    np.testing.assert_array_equal(found[4][0].descriptor, finder.index.descriptors[4])
+    assert found[0][1].link is None and found[3][1].link == pytest.approx(finder.links[3])
+    assert [len(compared.candidates) for _, compared in found] == [0, 0, 0, 0, 1]
+
+
+def test_a_file_of_another_recording_or_of_other_frames_is_not_believed(tmp_path):
+    path = keep(tmp_path / "ours", WANTED)
+    other = keep(tmp_path / "theirs", {**WANTED, "recording": "b"}, seed=1)
+    ours = path.read_bytes()
+    path.write_bytes(other.read_bytes())
+    assert recalled(tmp_path / "ours", WANTED) == []
+    path.write_bytes(ours)
+    path.with_name("000005.safetensors").write_bytes(ours)
+    assert len(recalled(tmp_path / "ours", WANTED)) == 5, "the second file has the frames of the first"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shown": np.array([0, 2, 3, 9])},
+        {"shown": np.array([0, 0, 3, 4])},
+        {"shown": np.array([0.0, 2, 3, 4])},
+        {"images": np.zeros((3, 6, 6), np.uint8)},
+        {"images": np.zeros((4, 6, 5), np.uint8)},
+        {"pairs": np.array([[5, 1]])},
+        {"pairs": np.array([[4, 4]])},
+        {"pairs": np.array([[4, -1]])},
+        {"alignments": np.zeros((1, 13))},
+        {"alignments": np.full((1, 14), np.nan)},
+        {"alignments": np.zeros((2, 14))},
+        {"evidence": np.zeros((1, 1))},
+        {"links": np.zeros((4, 6))},
+        {"links": np.array([[np.nan, 0, 0, 0, 0, 0]] * 5)},
+        {"made_from": np.zeros(31, np.uint8)},
+        {"links": None},
+    ],
+)
+def test_content_that_cannot_be_is_not_believed_though_the_checksum_is_right(tmp_path, change):
+    path = keep(tmp_path, WANTED)
+    frames, more = Index.load_with(path)
+    changed = {name: values for name, values in (more | change).items() if values is not None}
+    path.write_bytes(frames.to_bytes(changed))
+    assert recalled(tmp_path, WANTED) == []
+
+
+def test_a_file_without_frames_or_with_frames_of_another_width_ends_the_recall(tmp_path):
+    path = keep(tmp_path, WANTED)
+    _, more = Index.load_with(path)
+    path.write_bytes(Index.empty(4, weights_hash="w").to_bytes(more | {"links": np.zeros((0, 6))}))
+    assert recalled(tmp_path, WANTED) == []
+    wide = Index.empty(5, weights_hash="w")
+    wide.add(np.zeros((5, 5)))
+    path.write_bytes(wide.to_bytes(more))
+    assert recalled(tmp_path, WANTED) == []
+
+
+def test_scans_of_another_drive_have_other_settings_though_sizes_and_times_agree(twice, params, tmp_path):
+    finder, paths = sglpr_jax.LoopDetector(params).finder, tuple(tmp_path / f"{name}.bin" for name in twice[0].ids)
+    recording = dataclasses.replace(twice[0], paths=paths)
+    found = []
+    for content in (b"aaaa", b"bbbb"):
+        for path in paths:
+            path.write_bytes(content)
+            os.utime(path, (1e9, 1e9))
+        found.append(unfinished.settings(recording, finder))
+    assert found[0]["recording"] == found[1]["recording"] and found[0] != found[1]
+    assert unfinished.settings(dataclasses.replace(recording, name="other"), finder) != found[1]
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):

@@ -16,7 +16,7 @@ from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.weights import as_tree, by_name, describing, for_places, graft, weight_shapes, weights_hash
+from sglpr_jax.models.weights import as_tree, by_name, describing, for_places, graft, hash_of, weight_shapes, weights_hash
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 
@@ -178,9 +178,31 @@ def test_what_was_checked_when_it_was_written_is_not_checked_again(params, tmp_p
     monkeypatch.setattr(weights_file, "weight_shapes", lambda config: asked.append(config) or weight_shapes(config))
     chex.assert_trees_all_equal(load(folder), params)
     assert asked == []
-    other = dataclasses.replace(params.config, blind_m=1.0)  # of the same weights
-    (folder / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(other)))
-    assert load(folder).config == other and asked == [other]
+    flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    safetensors.numpy.save_file(flat, folder / WEIGHTS_FILE)  # an earlier version wrote no checksums
+    assert load(folder).config == params.config and asked == [params.config]
+
+
+def test_a_digit_that_was_changed_in_the_configuration_is_noticed(params, tmp_path):
+    folder = save(params, tmp_path / "weights")
+    other = dataclasses.asdict(dataclasses.replace(params.config, blind_m=1.0))  # of the same weights
+    (folder / CONFIG_FILE).write_text(json.dumps(other))
+    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected the {CONFIG_FILE} that it was saved with"):
+        load(folder)
+
+
+def test_a_configuration_without_fields_that_were_added_later_is_that_of_its_weights(params, tmp_path):
+    folder = save(params, tmp_path / "weights")
+    older = dataclasses.asdict(params.config)
+    del older["head"]["means"]
+    flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    header = {"sha256": hash_of(flat), "config_sha256": weights_file._hash_of(older)}
+    safetensors.numpy.save_file(flat, folder / WEIGHTS_FILE, header)
+    (folder / CONFIG_FILE).write_text(json.dumps(older))
+    assert load(folder).config == params.config
+    (folder / CONFIG_FILE).write_text(json.dumps({**older, "blind_m": 1.0}))
+    with pytest.raises(ValueError, match="found a changed one"):
+        load(folder)
 
 
 def test_equal_weights_are_equal_files(params, tmp_path):

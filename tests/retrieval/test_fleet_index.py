@@ -1,5 +1,6 @@
 """The index on LanceDB answers as the one in memory does, comes back from its folder, and refuses the same things."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -80,6 +81,26 @@ def test_other_tables_and_broken_ones_are_refused(tmp_path):
     other._connection.create_table(TABLE, [{"x": 1}])
     with pytest.raises(ValueError, match=f"other: expected format '{FORMAT}', found None"):
         FleetIndex(tmp_path / "other", width=WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("about", "message"),
+    [
+        (b"nothing", "expected JSON, found invalid JSON"),
+        (b"[]", f"expected format '{FORMAT}'"),
+        (json.dumps({"format": FORMAT}).encode(), ".*found no `width`"),
+        (json.dumps({"format": FORMAT, "width": "8", "weights_hash": ""}).encode(), "`width`: expected a value of type"),
+        (json.dumps({"format": FORMAT, "width": 8, "weights_hash": None}).encode(), "`weights_hash`: expected a value"),
+        (json.dumps({"format": FORMAT, "width": 8, "weights_hash": ""}).encode(), "expected a column row of int64"),
+    ],
+)
+def test_a_table_of_another_program_is_refused(tmp_path, about, message):
+    import pyarrow
+
+    rows = pyarrow.table({"id": ["a"]}).replace_schema_metadata({"about": about})
+    FleetIndex(tmp_path, width=WIDTH)._connection.create_table(TABLE, rows)
+    with pytest.raises(ValueError, match=rf"{tmp_path}.*: {message}"):
+        FleetIndex(tmp_path, width=WIDTH)
 
 
 def test_without_the_extra_it_is_named(tmp_path, monkeypatch):

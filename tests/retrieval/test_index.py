@@ -1,12 +1,16 @@
 """The index answers as numpy does over all pairs, grows, and comes back from its file or says why not."""
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax import Index
+from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.files import WriteError
+from sglpr_jax.retrieval.index import FORMAT, _checksum
 
 from .places import WIDTH, add_places, draw, file_of
 
@@ -84,6 +88,52 @@ def test_a_flipped_byte_anywhere_is_noticed(tmp_path):
         Index.load(tmp_path / "elsewhere")
 
 
+def with_checksum(path, arrays=None, text=None, **about):
+    """Write a file whose checksum is right, whatever its content."""
+    arrays = {"descriptors": draw(3)} | (arrays or {})
+    valid = {"format": FORMAT, "width": WIDTH, "weights_hash": "", "distance": "l2", "ids": ["a", "b", "c"]}
+    said = {name: value for name, value in (valid | about).items() if value is not None}
+    text = json.dumps(said) if text is None else text
+    path.write_bytes(tensors_as_bytes(arrays, {"about": text, "sha256": _checksum(text, arrays)}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"text": "nothing"}, "expected JSON, found invalid JSON"),
+        ({"text": "[]"}, f"expected format '{FORMAT}', found "),
+        ({"format": "other 1"}, f"expected format '{FORMAT}', found 'other 1'"),
+        ({"width": None}, "found no `width`"),
+        ({"width": 0}, "`width`: expected a number from 1"),
+        ({"width": "8"}, "`width`: expected a value of type int"),
+        ({"width": 9}, r"expected descriptors as float32 \(3, 9\)"),
+        ({"weights_hash": 1}, "`weights_hash`: expected a value of type str"),
+        ({"distance": "nearness"}, "expected a distance among"),
+        ({"distance": ["l2"]}, "`distance`: expected a value of type str"),
+        ({"ids": "abc"}, "`ids`: expected a value of type list"),
+        ({"ids": ["a", "b", 3]}, "expected `ids` as a list of strings"),
+        ({"ids": ["a", "b"]}, r"expected descriptors as float32 \(2, 8\), found float32 \(3, 8\)"),
+        ({"arrays": {"descriptors": draw(3).astype(np.float64)}}, "expected descriptors as float32"),
+        ({"arrays": {"descriptors": draw(3) * np.float32(np.nan)}}, "expected finite descriptors"),
+        ({"arrays": {"times": np.zeros(2)}}, r"expected times as float64 \(3\)"),
+        ({"arrays": {"times": np.array([0, np.inf, 1])}}, "expected finite times"),
+        ({"arrays": {"positions": np.zeros((3, 2))}}, r"expected positions as float64 \(3, 3\)"),
+    ],
+)
+def test_a_file_of_another_program_is_refused_though_its_checksum_is_right(tmp_path, content, message):
+    assert len(Index.load(with_checksum(tmp_path / "good.safetensors"))) == 3
+    with pytest.raises(ValueError, match=rf"i\.safetensors.*: .*{message}"):
+        Index.load(with_checksum(tmp_path / "i.safetensors", **content))
+
+
+def test_a_file_with_types_that_numpy_lacks_is_refused(tmp_path):
+    header = json.dumps({"descriptors": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
+    (tmp_path / "i.safetensors").write_bytes(len(header).to_bytes(8, "little") + header + b"ab")
+    with pytest.raises(ValueError, match=r"i\.safetensors: expected an index"):
+        Index.load(tmp_path / "i.safetensors")
+
+
 def test_a_full_disk_leaves_the_index_that_was_there(tmp_path, small_files):
     path = tmp_path / "places.safetensors"
     index_of(20).save(path)
@@ -102,6 +152,18 @@ def test_an_index_of_another_model_is_refused(tmp_path):
 def test_fewer_flags_than_places_are_refused():
     with pytest.raises(ValueError, match="one flag for each of 5"):
         index_of(5).query(draw(1), exclude=np.zeros(4, bool))
+
+
+def test_lists_are_converted_and_others_are_one_error():
+    index = index_of(5)
+    expected = index.query(draw(5)[1], 2)
+    found = index.query(draw(5)[1].tolist(), 2, exclude=[False] * 5)
+    np.testing.assert_array_equal(found.rows, expected.rows)
+    with pytest.raises(ValueError, match="expected flags"):
+        index.query(draw(1), exclude=[0] * 5)
+    for descriptors in ([["a"]], [[1.0], [1.0, 2.0]], np.array([object()])):
+        with pytest.raises(ValueError, match="expected descriptors of 8 numbers, found others"):
+            index.query(descriptors)
 
 
 def test_an_unknown_distance_is_refused():

@@ -13,8 +13,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,10 +23,13 @@ from sglpr_jax.data.cache.stacked import Stacked, StackWriter, map_stacked, sync
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.record import ReadRecord, Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import ABANDONED_S, half_written, in_short, read_json, replacing
+from sglpr_jax.files import in_short, read_json, replacing
+from sglpr_jax.names import file_name
 
 FORMAT = "sglpr-jax packed recording 1"
 ABOUT_FILE = "pack.json"
+LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)}
+"""Type and shape of the rows of each array. Images of different packs have different widths."""
 
 
 def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
@@ -53,10 +54,10 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
             "corrupted or simulated one"
         )
     source = _source(recording)
-    target = folder / f"{recording.name}-{hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]}"
+    target = folder / f"{file_name(recording.name)}-{hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]}"
     if not target.is_dir():
         _make(target, recording, source, on_progress)
-    return dataclasses.replace(recording, read=_reader(recording, open_pack(target)), on_disk=False)
+    return dataclasses.replace(recording, read=_reader(recording, open_pack(target, scans=len(recording))), on_disk=False)
 
 
 def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
@@ -95,21 +96,12 @@ def _source(recording: Recording) -> dict[str, Any]:
 
 def _make(target: Path, recording: Recording, source: dict[str, Any], on_progress: Callable[[int], None]) -> None:
     """Writes a pack atomically."""
-    _sweep(target)
     with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
         temporary.mkdir()
         arrays = _write_arrays(temporary, recording, on_progress)
         with (temporary / ABOUT_FILE).open("w") as stream:
             json.dump({**source, "arrays": arrays}, stream)
             sync(stream)
-
-
-def _sweep(target: Path) -> None:
-    """Removes incomplete copies of this pack that killed processes left behind."""
-    for left in half_written(target.parent, target.name):
-        with contextlib.suppress(FileNotFoundError):  # Another process may remove it, too.
-            if time.time() - max(path.stat().st_mtime for path in (left, *left.iterdir())) > ABANDONED_S:
-                shutil.rmtree(left)
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
@@ -136,13 +128,29 @@ def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
     return {"points": record.points, "labels": labels}
 
 
-def open_pack(folder: Path) -> dict[str, Stacked]:
-    """Return the arrays of a pack by name. Raises ValueError, with the folder, if the pack is damaged."""
+def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
+    """Return the arrays of a pack by name.
+
+    Raises ValueError, with the folder, if the pack is damaged, has other arrays than a pack, or not as many `scans`.
+    """
     try:
         lie = read_json(folder / ABOUT_FILE)["arrays"]
+        for name, about in lie.items():
+            _check_layout(name, about, scans)
+        if "images" not in lie and "points" not in lie:
+            raise ValueError(f"expected arrays of points or images, found {', '.join(lie) or 'none'}")
         return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError) as error:
         raise ValueError(
             f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); delete the "
             "folder to pack the recording again"
         ) from error
+
+
+def _check_layout(name: str, about: dict[str, Any], scans: int | None) -> None:
+    """Raises ValueError if a pack has no array of this name, type and shape of its rows."""
+    dtype, row = LAYOUT.get(name, (None, None))
+    if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
+        raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
+    if scans is not None and len(about["offsets"]) != scans + 1:
+        raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")

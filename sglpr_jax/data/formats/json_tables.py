@@ -44,6 +44,15 @@ def column_of(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[Any
     return [row[name] for row in rows]
 
 
+def texts_of(path: Path, rows: Sequence[dict[str, Any]], name: str) -> list[str]:
+    """Return a column of names or tokens. Raises ValueError if a value is missing, empty or no text."""
+    values = column_of(path, rows, name)
+    strange = next((value for value in values if not isinstance(value, str) or not value), values)
+    if strange is not values:
+        raise ValueError(f"{path}: expected text as {name!r} in every row, found {strange!r:.80}")
+    return values
+
+
 def numbers_of(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int) -> Float[np.ndarray, "n {size}"]:
     """Return a column with `size` finite numbers in each row. Raises ValueError if a value is malformed."""
     values = column_of(path, rows, name)

@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.formats.bin_records import described
-from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows
+from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows, texts_of
 from sglpr_jax.data.formats.pose_files import rotations_of
 from sglpr_jax.data.formats.scan_files import scan_id
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.names import path_inside
 
 CHANNEL = "LIDAR_TOP"
 
@@ -36,16 +37,16 @@ def open_recording(root: Path, name: str) -> Recording:
 
     Raises:
       FileNotFoundError: If a table is missing, or no scan has a file.
-      ValueError: If a table is malformed or refers to a missing row.
+      ValueError: If a table is malformed, refers to a missing row, or lists a file outside the dataset.
     """
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
     samples = set(
-        column_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token")
+        texts_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token")
     )
     table = tables / "sample_data.json"
     listed = table_rows(table, "sample_token", samples)
-    files = [root / str(file) for file in column_of(table, listed, "filename")]
+    files = [path_inside(root, file, source=table) for file in column_of(table, listed, "filename")]
     scans = [(file, row) for file, row in zip(files, listed, strict=True) if file.parent.name == CHANNEL]
     there = [(file, row) for file, row in scans if file.is_file()]
     if not there:
@@ -78,10 +79,14 @@ def _versions(root: Path) -> tuple[Path, ...]:
 
 
 def _scenes(tables: Path) -> dict[str, str]:
-    """Token of each scene, by name."""
+    """Token of each scene, by name. Raises ValueError if two scenes have the same name."""
     path = tables / "scene.json"
     rows = table_rows(path)
-    return dict(zip(column_of(path, rows, "name"), column_of(path, rows, "token"), strict=True))
+    names = texts_of(path, rows, "name")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{path}: expected a unique name for each scene, found {twice!r:.80} twice")
+    return dict(zip(names, texts_of(path, rows, "token"), strict=True))
 
 
 def _positions(tables: Path, rows: Sequence[dict[str, Any]]) -> Float[np.ndarray, "n 3"]:
@@ -95,7 +100,7 @@ def _poses(
     path: Path, rows: Sequence[dict[str, Any]], column: str
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Rotations and translations of the table rows that a column of `rows` refers to."""
-    tokens = column_of(path.with_name("sample_data.json"), rows, column)
+    tokens = texts_of(path.with_name("sample_data.json"), rows, column)
     found = {row["token"]: row for row in table_rows(path, "token", set(tokens))}
     lost = [token for token in tokens if token not in found]
     if lost:

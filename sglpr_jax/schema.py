@@ -1,0 +1,91 @@
+"""Schema of stored files: names and types of their JSON values, and names, types and shapes of their arrays.
+
+A valid checksum says only that a file is whole. Another program or version may have written it.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sglpr_jax.fields import check_value
+
+
+class Column(NamedTuple):
+    """Expected type and shape of a stored array."""
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    """Length of each axis. Axes with the same name have the same length."""
+    finite: bool = True
+    """Whether NaN and infinity are invalid."""
+    optional: bool = False
+    """Whether the array may be missing."""
+
+
+def check_about(about: Any, fields: Mapping[str, Any], *, format: str) -> None:
+    """Check the JSON values of a file.
+
+    Arguments:
+      about: Parsed JSON.
+      fields: Annotation of each required value, as in a configuration (`fields.check_value`).
+      format: Required value of `format`.
+
+    Raises:
+      ValueError: If `about` is no object of this format, or if a value is missing or has another type.
+    """
+    found = about.get("format") if isinstance(about, dict) else about
+    if found != format:
+        raise ValueError(f"expected format {format!r}, found {found!r:.60}")
+    missing = [name for name in fields if name not in about]
+    if missing:
+        wanted = ", ".join(f"`{name}`" for name in fields)
+        raise ValueError(f"expected {wanted}, found no `{missing[0]}`")
+    for name, annotation in fields.items():
+        check_value(about[name], annotation, f"`{name}`")
+
+
+def check_columns(arrays: Mapping[str, np.ndarray], columns: Mapping[str, Column], **sizes: int) -> None:
+    """Check the arrays of a file. Other arrays are ignored.
+
+    Arguments:
+      arrays: Arrays by name.
+      columns: Schema of each array.
+      sizes: Known lengths of named axes. The first array defines the others.
+
+    Raises:
+      ValueError: If an array is missing, has another type or shape, or is not finite. The message names the array.
+    """
+    missing = [name for name, column in columns.items() if not column.optional and name not in arrays]
+    if missing:
+        raise ValueError(f"expected arrays {', '.join(columns)}, found no {', '.join(missing)}")
+    for name, column in columns.items():
+        if name in arrays:
+            _check_column(name, arrays[name], column, sizes)
+
+
+def check_texts(values: Any, *, name: str, count: int | None = None) -> None:
+    """Raise ValueError if values are not a list of strings, or with `count` not that many."""
+    if not isinstance(values, list) or not all(type(value) is str for value in values):
+        raise ValueError(f"expected `{name}` as a list of strings, found {values!r:.60}")
+    if count is not None and len(values) != count:
+        raise ValueError(f"expected {count} `{name}`, found {len(values)}")
+
+
+def _check_column(name: str, array: np.ndarray, column: Column, sizes: dict[str, int]) -> None:
+    """Check an array, and add the lengths of its named axes to `sizes`."""
+    if array.ndim == len(column.shape):
+        for axis, length in zip(column.shape, array.shape, strict=True):
+            if isinstance(axis, str):
+                sizes.setdefault(axis, length)
+    wanted = tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in column.shape)
+    if array.dtype != column.dtype or array.shape != wanted:
+        shape = ", ".join(map(str, wanted))
+        raise ValueError(f"expected {name} as {column.dtype} ({shape}), found {array.dtype} {array.shape}")
+    if column.finite and array.dtype.kind == "f":
+        broken = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+        if broken.size:
+            raise ValueError(
+                f"expected finite {name}, found NaN or infinity in {broken.size} rows, first in row {broken[0]}"
+            )
+
