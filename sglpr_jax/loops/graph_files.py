@@ -74,13 +74,13 @@ def write_g2o(
 def read_g2o(path: Path | str) -> Graph:
     """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Other lines are ignored.
 
-    Edges without an information matrix get the unit matrix.
+    If the edges have no information matrix, they get the unit matrix.
 
     Raises:
       FileNotFoundError: If the file does not exist.
       ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
     """
-    path, graph = Path(path), Graph({}, [])
+    path, graph, columns = Path(path), Graph({}, []), 0
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a g2o file, found none")
     for i, line in enumerate(path.read_text(errors="replace").splitlines()):
@@ -92,7 +92,8 @@ def read_g2o(path: Path | str) -> Graph:
                 raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
             graph.poses[frame] = _pose(values[1:], where)
         elif words and words[0] == EDGE:
-            values = numbers_of(words[1:], columns=9 if len(words) == 10 else 30, where=where)
+            columns = columns or (9 if len(words) == 10 else 30)  # the same for all: another line is cut
+            values = numbers_of(words[1:], columns=columns, where=where)
             information = _information(values[9:])
             first, second = _frames(values[:2], where)
             graph.edges.append((first, second, _pose(values[2:9], where), information))

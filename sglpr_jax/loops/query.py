@@ -35,7 +35,7 @@ def read_query(
     """
     if path.is_dir():
         raise IsADirectoryError(
-            f"{path}: expected one scan or image, found a folder; name a file in it, or a scan with --frame"
+            f"{path}: expected one scan or image, found a folder; name a file in it, or use --frame"
         )
     if path.suffix in BAGS:
         raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")

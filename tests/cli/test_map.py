@@ -263,3 +263,16 @@ def test_wrong_input_is_one_clear_error(command, town, poses, tmp_path):
     assert_one_line_error(ended, "broken.safetensors", "expected an index")
     assert_one_line_error(command("relocalize", scan, "--map", tmp_path / "none"), "none", "expected an index")
     assert list(tmp_path.glob("a.safetensors")) == []
+
+
+def test_a_frame_of_a_recording_is_asked_in_the_map(command, town, places_file, monkeypatch):
+    """The scan, the mounting and the name are those of the recording."""
+    asked = []
+    monkeypatch.setattr(PlaceMap, "relocate", lambda self, params, record, **options: asked.append(record) or [])
+    ended = command("relocalize", town, "--seq", "08", "--frame", "12", "--map", places_file, "--sensor-height", "2")
+    assert_one_line_error(ended, f"frame 12 of {town.name}: expected a scan that shows a place")
+    (record,) = asked
+    assert record.name == "scan 000012 of sequence 08" and record.mounting.height_m == 2
+    np.testing.assert_array_equal(record.points, open_recording(town, "08").points(12))
+    ended = command("relocalize", town, "--seq", "08", "--frame", "40", "--map", places_file)
+    assert_one_line_error(ended, "08: expected the number of a scan, found 40; it has 40 scans from 0 to 39")

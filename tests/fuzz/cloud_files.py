@@ -143,5 +143,8 @@ ROADS = (
     Road("scan .npz", "1.npz", npz({"points": POINTS}), read_scan, _same_array, HEADED),
     Road("scan .las", "1.las", las(), read_scan, _same_las, HEADED),
     Road("scan .pcd, packed", "1.pcd", pcd_compressed(), read_scan, _same_number, HEADED),
-    *(Road(f"bag .{kind}", f"1.{kind}", bag(kind), _read_bag, _same_clouds, HEADED) for kind in ("bag", "mcap", "db3")),
+    *(
+        Road(f"bag .{kind}", f"1.{kind}", bag(kind), _read_bag, _same_clouds, HEADED, cost=5)
+        for kind in ("bag", "mcap", "db3")
+    ),
 )

@@ -17,6 +17,12 @@ def _replaced(road: str, old: bytes, new: bytes) -> Damaged:
     return Damaged(whole.replace(old, new, 1))
 
 
+def _with_number(road: str, *, at: int, number: int) -> Damaged:
+    """Another size in a binary header."""
+    whole = ROADS[road].whole
+    return Damaged(whole[:at] + number.to_bytes(4, "little") + whole[at + 4 :])
+
+
 def _member_that_is_no_array() -> Damaged:
     """numpy gives it as bytes."""
     stream = io.BytesIO()
@@ -63,6 +69,17 @@ FOUND = (
     ("label image", _picture_that_promises_more("label image", 7)),
     ("labels", Damaged(b"\x4d\0\0\0" * 5)),
     ("scan .pcd, binary", Damaged(PCD_BINARY.replace(b"COUNT 1", b"COUNT 0", 1))),
+    ("scan .pcd, binary", _replaced("scan .pcd, binary", b"COUNT 1 1 1 1", b"COUNT 1 1 1 99999999999999999999")),
+    ("scan .pcd, binary", _replaced("scan .pcd, binary", b"TYPE F", b"TYPE ,F")),
+    ("scan .pcd, binary", Damaged(PCD_BINARY.replace(b"SIZE 4", b"SIZE 8").replace(b"TYPE F", b"TYPE C"))),
+    ("scan .pcd, ascii", Damaged(ROADS["scan .pcd, ascii"].whole.rstrip().rpartition(b" ")[0] + b" 1_0\n")),
+    ("scan .ply, little", _replaced("scan .ply, little", b"property float int", b"propesty float int")),
+    ("scan .ply, little", Damaged(ROADS["scan .ply, little"].whole + b"\0")),
+    ("scan .ply, ascii", _replaced("scan .ply, ascii", b"vertex 5", b"vertex 4")),
+    ("scan .npy", _replaced("scan .npy", b"(5, 4), }      ", b"(2147483647, 4)")),
+    ("scan .las", _with_number("scan .las", at=100, number=2**32 - 1)),
+    ("bag .mcap", Damaged(ROADS["bag .mcap"].whole.replace(b"uint32 height", b"uint32 heighv"))),
+    ("bag .bag", _replaced("bag .bag", b"uint32 height", b"uint32 \n\neight")),
     ("scan .pcd, binary", Damaged(PCD_BINARY.replace(b"POINTS 5", b"POINTS 1", 1))),
 )
 """The road, and the file."""

@@ -148,7 +148,7 @@ def said_graph(content: bytes) -> Any:
             poses[int(words[0])] = _matrix(words[1:])
         elif kind == "EDGE_SE3:QUAT":
             upper = np.zeros((6, 6))
-            upper[np.triu_indices(6)] = [float(word) for word in words[9:]]
+            upper[np.triu_indices(6)] = [float(word) for word in words[9:]] or np.eye(6)[np.triu_indices(6)]
             edges.append([int(words[0]), int(words[1]), _matrix(words[2:9]), (upper + np.triu(upper, 1).T).tolist()])
     return [poses, edges]
 

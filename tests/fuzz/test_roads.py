@@ -47,7 +47,7 @@ def test_a_damaged_file_is_refused_or_read_rightly(road):
     counts = COUNTS.setdefault(road.name, Counter())
 
     @settings(
-        max_examples=max(CASES // len(ROADS), 1),
+        max_examples=max(CASES // len(ROADS) // road.cost, 1),
         derandomize=True,
         database=None,
         deadline=None,

@@ -66,6 +66,9 @@ def test_edges_without_information_have_the_unit_matrix(tmp_path):
     ((first, second, pose, information),) = read_g2o(path).edges
     assert (first, second, pose[:3, 3].tolist()) == (3, 7, [1, 2, 3])
     np.testing.assert_array_equal(information, np.eye(6))
+    path.write_text("EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1" + " 1" * 21 + "\nEDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1\n")
+    with pytest.raises(ValueError, match=r"a\.g2o, line 2: expected 30 numbers, found 9"):
+        read_g2o(path)
     path.write_text("EDGE_SE3:QUAT 3 7 1 2 3 0 0 0 1 1 0 0\n")
     with pytest.raises(ValueError, match=r"a\.g2o, line 1: expected 30 numbers, found 12"):
         read_g2o(path)

@@ -29,7 +29,7 @@ def read_npy(path: Path) -> Float32[np.ndarray, "n 3"]:
     _check_exists(path)
     try:
         with path.open("rb") as stream:
-            array = _read(stream, size=path.stat().st_size)
+            array = _read_scan(stream, size=path.stat().st_size)
     except Exception as error:  # numpy and tokenize raise many types for broken files
         raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
     return _points(path, array)
@@ -48,7 +48,7 @@ def read_npz(path: Path) -> Float32[np.ndarray, "n 3"]:
             if chosen is not None:
                 member = archive.getinfo(f"{chosen}.npy")
                 with archive.open(member) as stream:
-                    array = _read(stream, size=member.file_size)
+                    array = _read_scan(stream, size=member.file_size)
     except Exception as error:  # zipfile and zlib raise many types, too
         raise ValueError(f"{path}: expected a numpy array, found none ({in_short(error)})") from error
     if chosen is None:
@@ -67,17 +67,29 @@ def _chosen(names: Sequence[str]) -> str | None:
     return next((name for name in NAMES if name in names), names[0] if len(names) == 1 else None)
 
 
-def _read(stream: Any, *, size: int) -> np.ndarray:
-    """Read an array of `size` bytes with its header. A header may declare more than a file or an archive contains."""
+def read_array(stream: Any, *, size: int) -> np.ndarray:
+    """Read an array in numpy's format, without pickle. The header may declare more than the file contains.
+
+    Arguments:
+      stream: Open file, or member of an archive.
+      size: Size of the stream in bytes.
+
+    Raises ValueError if the header declares another size, before memory is allocated. Numpy raises many types of errors
+    for broken headers.
+    """
     shorter = np.lib.format.read_magic(stream) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if shorter else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(stream)
     declared = stream.tell() + math.prod(shape) * dtype.itemsize
     if declared != size:
         raise ValueError(f"expected {declared} bytes by its header, found {size}")
-    check_bytes(size)
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _read_scan(stream: Any, *, size: int) -> np.ndarray:
+    check_bytes(size)
+    return read_array(stream, size=size)
 
 
 def _points(path: Path, array: np.ndarray) -> Float32[np.ndarray, "n 3"]:

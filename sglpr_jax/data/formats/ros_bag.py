@@ -107,9 +107,9 @@ class RosBag:
                 message = self._point_cloud2(topic, time, nth)
         try:
             return read_custom_msg(message) if livox else read_point_cloud2(message, name=str(self.paths[0]))
-        except ValueError as error:
+        except Exception as error:  # the bag defines the types and names of the fields
             raise ValueError(
-                f"{self.paths[0]}: expected a cloud with points on {topic}, found an invalid one ({error})"
+                f"{self.paths[0]}: expected a cloud with points on {topic}, found an invalid one ({in_short(error)})"
             ) from error
 
     def fields(self, topic: str, time: int) -> str:

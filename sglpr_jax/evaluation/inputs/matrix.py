@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Num
 
+from sglpr_jax.data.formats.arrays import read_array
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors
 from sglpr_jax.evaluation.inputs.positions import needed
@@ -30,7 +31,7 @@ def _load(path: Path) -> Num[np.ndarray, "n d"]:
     expected = f"{path}: expected descriptors (n, d) as numbers"
     try:
         with path.open("rb") as stream:
-            rows = np.lib.format.read_array(stream, allow_pickle=False)
+            rows = read_array(stream, size=path.stat().st_size)
     except MemoryError as error:
         raise ValueError(f"{expected}, found an array larger than the memory") from error
     except Exception as error:  # numpy parses the header as Python, which can raise any exception
