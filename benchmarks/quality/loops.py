@@ -27,7 +27,8 @@ from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
 from sglpr_jax.loops.candidates import Candidate
-from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import settled
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.optimization import optimized, trajectory_error

@@ -14,7 +14,7 @@ from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBA
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
-    from sglpr_jax.loops.detector import DetectorConfig
+    from sglpr_jax.loops.config import DetectorConfig
 
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""
@@ -69,8 +69,7 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.detector import DetectorConfig
-    from sglpr_jax.loops.drift import DriftModel
+    from sglpr_jax.loops.config import DetectorConfig, DriftModel
     from sglpr_jax.loops.unfinished import alone  # slow imports, not needed for --help
 
     _check(command)

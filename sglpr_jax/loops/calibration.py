@@ -16,7 +16,8 @@ from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import picture, rotated
-from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.pose_search import occupied, query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated

@@ -1,6 +1,5 @@
 """Candidate matches of a scan: description, retrieval of earlier scans, and comparison of images."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,20 +16,13 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.loops.background import Background
-from sglpr_jax.loops.drift import DriftModel, position_deviations
+from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
+from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.given import check_is
-from sglpr_jax.loops.motion import Motion, MotionConfig
-from sglpr_jax.loops.pose_search import (
-    NO_PEAKS,
-    Peak,
-    VerificationConfig,
-    occupied,
-    query_spectra,
-    search_spectra,
-    within_reach,
-)
+from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, occupied, query_spectra, search_spectra, within_reach
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.rivals import RivalConfig, distance_share, expected_poses, rival_share, rivals
+from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
 from sglpr_jax.loops.verification import Alignment, refined
@@ -39,33 +31,6 @@ from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S
-
-
-@dataclasses.dataclass(frozen=True)
-class CandidateConfig:
-    """Selection of candidate matches and of their rivals."""
-
-    candidates: int = 3
-    """Number of nearest descriptors whose images are compared."""
-    elsewhere: int = 2
-    """Number of nearest descriptors from other times (`rivals.age`) whose images are compared. The best fit of all
-    compared frames is the candidate."""
-    exclude_s: float = EXCLUDED_S
-    exclude_frames: int = EXCLUDED_FRAMES
-    """Minimum age of a match in seconds, or in frames if there are no times."""
-    min_travelled_m: float = 10.0
-    """Minimum travelled distance between match and query, in metres, if the motion is known."""
-    min_cells: int = 20
-    """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
-    background_frames: int = 16
-    """Number of keyframes in the average image, which is subtracted before comparisons (`loops.background`)."""
-    min_background_frames: int = 4
-    """Minimum number of keyframes before the average is subtracted."""
-    min_rival_correlation: float = 0.25
-    """Minimum correlation of a candidate that is compared with rivals. Candidates below it are not loops."""
-    rivals: RivalConfig = RivalConfig()
-    motion: MotionConfig = MotionConfig()
 
 
 class Candidate(NamedTuple):

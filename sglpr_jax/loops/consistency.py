@@ -5,31 +5,19 @@ loops' own errors, one of the two loops is wrong. After Mangelson et al., Pairwi
 Maximization (ICRA 2018), in the plane.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.loops.drift import DriftModel
+from sglpr_jax.loops.config import ConsistencyConfig, DriftModel
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar_loops, planar_odometry, relative
 from sglpr_jax.loops.transforms import travelled
 
 BLOCK = 64
 """Number of loops compared with all others at a time, to limit memory."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ConsistencyConfig:
-    """Thresholds for the consistency of two loops."""
-
-    position_m: float = 0.5
-    yaw_deg: float = 1.5
-    """Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
-    deviations: float = 3.0
-    """Maximum closure error of the cycle of two consistent loops, in standard deviations."""
 
 
 def agree(

@@ -14,46 +14,18 @@ from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.times import PROOF, doubt
 from sglpr_jax.fields import check_value
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder, Compared, Seen
-from sglpr_jax.loops.choices import MIN_PROBABILITY
-from sglpr_jax.loops.consistency import ConsistencyConfig, agree
-from sglpr_jax.loops.drift import DriftModel, deviations
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
+from sglpr_jax.loops.config import (
+    DetectorConfig,
+)
+from sglpr_jax.loops.consistency import agree
+from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.given import DATES, given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
-from sglpr_jax.loops.pose_search import VerificationConfig
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.loops.sequence import SequenceConfig, added_log_odds, agree_in_motion, agree_in_order
+from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion, agree_in_order
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.models.params import Params
-
-
-@dataclasses.dataclass(frozen=True)
-class DetectorConfig:
-    """Thresholds for accepting a loop closure."""
-
-    min_probability: float = MIN_PROBABILITY
-    """Minimum probability of a returned loop, given its neighbours."""
-    min_neighbour_probability: float = 0.2
-    """Minimum probability of a pair alone that takes part in the sequential test, at most `min_probability`."""
-    near_m: float = 200.0
-    """With odometry, a loop must be consistent with at least half of the loops within this travelled distance, in
-    metres."""
-    candidates: CandidateConfig = CandidateConfig()
-    verification: VerificationConfig = VerificationConfig()
-    consistency: ConsistencyConfig = ConsistencyConfig()
-    sequence: SequenceConfig = SequenceConfig()
-    motion_drift: DriftModel = DriftModel(
-        metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5, max_deviation=3.0
-    )
-    """Drift of the motion that is used if there is no odometry (`loops.motion`)."""
-    drift: DriftModel = DriftModel()
-    """Drift of the odometry. Loops that contradict it are rejected."""
-
-    def __post_init__(self):
-        """Raises ValueError if a probability is outside [0, 1]."""
-        for name in ("min_probability", "min_neighbour_probability"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"expected {name} from 0 to 1, found {getattr(self, name)}")
 
 
 class LoopDetector:

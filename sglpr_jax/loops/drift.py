@@ -1,6 +1,5 @@
 """Drift model of odometry: how far a loop is from the odometry between its two frames, in standard deviations."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT
+from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
 from sglpr_jax.loops.transforms import travelled
@@ -17,38 +16,6 @@ GRAPH_M = 100.0
 """Travelled distance at which the drift of a pose graph equals that of the model, in metres."""
 STEP_M, STEP_DEG = 0.005, 0.005
 """Smallest standard deviation of an odometry step in a graph, for a sensor that stands still."""
-
-
-@dataclasses.dataclass(frozen=True)
-class DriftModel:
-    """Standard deviations of odometry per metre of travelled distance."""
-
-    metres_per_metre: float = DRIFT_PERCENT / 100
-    """Position drift in the direction of travel."""
-    degrees_per_metre: float = DRIFT_DEG_PER_100M / 100
-    """Heading drift. It rotates the rest of the path and so moves the position, too."""
-    sideways: float = 0.25
-    """Position drift across the direction of travel, as a fraction of the drift along it."""
-    position_m: float = 0.5
-    yaw_deg: float = 1.5
-    """Standard deviations of the comparison itself, whatever the distance, in metres and degrees."""
-    max_deviation: float = 4.0
-    """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
-
-    def __post_init__(self):
-        """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
-        for name, value in dataclasses.asdict(self).items():
-            positive = name in ("position_m", "yaw_deg", "max_deviation")
-            if not np.isfinite(value) or value < 0 or (positive and value == 0):
-                raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
-
-    def scaled(self, factor: float) -> "DriftModel":
-        """The same model with `factor` times the drift per metre."""
-        metres, degrees = factor * self.metres_per_metre, factor * self.degrees_per_metre
-        return dataclasses.replace(self, metres_per_metre=metres, degrees_per_metre=degrees)
-
-    def __str__(self) -> str:
-        return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"
 
 
 def deviations(

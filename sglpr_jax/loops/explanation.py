@@ -4,7 +4,7 @@ import numpy as np
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import FASTEST_S
-from sglpr_jax.loops.candidates import CandidateConfig
+from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.reasons import counted, listed

@@ -15,8 +15,8 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.candidates import Candidate, Compared, Seen
-from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
-from sglpr_jax.loops.drift import DriftModel
+from sglpr_jax.loops.config import DetectorConfig, DriftModel
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import check_is, given_poses
 from sglpr_jax.loops.joint import check_odometry, settled
 from sglpr_jax.loops.loop import Loop, Rejected

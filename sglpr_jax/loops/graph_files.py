@@ -16,7 +16,8 @@ from jaxtyping import Float, Int
 
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of
 from sglpr_jax.files import in_short, parse_json, write_text
-from sglpr_jax.loops.drift import DriftModel, step_deviations
+from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.drift import step_deviations
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.transforms import from_quaternions, inverse, quaternions
 from sglpr_jax.poses import are_rotations

@@ -10,9 +10,9 @@ from scipy.sparse.csgraph import connected_components
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.consistency import ConsistencyConfig, agree, largest_consistent_set
-from sglpr_jax.loops.detector import DetectorConfig
-from sglpr_jax.loops.drift import DriftModel, deviations
+from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig, DriftModel
+from sglpr_jax.loops.consistency import agree, largest_consistent_set
+from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.loop import Loop, Reason, Rejected
 from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.registration import register

@@ -6,40 +6,17 @@ do not show how the sensor moved, as in a tunnel, the motion is unknown and a ne
 extrapolated at the last known velocity, and its drift grows fast.
 """
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.config import MotionConfig
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import upright_from_lidar
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
-
-
-@dataclasses.dataclass(frozen=True)
-class MotionConfig:
-    """Thresholds for accepting a registration with the keyframe and for choosing the next keyframe."""
-
-    min_correlation: float = 0.4
-    """Minimum correlation of the two images."""
-    max_ridge: float = 0.8
-    """Maximum ratio of ridge to peak. Above it, the images do not show how far the sensor moved."""
-    max_second: float = 0.8
-    max_second_expected: float = 1.5
-    """Maximum second-peak ratio, without and with an expected pose."""
-    max_coasting: int = 3
-    """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
-    keyframe_m: float = 3.0
-    keyframe_deg: float = 20.0
-    """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
-    guess_m_per_s: float = 80.0
-    """Length of measured path with the same drift as one second of guessed motion, in metres."""
-    standing_s: float = 5.0
-    """Maximum time that one keyframe adds to the clock, in seconds. A vehicle that stands sees nothing new."""
 
 
 class Motion:

@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.drift import DriftModel, deviations, step_deviations
+from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import inverse

@@ -15,13 +15,14 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder, Compared, Seen
+from sglpr_jax.loops.candidates import CandidateFinder, Compared, Seen
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
+from sglpr_jax.loops.config import CandidateConfig, RivalConfig, VerificationConfig
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.pose_search import Peak, VerificationConfig, occupied, query_spectra, search_spectra, within_reach
+from sglpr_jax.loops.pose_search import Peak, occupied, query_spectra, search_spectra, within_reach
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
-from sglpr_jax.loops.rivals import RivalConfig, distance_share, rival_share
+from sglpr_jax.loops.rivals import distance_share, rival_share
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.upright import check_level, upright_from_lidar

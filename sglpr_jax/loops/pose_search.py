@@ -6,7 +6,6 @@ without it one street looks like any other. The correlation is needed at small s
 transform is a product with small matrices, which is faster than a full transform.
 """
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,37 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num
 from scipy.fft import next_fast_len
 
 from sglpr_jax.bev import centre_crop, rotate_image
-from sglpr_jax.data.density_grid import RESOLUTION_M
-
-
-@dataclasses.dataclass(frozen=True)
-class VerificationConfig:
-    """Settings of the comparison of two images."""
-
-    resolution_m: float = RESOLUTION_M
-    """Edge of an image's cell, in metres."""
-    reach_m: float = 25.0
-    """Radius of the compared cells around the sensor, in metres. A circle has the same content at every rotation."""
-    max_shift_m: float = 12.0
-    """Maximum distance between two scans of one place along x and along y, in metres."""
-    turns: int = 72
-    """Number of rotations over the whole circle."""
-    coarse: int = 2
-    """Number of cells per side that the exhaustive search merges into one."""
-    blur_m: float = 0.4
-    wide_blur_m: float = 1.0
-    """Standard deviations of the two blurs, in metres. The wider blur is subtracted."""
-    refine_deg: float = 3.0
-    """Range of the refinement to each side, in degrees, in 4 steps."""
-    second_m: float = 3.0
-    second_deg: float = 15.0
-    """Minimum distance of the second peak from the best one, in metres or in degrees."""
-    ridge_m: float = 6.0
-    """Maximum distance at which a peak of the same rotation belongs to the ridge of the best one, in metres."""
-    prior_m: float = 2.0
-    prior_deg: float = 10.0
-    """Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
-
+from sglpr_jax.loops.config import VerificationConfig
 
 DEFAULT = VerificationConfig()
 

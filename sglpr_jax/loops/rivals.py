@@ -6,36 +6,16 @@ proves nothing. A rival that overlaps the query or the match fits it correctly a
 pose, only the second-best fit counts.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sglpr_jax.loops.config import RivalConfig
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import yaw_of
-
-
-@dataclasses.dataclass(frozen=True)
-class RivalConfig:
-    """Selection of the rivals of a match."""
-
-    of_query: int = 6
-    """Maximum number of rivals before the query."""
-    of_match: int = 4
-    """Maximum number of rivals around the match, half before and half after it."""
-    age: tuple[float, float] = (0.27, 0.97)
-    """Minimum and maximum time between a rival and the query or the match, without standing time, as fractions of the
-    excluded time. The defaults are 8 and 29 s of 30 s."""
-    agree_m: float = 3.0
-    agree_share: float = 0.05
-    """Maximum deviation of a fit that agrees with the motion, in metres and as a fraction of the travelled distance."""
-    agree_deg: float = 20.0
-    """Maximum angle of a fit that agrees with the motion, in degrees."""
-    overlap_m: float = 15.0
-    """Distance below which two scans overlap, in metres."""
 
 
 def rivals(

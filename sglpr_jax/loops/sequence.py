@@ -5,7 +5,6 @@ elsewhere. Neighbours that see the same walls are not independent, so the weight
 travelled since the previous one.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,38 +12,10 @@ from jaxtyping import Bool, Float
 from scipy.special import logit
 
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.config import SequenceConfig
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar, planar_loops, wrapped
-
-
-@dataclasses.dataclass(frozen=True)
-class SequenceConfig:
-    """Selection and weights of neighbouring frames."""
-
-    frames: int = 30
-    """Number of frames before and after a loop that are considered."""
-    support: int = 2
-    """Minimum number of loops that show the same place, including the loop itself."""
-    independent_m: float = 15.0
-    """Travelled distance after which two frames are nearly independent, in metres."""
-    least_probability: float = 0.2
-    """Minimum probability of a neighbour. It counts with the excess of its log odds over those of this probability."""
-    unknown_m: float = 1.0
-    """Assumed distance between consecutive frames if the motion is unknown, in metres."""
-    max_log_odds: float = 4.0
-    """Maximum log odds that a neighbour adds or subtracts."""
-    frames_a_frame: float = 3.0
-    """If the motion is unknown, the matches of two queries k frames apart are at most this factor times k + 1 frames
-    apart."""
-    agree_m: float = 2.0
-    agree_share: float = 0.1
-    agree_deg: float = 10.0
-    """Maximum closure error of the cycle of two loops that agree: distance in metres, additional fraction of the
-    travelled distance, and angle in degrees."""
-    guess_share: float = 0.075
-    guess_deg_per_m: float = 0.2
-    """Additional tolerance for each metre of `Motion.guessed_m`, in metres and degrees."""
 
 
 def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceConfig()) -> Bool[np.ndarray, "n n"]:

@@ -8,8 +8,7 @@ import pytest
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import find
-from sglpr_jax.loops.detector import DetectorConfig
-from sglpr_jax.loops.drift import DriftModel
+from sglpr_jax.loops.config import DetectorConfig, DriftModel
 from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, write_kitti, write_tum
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.unfinished import alone

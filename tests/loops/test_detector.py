@@ -7,15 +7,9 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import (
-    Candidate,
-    CandidateConfig,
-    CandidateFinder,
-    Compared,
-    Seen,
-    square_image,
-)
-from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen, square_image
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import MIN_OVERLAP
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel

@@ -13,8 +13,9 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, Compared, Seen
-from sglpr_jax.loops.detector import DetectorConfig, LoopDetector
+from sglpr_jax.loops.candidates import Candidate, Compared, Seen
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import check_odometry
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of

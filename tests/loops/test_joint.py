@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.detector import DetectorConfig
-from sglpr_jax.loops.drift import DriftModel, deviations
+from sglpr_jax.loops.config import DetectorConfig, DriftModel
+from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.joint import accepted, check_odometry, stretches
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.optimization import optimized, trajectory_error

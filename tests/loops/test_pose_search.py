@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.pose_search import VerificationConfig, cells, merged, prepared, rotations, search, spectrum
+from sglpr_jax.loops.config import VerificationConfig
+from sglpr_jax.loops.pose_search import cells, merged, prepared, rotations, search, spectrum
 
 from .scenes import place, relative, seen_from
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from sglpr_jax.loops.config import SequenceConfig
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.motion import Motion
-from sglpr_jax.loops.sequence import SequenceConfig, added_log_odds, agree_in_motion, agree_in_order
+from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion, agree_in_order
 from sglpr_jax.loops.transforms import inverse, transform
 
 

@@ -13,8 +13,8 @@ import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find, joint, unfinished
-from sglpr_jax.loops.candidates import Candidate, CandidateConfig, CandidateFinder
-from sglpr_jax.loops.detector import DetectorConfig
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel

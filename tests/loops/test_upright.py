@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 import sglpr_jax
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import CandidateConfig, CandidateFinder
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.loop import planar_loop

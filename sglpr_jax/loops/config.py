@@ -1,0 +1,207 @@
+"""Settings of the loop detector as plain values, readable without JAX. `bin/loops` has a flag for each."""
+
+import dataclasses
+
+import numpy as np
+
+from sglpr_jax.data.density_grid import RESOLUTION_M
+from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY
+from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
+
+
+@dataclasses.dataclass(frozen=True)
+class DriftModel:
+    """Standard deviations of odometry per metre of travelled distance."""
+
+    metres_per_metre: float = DRIFT_PERCENT / 100
+    """Position drift in the direction of travel."""
+    degrees_per_metre: float = DRIFT_DEG_PER_100M / 100
+    """Heading drift. It rotates the rest of the path and so moves the position, too."""
+    sideways: float = 0.25
+    """Position drift across the direction of travel, as a fraction of the drift along it."""
+    position_m: float = 0.5
+    yaw_deg: float = 1.5
+    """Standard deviations of the comparison itself, whatever the distance, in metres and degrees."""
+    max_deviation: float = 4.0
+    """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
+
+    def __post_init__(self):
+        """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
+        for name, value in dataclasses.asdict(self).items():
+            positive = name in ("position_m", "yaw_deg", "max_deviation")
+            if not np.isfinite(value) or value < 0 or (positive and value == 0):
+                raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
+
+    def scaled(self, factor: float) -> "DriftModel":
+        """The same model with `factor` times the drift per metre."""
+        metres, degrees = factor * self.metres_per_metre, factor * self.degrees_per_metre
+        return dataclasses.replace(self, metres_per_metre=metres, degrees_per_metre=degrees)
+
+    def __str__(self) -> str:
+        return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionConfig:
+    """Thresholds for accepting a registration with the keyframe and for choosing the next keyframe."""
+
+    min_correlation: float = 0.4
+    """Minimum correlation of the two images."""
+    max_ridge: float = 0.8
+    """Maximum ratio of ridge to peak. Above it, the images do not show how far the sensor moved."""
+    max_second: float = 0.8
+    max_second_expected: float = 1.5
+    """Maximum second-peak ratio, without and with an expected pose."""
+    max_coasting: int = 3
+    """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
+    keyframe_m: float = 3.0
+    keyframe_deg: float = 20.0
+    """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
+    guess_m_per_s: float = 80.0
+    """Length of measured path with the same drift as one second of guessed motion, in metres."""
+    standing_s: float = 5.0
+    """Maximum time that one keyframe adds to the clock, in seconds. A vehicle that stands sees nothing new."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RivalConfig:
+    """Selection of the rivals of a match."""
+
+    of_query: int = 6
+    """Maximum number of rivals before the query."""
+    of_match: int = 4
+    """Maximum number of rivals around the match, half before and half after it."""
+    age: tuple[float, float] = (0.27, 0.97)
+    """Minimum and maximum time between a rival and the query or the match, without standing time, as fractions of the
+    excluded time. The defaults are 8 and 29 s of 30 s."""
+    agree_m: float = 3.0
+    agree_share: float = 0.05
+    """Maximum deviation of a fit that agrees with the motion, in metres and as a fraction of the travelled distance."""
+    agree_deg: float = 20.0
+    """Maximum angle of a fit that agrees with the motion, in degrees."""
+    overlap_m: float = 15.0
+    """Distance below which two scans overlap, in metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CandidateConfig:
+    """Selection of candidate matches and of their rivals."""
+
+    candidates: int = 3
+    """Number of nearest descriptors whose images are compared."""
+    elsewhere: int = 2
+    """Number of nearest descriptors from other times (`rivals.age`) whose images are compared. The best fit of all
+    compared frames is the candidate."""
+    exclude_s: float = EXCLUDED_S
+    exclude_frames: int = EXCLUDED_FRAMES
+    """Minimum age of a match in seconds, or in frames if there are no times."""
+    min_travelled_m: float = 10.0
+    """Minimum travelled distance between match and query, in metres, if the motion is known."""
+    min_cells: int = 20
+    """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
+    background_frames: int = 16
+    """Number of keyframes in the average image, which is subtracted before comparisons (`loops.background`)."""
+    min_background_frames: int = 4
+    """Minimum number of keyframes before the average is subtracted."""
+    min_rival_correlation: float = 0.25
+    """Minimum correlation of a candidate that is compared with rivals. Candidates below it are not loops."""
+    rivals: RivalConfig = RivalConfig()
+    motion: MotionConfig = MotionConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class VerificationConfig:
+    """Settings of the comparison of two images."""
+
+    resolution_m: float = RESOLUTION_M
+    """Edge of an image's cell, in metres."""
+    reach_m: float = 25.0
+    """Radius of the compared cells around the sensor, in metres. A circle has the same content at every rotation."""
+    max_shift_m: float = 12.0
+    """Maximum distance between two scans of one place along x and along y, in metres."""
+    turns: int = 72
+    """Number of rotations over the whole circle."""
+    coarse: int = 2
+    """Number of cells per side that the exhaustive search merges into one."""
+    blur_m: float = 0.4
+    wide_blur_m: float = 1.0
+    """Standard deviations of the two blurs, in metres. The wider blur is subtracted."""
+    refine_deg: float = 3.0
+    """Range of the refinement to each side, in degrees, in 4 steps."""
+    second_m: float = 3.0
+    second_deg: float = 15.0
+    """Minimum distance of the second peak from the best one, in metres or in degrees."""
+    ridge_m: float = 6.0
+    """Maximum distance at which a peak of the same rotation belongs to the ridge of the best one, in metres."""
+    prior_m: float = 2.0
+    prior_deg: float = 10.0
+    """Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ConsistencyConfig:
+    """Thresholds for the consistency of two loops."""
+
+    position_m: float = 0.5
+    yaw_deg: float = 1.5
+    """Standard deviations of a cycle in addition to the covariances of its loops, in metres and degrees."""
+    deviations: float = 3.0
+    """Maximum closure error of the cycle of two consistent loops, in standard deviations."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SequenceConfig:
+    """Selection and weights of neighbouring frames."""
+
+    frames: int = 30
+    """Number of frames before and after a loop that are considered."""
+    support: int = 2
+    """Minimum number of loops that show the same place, including the loop itself."""
+    independent_m: float = 15.0
+    """Travelled distance after which two frames are nearly independent, in metres."""
+    least_probability: float = 0.2
+    """Minimum probability of a neighbour. It counts with the excess of its log odds over those of this probability."""
+    unknown_m: float = 1.0
+    """Assumed distance between consecutive frames if the motion is unknown, in metres."""
+    max_log_odds: float = 4.0
+    """Maximum log odds that a neighbour adds or subtracts."""
+    frames_a_frame: float = 3.0
+    """If the motion is unknown, the matches of two queries k frames apart are at most this factor times k + 1 frames
+    apart."""
+    agree_m: float = 2.0
+    agree_share: float = 0.1
+    agree_deg: float = 10.0
+    """Maximum closure error of the cycle of two loops that agree: distance in metres, additional fraction of the
+    travelled distance, and angle in degrees."""
+    guess_share: float = 0.075
+    guess_deg_per_m: float = 0.2
+    """Additional tolerance for each metre of `Motion.guessed_m`, in metres and degrees."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectorConfig:
+    """Thresholds for accepting a loop closure."""
+
+    min_probability: float = MIN_PROBABILITY
+    """Minimum probability of a returned loop, given its neighbours."""
+    min_neighbour_probability: float = 0.2
+    """Minimum probability of a pair alone that takes part in the sequential test, at most `min_probability`."""
+    near_m: float = 200.0
+    """With odometry, a loop must be consistent with at least half of the loops within this travelled distance, in
+    metres."""
+    candidates: CandidateConfig = CandidateConfig()
+    verification: VerificationConfig = VerificationConfig()
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    sequence: SequenceConfig = SequenceConfig()
+    motion_drift: DriftModel = DriftModel(
+        metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5, max_deviation=3.0
+    )
+    """Drift of the motion that is used if there is no odometry (`loops.motion`)."""
+    drift: DriftModel = DriftModel()
+    """Drift of the odometry. Loops that contradict it are rejected."""
+
+    def __post_init__(self):
+        """Raises ValueError if a probability is outside [0, 1]."""
+        for name in ("min_probability", "min_neighbour_probability"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"expected {name} from 0 to 1, found {getattr(self, name)}")
