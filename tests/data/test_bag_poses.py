@@ -194,9 +194,7 @@ def test_rotations_that_nobody_measured_are_none(tmp_path, quaternion):
 def test_one_message_without_rotation_is_dropped_and_the_others_turn(tmp_path):
     times = np.arange(5.0, 11.0, 0.1)
     track = poses("ros2", "/odom", times, turns=lambda t: turned(t) if t != times[7] else (0.0, 0.0, 0.0, 0.0))
-    with pytest.warns(
-        DataWarning, match=r"expected valid poses on /odom, found 1 of 60 without finite position or"
-    ):
+    with pytest.warns(DataWarning, match=r"expected valid poses on /odom, found 1 of 60 without finite position or"):
         recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
     np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, np.eye(4)), atol=1e-5)
 
@@ -236,9 +234,7 @@ def test_bags_of_two_days_are_two_recordings(tmp_path):
 def test_a_track_that_jumps_is_told(tmp_path):
     times = np.arange(5.0, 7.0, 0.1)
     track = poses("ros2", "/odom", times, where=lambda t: (t + 234.0 * (t > 6.05), 0.0, 0.0))
-    with pytest.warns(
-        DataWarning, match=r"drive: expected consecutive scans near each other, found 0000\d\d and"
-    ):
+    with pytest.warns(DataWarning, match=r"drive: expected consecutive scans near each other, found 0000\d\d and"):
         opened(tmp_path, "ros2", scans("ros2", times) + track)
 
 

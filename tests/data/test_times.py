@@ -123,9 +123,7 @@ def test_poses_beside_scans_that_count_rows_give_no_times(tmp_path):
 def test_a_change_of_the_clock_is_told_for_every_layout(tmp_path):
     folder = folder_of_scans(tmp_path / "scans", 12)
     np.savetxt(folder / "times.txt", SECONDS[:12] + 86400.0 * (np.arange(12) >= 7))
-    said = (
-        r"scans: expected one drive, found 24 h between scans 6 and 7 \(1 jumps\); scans before and after a jump"
-    )
+    said = r"scans: expected one drive, found 24 h between scans 6 and 7 \(1 jumps\); scans before and after a jump"
     with pytest.warns(DataWarning, match=said):
         open_recording(folder, sensor_height=1.7)
     check_jumps(np.array([0.0, 600.0, 1200.0]), source="stops")
