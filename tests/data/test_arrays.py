@@ -60,6 +60,8 @@ def test_several_arrays_broken_files_and_objects_are_refused(tmp_path):
     (tmp_path / "b.npy").write_bytes(b"\x93NUMPY\x01\x00cut")
     np.savez(tmp_path / "c.npz", points=CLOUD)
     (tmp_path / "c.npz").write_bytes((tmp_path / "c.npz").read_bytes()[:60])
+    with pytest.raises(ValueError, match=r"o\.npy: expected a numpy array, .*allow_pickle=False"):
+        read_npy(tmp_path / "o.npy")
     for name, read in (("o.npy", read_npy), ("b.npy", read_npy), ("c.npz", read_npz)):
         with pytest.raises(ValueError, match=rf"{name}: expected a numpy array"):
             read(tmp_path / name)
