@@ -52,7 +52,7 @@ def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
 
 
 def write(figure: "matplotlib.figure.Figure", to: Path | io.BytesIO, *, format: str = "png") -> None:
-    """Write the figure to a file or a stream. Its texts are drawn as they are: names may contain `$` and other markup."""
+    """Write the figure to a file or a stream. Names with `$` are drawn as they are, not as formulas."""
     from matplotlib.legend import Legend
     from matplotlib.text import Text
 

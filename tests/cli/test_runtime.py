@@ -10,7 +10,6 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.cli import runtime
-
 from sglpr_jax.cli.runtime import own_names, parse_command
 from sglpr_jax.fields import NotNegative, Size
 

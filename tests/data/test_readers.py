@@ -52,7 +52,7 @@ def test_a_new_file_is_all_that_a_new_layout_needs(with_another, tmp_path):
     recording = open_recording(root.parent, "A", pose_source="kitti")
     assert recording.points(0).shape == (3, 3) and recording.pose_source == "kitti"
     (tmp_path / "none").mkdir()
-    with pytest.raises(FileNotFoundError, match="found no known layout: no files; .*MulRan.*single scans"):
+    with pytest.raises(FileNotFoundError, match=r"found no known layout: no files; .*MulRan.*single scans"):
         recording_names(tmp_path / "none")
 
 

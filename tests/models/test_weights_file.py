@@ -16,7 +16,16 @@ from sglpr_jax.models.backbones.rings_config import RingConfig
 from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.weights import as_tree, by_name, describing, for_places, graft, hash_of, weight_shapes, weights_hash
+from sglpr_jax.models.weights import (
+    as_tree,
+    by_name,
+    describing,
+    for_places,
+    graft,
+    hash_of,
+    weight_shapes,
+    weights_hash,
+)
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load, save
 
 
