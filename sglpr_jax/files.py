@@ -12,7 +12,7 @@ import tempfile
 import time
 import uuid
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,25 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
             _put(temporary, path, keep=keep)
     finally:
         _remove(temporary)
+
+
+def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> list[Path]:
+    """Write several files of a folder, completely or not at all.
+
+    Arguments:
+      folder: Folder of the files. It is created if needed.
+      files: For each file name, a function that writes the content to the path that it receives.
+
+    Returns:
+      The paths of the files.
+
+    Raises:
+      WriteError: If a file cannot be written. All files in the folder then stay as they were.
+    """
+    with contextlib.ExitStack() as opened:
+        for name, write in files.items():
+            write(opened.enter_context(replacing(folder / name)))
+    return [folder / name for name in files]
 
 
 def check_holds_only(folder: Path, names: Collection[str]) -> None:
@@ -120,17 +139,24 @@ def _locked_by_file(folder: Path, busy: str) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8, completely or not at all. Raises WriteError if it cannot be written.
-
-    Names of files that are not UTF-8 are escaped.
-    """
+    """Write a text file in UTF-8, completely or not at all. Raises WriteError if it cannot be written."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+        temporary.write_bytes(text_bytes(text))
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file completely or not at all. Raises WriteError if it cannot be written."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
+    write_text(path, json_text(value))
+
+
+def text_bytes(text: str) -> bytes:
+    """Encode a text in UTF-8. Names of files that are not UTF-8 are escaped."""
+    return text.encode(errors="backslashreplace")
+
+
+def json_text(value: Any) -> str:
+    """Return the content of the JSON file of a value."""
+    return json.dumps(value, indent=2) + "\n"
 
 
 def read_json(path: Path) -> Any:
@@ -205,6 +231,24 @@ def writing(path: Path, *others: Path) -> Iterator[None]:
         if error.filename is not None and Path(str(error.filename)) not in others:
             raise
         raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def check_writable(path: Path) -> None:
+    """Check before long work that a file can be written at `path`. Missing parent folders are not created.
+
+    Raises:
+      IsADirectoryError: If `path` is a folder.
+      WriteError: If `path` cannot be written.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: expected a file to write, found a folder")
+    there = next(folder for folder in path.absolute().parents if folder.exists())
+    trial = _hidden(there / path.name)
+    try:
+        with writing(path, trial, *trial.parents):
+            trial.touch()
+    finally:
+        _remove(trial)
 
 
 def half_written(folder: Path) -> list[Path]:

@@ -40,7 +40,7 @@ def path_inside(root: Path, listed: Any, *, source: Path) -> Path:
     return root / path
 
 
-def printable(name: str) -> str:
-    """Return a name as one line of printable text. Other characters are escaped, and a very long name is shortened."""
-    start = name if len(name) <= MOST_SHOWN else f"{name[: MOST_SHOWN - 3]}..."
-    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in start)
+def printable(name: str, *, most: int = MOST_SHOWN) -> str:
+    """Return a name as one line of printable text. Other characters are escaped. A long name loses its middle."""
+    shown = name if len(name) <= most else f"{name[: most - 19]}...{name[-16:]}"
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in shown)

@@ -88,4 +88,3 @@ def _check_column(name: str, array: np.ndarray, column: Column, sizes: dict[str,
             raise ValueError(
                 f"expected finite {name}, found NaN or infinity in {broken.size} rows, first in row {broken[0]}"
             )
-

@@ -15,11 +15,13 @@ from sglpr_jax.files import (
     ABANDONED_S,
     WriteError,
     alone_in,
+    check_writable,
     half_written,
     json_in_short,
     read_json,
     remove_half_written,
     replacing,
+    write_all,
     write_json,
     write_text,
     writing,
@@ -174,6 +176,29 @@ def test_an_old_link_with_the_name_of_a_temporary_file_goes_and_what_it_leads_to
 def test_a_name_that_is_not_utf_8_is_written_escaped(tmp_path):
     write_text(tmp_path / "t.txt", "Zürich n\udcff")
     assert (tmp_path / "t.txt").read_text(encoding="utf-8") == "Zürich n\\udcff"
+
+
+def test_whether_a_file_can_be_written_is_known_before(tmp_path):
+    check_writable(tmp_path / "new" / "folder" / "a.npz")
+    assert names(tmp_path) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(IsADirectoryError, match="expected a file to write, found a folder"):
+        check_writable(tmp_path)
+    with pytest.raises(WriteError, match=rf"{tmp_path}/file/a: cannot be written: Not a directory"):
+        check_writable(tmp_path / "file" / "a")
+
+
+def test_several_files_are_written_together_or_not_at_all(tmp_path):
+    def fail(path):
+        raise OSError(28, "No space left on device")
+
+    def write(path):
+        path.write_text("x")
+
+    assert write_all(tmp_path / "new", {"a": write, "b": write}) == [tmp_path / "new" / "a", tmp_path / "new" / "b"]
+    with pytest.raises(WriteError, match=rf"{tmp_path}/c: cannot be written: No space left on device"):
+        write_all(tmp_path, {"b": write, "c": fail})
+    assert names(tmp_path) == ["new"]
 
 
 def test_json_comes_back(tmp_path):

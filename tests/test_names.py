@@ -6,7 +6,8 @@ import pytest
 
 from sglpr_jax.names import MOST_BYTES, MOST_SHOWN, file_name, path_inside, printable
 
-HOSTILE = ("../../escaped", "/etc/passwd", "a/b", "a\\b", "", ".", "..", "a\0b", "a\nb", "x" * 2**20, "é" * 100, "\ud800")
+HOSTILE = ("../../escaped", "/etc/passwd", "a/b", "a\\b", "", ".", "..", "a\0b", "a\nb")
+HOSTILE += ("x" * 2**20, "é" * 100, "\ud800")
 
 
 @pytest.mark.parametrize("name", ["08", "2012-01-15", "scene 0061", "a.b", ".hidden", "Zürich [2]", "n\udcff", "a:b"])

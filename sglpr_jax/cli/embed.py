@@ -44,7 +44,9 @@ class EmbedCommand:
 
 def embed_recording(command: EmbedCommand) -> Path:
     """Run the command. Returns the path of the descriptor file."""
-    from sglpr_jax.methods.registry import method_named  # slow imports, not needed for --help
+    from sglpr_jax.files import check_writable  # slow imports, not needed for --help
+    from sglpr_jax.methods.registry import method_named
+    from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.embed import embed
 
     if command.weights is not None and command.method != NETWORK:
@@ -53,8 +55,10 @@ def embed_recording(command: EmbedCommand) -> Path:
         raise ValueError(f"expected --out to end in .npz, found {command.out}")
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
+    check_writable(command.out)
+    params = None if command.weights is None else load(command.weights)
     recording = command.source.open(command.data)
-    method = method_named(command.method, command.weights, recording)
+    method = method_named(command.method, params, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         file = embed(
             method,

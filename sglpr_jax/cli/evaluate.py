@@ -62,11 +62,13 @@ class EvaluateCommand:
 
 def evaluate_file(command: EvaluateCommand) -> Path:
     """Run the command. Returns the output folder."""
-    from sglpr_jax.evaluation.page.writing import write_sessions  # slow imports, not needed for --help
+    from sglpr_jax.evaluation.page.writing import NUMBERS, write_sessions  # slow imports, not needed for --help
     from sglpr_jax.evaluation.sessions import evaluate_session_files
+    from sglpr_jax.files import check_writable
 
     _check_options(command)
     folder = command.out or _folder(command.file)
+    check_writable(folder / NUMBERS)
     if command.database is not None:
         files = (command.file, *command.more)
         across = evaluate_session_files(command.database, files, command.protocol, published=command.published)
@@ -89,8 +91,8 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     from sglpr_jax.evaluation.scoring import evaluate_methods
     from sglpr_jax.models.weights_file import load
 
-    recording = None if command.data is None else command.source.open(command.data)
     params = None if command.weights is None else load(command.weights)
+    recording = None if command.data is None else command.source.open(command.data)
     poses = None
     if command.poses is not None:
         unit = command.source.time_unit

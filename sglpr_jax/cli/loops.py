@@ -107,13 +107,13 @@ def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
     from sglpr_jax.models.weights_file import load
 
     source, path = command.source, command.odometry
+    params = load(command.weights)
     if path is None:
         recording, odometry = source.open(command.recording), None
     else:
         recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
     if too_recent := why_few_queries(recording, config.candidates):
         warn(f"{recording.name}: {too_recent}")
-    params = load(command.weights)
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(
             recording,

@@ -58,12 +58,14 @@ class RelocalizeCommand:
 
 def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     """Run the command. Returns the answers, the most probable first."""
-    from sglpr_jax.files import write_json  # slow imports, not needed for --help
+    from sglpr_jax.files import check_writable, write_json  # slow imports, not needed for --help
     from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.loops.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
 
+    if command.out is not None:
+        check_writable(command.out)
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     name = command.scan.name

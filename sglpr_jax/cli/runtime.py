@@ -6,11 +6,13 @@ import dataclasses
 import functools
 import gc
 import inspect
+import io
 import logging
 import os
 import re
 import signal
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import distribution
@@ -23,6 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.fields import check_value, field_types, has_bounds
+from sglpr_jax.names import printable
 
 _TABLE_WIDTH = 140
 _INSTALLED_AS = "sglpr-"
@@ -30,12 +33,27 @@ _INSTALLED_AS = "sglpr-"
 _OBJECTS_BETWEEN_COLLECTIONS = 100_000
 """Allocations between garbage collections. Imports and tracing create permanent objects; with Python's default of 700,
 the collections took an eighth of the start-up time."""
+_ENDED_BY_READER = 141
+"""Exit status after a write to a pipe without a reader, as in shells (128 + SIGPIPE)."""
+_MOST_OF_AN_ERROR = 2000
+"""Maximum number of characters of an error message. File names and tables may contain long names."""
 T = TypeVar("T")
 
 
 def cache_folder() -> Path:
-    """Return the user's folder for compiled programs and simulated recordings."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax"
+    """Return the user's folder for compiled programs and simulated recordings.
+
+    A user without a home folder, as in some containers, gets a temporary folder that ends with the process.
+    """
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax"
+    except RuntimeError:  # neither HOME nor an entry for the user
+        return Path(_temporary_folder().name)
+
+
+@functools.cache
+def _temporary_folder() -> tempfile.TemporaryDirectory:
+    return tempfile.TemporaryDirectory(prefix="sglpr-jax-")
 
 
 def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
@@ -83,7 +101,7 @@ def _check_numbers(command: Any) -> None:
 
 def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     """Parse a command line and run the command. Invalid input gives one line on stderr and exit status 1, Ctrl-C gives
-    130."""
+    130. If the reader of the output ends early, as `head` does, the command ends without a message."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     for chatty in ("absl", "asyncio"):  # they log pages about a failed checkpoint, which orbax also raises
         logging.getLogger(chatty).setLevel(logging.CRITICAL)
@@ -94,14 +112,53 @@ def run(parse: Callable[[], T], work: Callable[[T], object]) -> None:
     warnings.simplefilter("always", DataWarning)
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _show_unraisable
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be UTF-8
     try:
         command = parse()
         _keep_compiled_programs()
         work(command)
+    except BrokenPipeError:
+        sys.exit(_ENDED_BY_READER)
     except (ValueError, OSError, FloatingPointError, ImportError) as error:
-        sys.exit(own_names(f"error: {' '.join(str(error).split())}"))
+        sys.exit(_one_line(error))
+    except (RuntimeError, AssertionError):  # JAX raises these for a missing device
+        missing = _missing_device()
+        if missing is None:
+            raise
+        sys.exit(_one_line(missing))
     except KeyboardInterrupt:
         sys.exit(130)
+    finally:
+        _flush_stdout()
+
+
+def _one_line(error: Exception) -> str:
+    return own_names(f"error: {printable(' '.join(str(error).split()), most=_MOST_OF_AN_ERROR)}")
+
+
+def _missing_device() -> ValueError | None:
+    """Return an error if JAX does not find the devices of JAX_PLATFORMS."""
+    asked = os.environ.get("JAX_PLATFORMS")
+    if not asked:
+        return None
+    import jax  # slow imports, not needed for --help
+
+    from sglpr_jax.files import in_short
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        return ValueError(f"JAX_PLATFORMS={asked}: expected a device that JAX finds, found none ({in_short(error)})")
+    return None
+
+
+def _flush_stdout() -> None:
+    """Flush stdout. If its reader has ended, discard the rest, because Python would report it at exit."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _keep_compiled_programs() -> None:
@@ -171,7 +228,7 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar on stderr. The context returns a function that sets the finished count. Without a terminal nothing is
     shown."""
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(title, total=total)
+        task = progress.add_task(printable(title), total=total)
         yield lambda done: progress.update(task, completed=done)

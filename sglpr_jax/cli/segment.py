@@ -43,15 +43,16 @@ def segment_recording(command: SegmentCommand) -> Path:
 
     from sglpr_jax.evaluation.segmentation import map_confusion
     from sglpr_jax.evaluation.semantic_score import draw_semantics, semantic_score
-    from sglpr_jax.files import write_json
+    from sglpr_jax.files import check_writable, write_json
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.names import file_name
     from sglpr_jax.retrieval.semantic_maps import save_map, semantic_maps
 
-    recording, least = command.source.open(command.data), command.min_confidence
+    check_writable(command.out / RESULT_FILE)
     params = load(command.weights)
     if not params.config.segments:
         raise ValueError(f"{command.weights}: expected weights with a segmentation head, found none")
+    recording, least = command.source.open(command.data), command.min_confidence
     command.out.mkdir(parents=True, exist_ok=True)
     categories, classes, labelled, cells = params.config.categories, params.config.classes, 0, 0
     confusion = np.zeros((classes, classes), np.int64)

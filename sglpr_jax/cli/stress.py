@@ -50,16 +50,20 @@ def run_stress_test(command: StressCommand) -> Path:
     )
     from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.stress_test import stress_protocols, stress_test, write_stress_test
+    from sglpr_jax.files import check_writable
     from sglpr_jax.methods.registry import methods_named
+    from sglpr_jax.models.weights_file import load
 
     stress_protocols(command.protocol)  # report invalid names before the recording is opened
     chosen_corruptions(command.corruption)
+    check_writable(command.out / "results.json")
+    params = None if command.weights is None else load(command.weights)
     recording = command.source.open(command.data)
     if recording.has_images and not command.corruption:
         print(f"sequence {recording.name} has only images, which can only be rotated", file=sys.stderr)
     found = stress_test(
         recording,
-        methods_named(command.method, command.weights, recording),
+        methods_named(command.method, params, recording),
         folder=command.out,
         corruptions=command.corruption,
         protocols=command.protocol,

@@ -1,6 +1,7 @@
 """Figures of an evaluation (extra `viz`). They do not register with the global state of matplotlib."""
 
 import importlib.util
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from sglpr_jax.evaluation.protocols import Decision
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import Taxonomy, taxonomy
 from sglpr_jax.metrics import PrecisionRecallCurve
+from sglpr_jax.names import MOST_SHOWN, printable
 
 if TYPE_CHECKING:
     import matplotlib.axes
@@ -21,6 +23,8 @@ DOTS_PER_INCH = 150
 LOOP_COLOUR, WRONG_COLOUR = "#2b5fc4", "#d62728"
 MOST_INSIDE = 4
 """Maximum number of lines with a legend inside the axes. A longer legend would cover the lines."""
+LEGEND_CHARACTERS = 40
+"""Maximum length of a name in a legend. Longer ones leave no room for the plot."""
 
 DECISIONS = {
     Decision.NOT_A_QUERY: ("not a query", "#c8c8c8", 4),
@@ -44,7 +48,21 @@ def can_draw() -> bool:
 def save(figure: "matplotlib.figure.Figure", path: Path) -> None:
     """Write the figure atomically, in the format given by the suffix of `path`."""
     with replacing(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:], dpi=DOTS_PER_INCH)
+        write(figure, temporary, format=path.suffix[1:])
+
+
+def write(figure: "matplotlib.figure.Figure", to: Path | io.BytesIO, *, format: str = "png") -> None:
+    """Write the figure to a file or a stream. Names with `$` are drawn as they are, not as formulas."""
+    from matplotlib.legend import Legend
+    from matplotlib.text import Text
+
+    in_legends = {text for legend in figure.findobj(Legend) for text in legend.findobj(Text)}
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        most = LEGEND_CHARACTERS if text in in_legends else MOST_SHOWN
+        text.set_parse_math(False)
+        text.set_text("\n".join(printable(line, most=most) for line in text.get_text().split("\n")))
+    figure.savefig(to, format=format, dpi=DOTS_PER_INCH)
 
 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
+from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
+from sglpr_jax.names import printable
 
 WIDTH = 140
 """Width of printed results, in characters."""
@@ -23,11 +23,11 @@ PUBLISHED_NOTE = (
 )
 
 
-def table(results: Sequence[Result], *, title: str = "") -> Table:
+def table(results: Sequence[Result], *, title: str = "") -> PlainTable:
     """Return a table with one row per protocol: rule, score, interval, counts, distance and poses."""
-    rows = Table(*COLUMNS, title=title)
+    rows = PlainTable(*COLUMNS, title=title)
     for result in results:
-        rows.add_row(*map(escape, cells(result)))
+        rows.add_row(*cells(result))
     return rows
 
 
@@ -39,7 +39,7 @@ def cells(result: Result) -> tuple[str, ...]:
     return result.name, result.rule, format_score(result), _format_interval(result), counts, distance, poses
 
 
-def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> Table:
+def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> PlainTable:
     """Return a table of scores with one row per method and one column per protocol.
 
     If there are more than `MOST_COLUMNS` protocols, rows and columns are exchanged. All methods are scored on the same
@@ -48,13 +48,13 @@ def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> T
     names = [result.name for result in next(iter(methods.values()))]
     scores = [[format_score(result) for result in results] for results in methods.values()]
     if len(names) <= MOST_COLUMNS:
-        rows = Table("method", *names, title=title)
+        rows = PlainTable("method", *names, title=title)
         lines = zip(methods, scores, strict=True)
     else:
-        rows = Table("protocol", *methods, title=title)
+        rows = PlainTable("protocol", *map(printable, methods), title=title)
         lines = zip(names, zip(*scores, strict=True), strict=True)
     for name, line in lines:
-        rows.add_row(escape(name), *line)
+        rows.add_row(printable(name), *line)
     return rows
 
 
@@ -70,9 +70,9 @@ def published_rows(sequence: str) -> list[tuple[str, ...]]:
     return [(method, f"{score:.3f}", sources[method]) for method, score in scores.items()]
 
 
-def published_table(rows: Sequence[tuple[str, ...]]) -> Table:
+def published_table(rows: Sequence[tuple[str, ...]]) -> PlainTable:
     """Return `published_rows` as a table. Print `PUBLISHED_NOTE` below it."""
-    table = Table(*PUBLISHED_COLUMNS)
+    table = PlainTable(*PUBLISHED_COLUMNS)
     for row in rows:
         table.add_row(*row)
     return table

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 from rich.console import Console, ConsoleOptions
-from rich.table import Table
 
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation import report
@@ -19,8 +18,10 @@ from sglpr_jax.evaluation.false_positives import FalsePositive, worst_false_posi
 from sglpr_jax.evaluation.inputs import Input, read_input
 from sglpr_jax.evaluation.inputs.agreement import check_agreement
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
+from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import chosen_protocols
+from sglpr_jax.names import printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 
@@ -69,7 +70,7 @@ class Evaluation(report.PrintsItself):
             "published": self.published,
         }
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | str]:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[PlainTable | str]:
         yield report.table(self.results, title=self.title)
         if len(self.methods) > 1:
             yield report.comparison(self.methods)
@@ -189,7 +190,7 @@ def score(source: Input, protocols: Sequence[str] = ()) -> list[Result]:
 def _title(source: Input, file: Path | None) -> str:
     if isinstance(source, ScoredPairs):
         return f"{'pairs' if file is None else file.name}, {len(source.pairs)} pairs"
-    return f"sequence {source.sequence}, {len(source)} scans"
+    return f"sequence {printable(source.sequence)}, {len(source)} scans"
 
 
 def _sequence_of(source: Input) -> str:

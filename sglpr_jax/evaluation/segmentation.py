@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from rich.table import Table
 
+from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.labels import UNLABELLED, taxonomy
 from sglpr_jax.retrieval.semantic_maps import SemanticMap
 
@@ -78,10 +78,10 @@ def map_confusion(found: SemanticMap, *, categories: int) -> Int[np.ndarray, "k 
     return confusion_matrix(found.truth, found.predicted, counted=found.seen, classes=classes)
 
 
-def segmentation_table(result: SegmentationResult, *, categories: int, title: str = "") -> Table:
+def segmentation_table(result: SegmentationResult, *, categories: int, title: str = "") -> PlainTable:
     """Return a table with a row for each class that occurs, and rows for the means."""
     names = taxonomy(categories).names
-    table = Table(title=title, caption=f"{result.cells} cells with points and a label")
+    table = PlainTable(title=title, caption=f"{result.cells} cells with points and a label")
     for column in ("class", "share of the cells", "IoU"):
         table.add_column(column, justify="left" if column == "class" else "right")
     for name, share, iou in zip(names, result.shares, result.iou, strict=True):

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions
-from rich.table import Table
 
 from sglpr_jax.evaluation.inputs.own_file import read_own_file
+from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import ALL
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
 from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json
+from sglpr_jax.names import printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
 APART_M = 25.0
@@ -42,7 +43,7 @@ class AcrossSessions(PrintsItself):
     @property
     def title(self) -> str:
         """Title of the tables."""
-        return f"database {self.database}; queries of {len(self.sessions)} sessions"
+        return f"database {printable(self.database)}; queries of {len(self.sessions)} sessions"
 
     @property
     def results(self) -> list[Result]:
@@ -52,7 +53,7 @@ class AcrossSessions(PrintsItself):
     @property
     def columns(self) -> tuple[str, ...]:
         """Header of `rows`."""
-        return ("", *self.sessions, "mean")
+        return ("", *map(printable, self.sessions), "mean")
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return one row for each protocol: name, score of each session, and mean over the sessions with a score."""
@@ -73,9 +74,9 @@ class AcrossSessions(PrintsItself):
         beside = {"published": published} if self.published else {}
         return {**self.made_with, "database_session": self.database, "results": results, **beside}
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | str]:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[PlainTable | str]:
         yield table(self.results)
-        rows = Table(*self.columns, title=self.title)
+        rows = PlainTable(*self.columns, title=self.title)
         for row in self.rows():
             rows.add_row(*row)
         rows.add_section()

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
+from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.report import PrintsItself, format_score, to_json
 
@@ -38,7 +38,7 @@ class StressTest(PrintsItself):
         """Return values for `json.dump`, one item per row."""
         return stress_json(self.rows)
 
-    def __rich__(self) -> Table:
+    def __rich__(self) -> PlainTable:
         return stress_table(self.rows, title=self.title)
 
 
@@ -50,12 +50,12 @@ def score_changes(row: StressRow, clean: StressRow) -> dict[str, list[float]]:
     }
 
 
-def stress_table(rows: Sequence[StressRow], *, title: str = "") -> Table:
+def stress_table(rows: Sequence[StressRow], *, title: str = "") -> PlainTable:
     """Return a table with one row per corruption and one column per method and protocol.
 
     Each cell has the score and its change relative to the clean recording.
     """
-    table = Table("corruption", title=title)
+    table = PlainTable("corruption", title=title)
     for method, results in rows[0].results.items():
         for result in results:
             table.add_column(f"{method}\n{result.name}", justify="right")

@@ -118,8 +118,8 @@ class Unfinished:
     ) -> None:
         """Call `add` with each stored frame and its comparisons.
 
-        Stops at the first file that is missing, damaged or of another recording. With `missing=False`, it also stops at the first frame whose
-        scan could not be read.
+        Stops at the first file that is missing, damaged or of another recording. With `missing=False`, it also stops at
+        the first frame whose scan could not be read.
 
         Arguments:
           finder: Empty finder, to which `add` adds the frames.

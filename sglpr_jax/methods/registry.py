@@ -21,17 +21,17 @@ from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
 
 
-def method_named(name: str, weights: str | None, recording: Recording) -> Method:
+def method_named(name: str, params: Params | None, recording: Recording) -> Method:
     """Return the network with these weights (None: `DEFAULT_WEIGHTS`), or a handcrafted method."""
     if name != NETWORK:
         return handcrafted(name, recording, model_preset("sglpr").grid)
-    return network(load(DEFAULT_WEIGHTS if weights is None else weights))
+    return network(load(DEFAULT_WEIGHTS) if params is None else params)
 
 
-def methods_named(names: Sequence[str], weights: str | None, recording: Recording) -> dict[str, Method]:
+def methods_named(names: Sequence[str], params: Params | None, recording: Recording) -> dict[str, Method]:
     """Return the methods with these names. The network comes first if weights are given, or if nothing is given."""
-    described_first = [NETWORK] if weights is not None or not names else []
-    return {name: method_named(name, weights, recording) for name in dict.fromkeys([*described_first, *names])}
+    described_first = [NETWORK] if params is not None or not names else []
+    return {name: method_named(name, params, recording) for name in dict.fromkeys([*described_first, *names])}
 
 
 def method_beside(trained: Params, name: str, recording: Recording, *, seed: int = 0) -> Method:

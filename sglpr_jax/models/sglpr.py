@@ -95,9 +95,11 @@ def describe(
       Descriptors of length 1. The shipped weights give 256 numbers.
 
     Raises:
+      TypeError: If the images are no array, for instance a list.
       ValueError: If the images have another size than `params.config.grid`, if a density image has another integer
         type, if labels are missing, or if the head does not read labels.
     """
+    _check_array(bev)
     if 0 in bev.shape[:-2]:
         return jnp.zeros((*bev.shape[:-2], params.config.head.descriptor_size))
     return forward(params, bev, labels, segment=0).descriptor.reshape(*bev.shape[:-2], -1)
@@ -150,6 +152,7 @@ def forward(
     """
     config = params.config
     grid = config.grid
+    _check_array(bev)
     if bev.ndim < 2 or bev.shape[-2:] != (grid.height, grid.width):
         raise ValueError(f"expected images [..., H, W] of {grid.height} x {grid.width} cells, found shape {bev.shape}")
     if 0 in bev.shape:
@@ -167,6 +170,12 @@ def forward(
         rngs=None if key is None else {"drop_path": key},
     )
     return outputs
+
+
+def _check_array(bev: Any) -> None:
+    """Raises TypeError for a list. JAX would treat each of its numbers as an argument."""
+    if not hasattr(bev, "shape"):
+        raise TypeError(f"expected images as an array of numpy or JAX, found a {type(bev).__name__}; use np.asarray")
 
 
 def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:

@@ -57,7 +57,8 @@ def save(params: Params, folder: Path | str, *, half: bool = False) -> Path:
     values = {name: _halved(name, leaf) for name, leaf in values.items()} if half else values
     with replacing(folder) as new:
         new.mkdir()
-        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), CHECKED_FOR: _hash_of(dataclasses.asdict(params.config))})
+        config = _hash_of(dataclasses.asdict(params.config))
+        content = tensors_as_bytes(values, {CHECKSUM: hash_of(values), CHECKED_FOR: config})
         (new / WEIGHTS_FILE).write_bytes(content)  # save_file hides the OSError of a full disk
         (new / CONFIG_FILE).write_text(json.dumps(dataclasses.asdict(params.config), indent=2) + "\n")
     return folder

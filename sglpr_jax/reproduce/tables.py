@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rich.table import Table
-
+from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.report import PrintsItself
 
 OURS, PUBLISHED = "here", "published"
@@ -40,8 +39,8 @@ class PaperTable(PrintsItself):
     columns: Sequence[str]
     caption: str
 
-    def __rich__(self) -> Table:
-        table = Table(title=self.title, caption=self.caption)
+    def __rich__(self) -> PlainTable:
+        table = PlainTable(title=self.title, caption=self.caption)
         for name in self._head():
             table.add_column(name, justify="left" if name in ("method", "source") else "right")
         for row in self.rows:

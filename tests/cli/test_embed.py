@@ -1,6 +1,8 @@
+import errno
 import json
 import shutil
 import warnings
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -135,6 +137,24 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_work(embed, town
     options = ("--method", "thumbnail", "--data", town, "--seq", "08")
     assert_one_line_error(embed(*options, out="no/out.npz")[0], "no/out.npz", "does not exist")
     assert_one_line_error(embed(*options, out="out")[0], ".npz")
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_recording_is_opened(embed, town, tmp_path, monkeypatch):
+    def refuse(path, *arguments):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    options = ("--method", "thumbnail", "--data", town, "--seq", "08")
+    (tmp_path / "folder.npz").mkdir()
+    ended, _ = embed(*options, out="folder.npz")
+    assert ended.error == f"error: {tmp_path / 'folder.npz'}: expected a file to write, found a folder\n"
+    monkeypatch.setattr(Path, "touch", refuse)
+    ended, out = embed(*options)
+    assert ended.error == f"error: {out}: cannot be written: Permission denied\n"
+
+
+def test_weights_that_do_not_exist_are_told_before_the_recording_is_opened(embed, town, tmp_path):
+    ended, _ = embed("--data", town, "--seq", "08", "--weights", tmp_path / "nosuch")
+    assert ended.error.startswith(f"error: {tmp_path / 'nosuch'}: expected a folder with config.json"), ended.error
 
 
 @pytest.mark.parametrize("batch", [0, -1])

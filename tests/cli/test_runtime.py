@@ -1,10 +1,15 @@
 """Commands are called as whoever started one knows them; what is a path stays one."""
 
 import dataclasses
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import sglpr_jax
+from sglpr_jax.cli import runtime
 from sglpr_jax.cli.runtime import own_names, parse_command
 from sglpr_jax.fields import NotNegative, Size
 
@@ -76,3 +81,88 @@ def test_numbers_that_no_flag_can_have_are_told(flags, error):
 
 def test_all_other_numbers_are_taken():
     assert parse_command(Example, "example", ["--spacing-m", "0", "--seed", "-3"]) == Example(8, 0.0, -3)
+
+
+PRINTS = """
+import sys
+from sglpr_jax.cli.runtime import run
+
+def work(command):
+    for number in range(100_000):
+        print(number)
+
+run(lambda: None, work)
+"""
+ALWAYS = {"PYTHONPATH": str(Path(sglpr_jax.__file__).parents[1]), "PYTHONUNBUFFERED": ""}
+
+
+def python(program: str, *, shell: str = "", **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a program in a Python of its own, whose environment is that of the test unless another is given."""
+    surroundings = environment or dict(os.environ)
+    code = ["bash", "-c", f'"$0" -c "$1" {shell}; echo status ${{PIPESTATUS[0]}} >&2', sys.executable, program]
+    return subprocess.run(code, capture_output=True, text=True, env={**surroundings, **ALWAYS}, timeout=120)
+
+
+def test_a_reader_that_ends_early_ends_the_command_without_a_message():
+    ended = python(PRINTS, shell="| head -1")
+    assert ended.stdout == "0\n" and ended.stderr == "status 141\n"
+
+
+def test_a_reader_that_ends_before_the_last_flush_is_no_error():
+    ended = python(PRINTS.replace("100_000", "1"), shell="| true")
+    assert ended.stderr == "status 0\n"
+
+
+def test_output_that_is_not_utf_8_is_escaped():
+    program = "from sglpr_jax.cli.runtime import run; run(lambda: None, lambda command: print('n\\udcff'))"
+    assert python(program, PATH=os.environ["PATH"], LANG="C.UTF-8", HOME="/tmp").stdout == "n\\udcff\n"
+
+
+def test_a_user_without_a_home_has_a_cache_until_the_process_ends(monkeypatch, tmp_path):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.setattr(runtime.tempfile, "tempdir", str(tmp_path))
+    runtime._temporary_folder.cache_clear()
+    folder = runtime.cache_folder()
+    assert folder == runtime.cache_folder() and folder.is_dir() and folder.stat().st_mode & 0o077 == 0
+    assert folder.parent == tmp_path
+    runtime._temporary_folder().cleanup()
+    runtime._temporary_folder.cache_clear()
+
+
+def test_a_device_that_is_absent_is_one_line():
+    program = """
+import sys
+from sglpr_jax.cli.runtime import run
+
+def work(command):
+    import jax
+    jax.devices()
+
+run(lambda: None, work)
+"""
+    ended = python(program, **{**os.environ, "JAX_PLATFORMS": "nosuch"})
+    assert ended.stderr.startswith("error: JAX_PLATFORMS=nosuch: expected a device that JAX finds, found none (")
+    assert ended.stderr.endswith("\nstatus 1\n") and ended.stderr.count("\n") == 2
+
+
+def test_another_error_of_a_program_is_not_hidden(monkeypatch):
+    def work(command):
+        raise RuntimeError("a fault of this program")
+
+    with pytest.raises(RuntimeError, match="a fault of this program"):
+        runtime.run(lambda: None, work)
+
+
+@pytest.mark.parametrize(("text", "found"), [("a\x1b[2J\nb", "error: a\\x1b[2J b"), ("x" * 2**20, None)])
+def test_an_error_is_one_line_of_limited_length(text, found):
+    def work(command):
+        raise ValueError(text)
+
+    with pytest.raises(SystemExit) as ended:
+        runtime.run(lambda: None, work)
+    assert isinstance(ended.value.code, str) and len(ended.value.code) < 2100
+    assert found is None or ended.value.code == found

@@ -43,14 +43,16 @@ def test_an_unknown_sequence_lists_those_that_exist(kitti_root, bev_root):
 
 
 def test_an_unknown_layout_says_what_was_expected(tmp_path):
-    expected = r"expected sequences/NN/velodyne.*NN/imgs.*no known layout: "
-    with pytest.raises(FileNotFoundError, match=f"{expected}no files"):
+    expected = "; expected sequences/NN/velodyne.*NN/imgs.*"
+    with pytest.raises(FileNotFoundError, match=rf"{tmp_path}: found no known layout: no files{expected}"):
         recording_names(tmp_path)
     (tmp_path / "scans").mkdir()
     (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(FileNotFoundError, match=rf"{expected}1 .txt, 1 folder \(scans\)"):
+    with pytest.raises(FileNotFoundError, match=rf"no known layout: 1 .txt, 1 folder \(scans\){expected}"):
         recording_names(tmp_path)
-    with pytest.raises(FileNotFoundError, match="found no such folder"):
+    with pytest.raises(
+        FileNotFoundError, match=r"none: expected the folder of a recording, or a bag, found no such folder$"
+    ):
         open_recording(tmp_path / "none", "08")
 
 

@@ -51,7 +51,8 @@ def test_a_new_file_is_all_that_a_new_layout_needs(with_another, tmp_path):
     assert recording_names(root.parent) == ("A",)
     recording = open_recording(root.parent, "A", pose_source="kitti")
     assert recording.points(0).shape == (3, 3) and recording.pose_source == "kitti"
-    with pytest.raises(FileNotFoundError, match=r"MulRan.*single scans .*found no such folder"):
+    (tmp_path / "none").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"found no known layout: no files; .*MulRan.*single scans"):
         recording_names(tmp_path / "none")
 
 

@@ -5,6 +5,7 @@ import functools
 import os
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from recordings import with_points
@@ -230,9 +231,9 @@ def fake_finder(seed: int = 0, frames: int = 5) -> CandidateFinder:
 
 def fake_candidates(seed: int = 0) -> list[Candidate]:
     draw = np.random.default_rng(seed)
-    x, y, yaw = map(np.asarray, draw.normal(size=3))
+    x, y, yaw = map(jnp.asarray, draw.normal(size=3))
     evidence = Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields))))
-    return [Candidate(4, 1, Alignment(x, y, yaw, np.eye(3), np.array(0.5), np.array(0.4)), evidence)]
+    return [Candidate(4, 1, Alignment(x, y, yaw, jnp.eye(3), jnp.array(0.5), jnp.array(0.4)), evidence)]
 
 
 def recalled(folder: Path, wanted: dict) -> list:

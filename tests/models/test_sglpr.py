@@ -219,3 +219,9 @@ def test_init_makes_every_weight_of_its_preset_from_its_key(random_params):
     assert 0.9 * config.backbone.width**-0.5 < np.abs(kernel).max() <= config.backbone.width**-0.5
     with pytest.raises(ValueError, match=r"expected a model preset \(paper, .*\), found 'huge'"):
         init(jax.random.key(0), preset="huge")
+
+
+def test_a_list_of_images_is_one_clear_error(as_installed, random_params):
+    params = random_params(model_preset("tiny"))
+    with pytest.raises(TypeError, match="expected images as an array of numpy or JAX, found a list; use"):
+        describe(params, [[0.0, 1.0], [2.0, 3.0]])

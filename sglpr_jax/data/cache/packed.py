@@ -54,10 +54,13 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
             "corrupted or simulated one"
         )
     source = _source(recording)
-    target = folder / f"{file_name(recording.name)}-{hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]}"
+    identity = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
+    target = folder / f"{file_name(recording.name)}-{identity}"
     if not target.is_dir():
         _make(target, recording, source, on_progress)
-    return dataclasses.replace(recording, read=_reader(recording, open_pack(target, scans=len(recording))), on_disk=False)
+    return dataclasses.replace(
+        recording, read=_reader(recording, open_pack(target, scans=len(recording))), on_disk=False
+    )
 
 
 def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:

@@ -109,5 +109,8 @@ def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:
             else ""
         )
         raise FileNotFoundError(f"{root}: expected the folder of a recording, found a single file{scan}")
-    found = f"no known layout: {left_aside(root, ()) or 'no files'}" if root.is_dir() else "no such folder"
-    raise FileNotFoundError(f"{root}: expected {', '.join(layouts)} or {last}, found {found}")
+    if not root.is_dir():
+        raise FileNotFoundError(f"{root}: expected the folder of a recording, or a bag, found no such folder")
+    raise FileNotFoundError(
+        f"{root}: found no known layout: {left_aside(root, ()) or 'no files'}; expected {', '.join(layouts)} or {last}"
+    )

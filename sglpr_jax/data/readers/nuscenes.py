@@ -41,9 +41,7 @@ def open_recording(root: Path, name: str) -> Recording:
     """
     tables = next(folder for folder in _versions(root) if name in _scenes(folder))
     scene = _scenes(tables)[name]
-    samples = set(
-        texts_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token")
-    )
+    samples = set(texts_of(tables / "sample.json", table_rows(tables / "sample.json", "scene_token", {scene}), "token"))
     table = tables / "sample_data.json"
     listed = table_rows(table, "sample_token", samples)
     files = [path_inside(root, file, source=table) for file in column_of(table, listed, "filename")]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Num
 from PIL import Image
 
-from sglpr_jax.evaluation.figures import DOTS_PER_INCH, brightness
+from sglpr_jax.evaluation.figures import brightness, write
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -83,7 +83,7 @@ def missing(text: str) -> str:
 def figure_html(figure: "matplotlib.figure.Figure", name: str, *, caption: str = "") -> str:
     """Return a matplotlib figure as an embedded image. `name` is the alternative text."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=DOTS_PER_INCH)
+    write(figure, stream)
     width = round(figure.get_figwidth() * 96)  # a CSS pixel is 1/96 of an inch
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     picture = f'<img src="{_uri(stream)}" width="{width}" alt="{escape(name)}">'

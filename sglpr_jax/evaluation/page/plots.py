@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.scoring import Evaluation
+from sglpr_jax.names import file_name
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -47,4 +48,4 @@ def draw_trajectory(found: Evaluation) -> Plots:
 
 def _name(result: str) -> str:
     """Return the file name of the plot of several methods by one protocol."""
-    return f"precision-recall-{result.lower().replace(' ', '-').replace(':', '-')}.png"
+    return f"precision-recall-{file_name(result.lower().replace(' ', '-').replace(':', '-'))}.png"

@@ -1,5 +1,6 @@
 """Writes the numbers, plots and page of an evaluation to a folder."""
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from sglpr_jax.evaluation.page.across_sessions import sessions_page
 from sglpr_jax.evaluation.page.plots import Plots, plot_names
 from sglpr_jax.evaluation.scoring import Evaluation
 from sglpr_jax.evaluation.sessions import AcrossSessions
-from sglpr_jax.files import read_json, write_json, write_text
+from sglpr_jax.files import json_text, read_json, text_bytes, write_all
 
 NUMBERS = "results.json"
 PAGE = "report.html"
@@ -40,15 +41,15 @@ def write_sessions(found: AcrossSessions, folder: Path) -> list[Path]:
 
 
 def _write(folder: Path, numbers: Mapping[str, Any], plots: Plots, html: str) -> list[Path]:
-    """Replace an earlier evaluation in the folder. Returns the paths written."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in _earlier_plots(folder) - set(plots):
+    """Replace an earlier evaluation in the folder, completely or not at all. Returns the paths written."""
+    earlier = _earlier_plots(folder)
+    drawn = {name: functools.partial(figures.write, figure) for name, figure in plots.items()}
+    texts = {NUMBERS: json_text(numbers), PAGE: html}
+    said = {name: functools.partial(Path.write_bytes, data=text_bytes(text)) for name, text in texts.items()}
+    written = write_all(folder, {NUMBERS: said[NUMBERS], **drawn, PAGE: said[PAGE]})
+    for name in earlier - set(plots):
         (folder / name).unlink(missing_ok=True)
-    write_json(folder / NUMBERS, numbers)
-    for name, figure in plots.items():
-        figures.save(figure, folder / name)
-    write_text(folder / PAGE, html)
-    return [folder / name for name in (NUMBERS, *plots, PAGE)]
+    return written
 
 
 def _earlier_plots(folder: Path) -> set[str]:
