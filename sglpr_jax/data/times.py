@@ -53,8 +53,11 @@ def times_of(
     return seconds
 
 
-def doubt(times: Float[np.ndarray, " n"]) -> str:
-    """Describes why times cannot be seconds of scans or poses. Empty if they can, or if they are too few to judge."""
+def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
+    """Describes why times cannot be seconds of scans or poses. Empty if they can, or if they are too few to judge.
+
+    With `numbers`, whole numbers count as numbers of frames. Headers of bags have a unit and may have whole seconds.
+    """
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
     steps = np.diff(times)
@@ -66,7 +69,7 @@ def doubt(times: Float[np.ndarray, " n"]) -> str:
     if usual > SLOWEST_S:
         unit = next((unit for unit in NAMES if usual <= SLOWEST_S * PER_SECOND[unit]), "ns")
         return f"steps of {usual:g}, which fit {NAMES[unit]}"
-    if usual >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
+    if numbers and usual >= 1 and times[0] < EPOCH and (times == np.round(times)).all():
         return f"whole numbers from {times[0]:g} to {times[-1]:g}, as of frames"
     return ""
 

@@ -28,7 +28,8 @@ class Stamps(NamedTuple):
     @property
     def orderly(self) -> bool:
         """Whether the header times are positive, never decrease, and can be seconds (`times.doubt`)."""
-        return bool(len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all() and not doubt(self.own))
+        ordered = len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all()
+        return bool(ordered and not doubt(self.own, numbers=False))
 
     @property
     def seconds(self) -> Float[np.ndarray, " n"]:

@@ -86,7 +86,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
 
 def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
     """Times of the scans in seconds, or None with a warning if neither headers nor recorder have seconds."""
-    if found := doubt(stamps.seconds):
+    if found := doubt(stamps.seconds, numbers=False):
         warn(f"{source}: expected times in seconds in the headers or of the recorder, found {found}; not used")
         return None
     return stamps.seconds
