@@ -228,7 +228,7 @@ LEVEL = np.tile([1.73, 0, 0, 1], (3, 1))
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"world_from_place": changed(POSES, (1, 0, 3), np.nan)}, r"finite world_from_place, .* in row 1"),
+        ({"world_from_place": changed(POSES, (1, 0, 3), np.nan)}, "expected finite world_from_place"),
         ({"world_from_place": 2 * POSES}, r"expected world_from_place \(n, 4, 4\), with rotations"),
         ({"world_from_place": changed(POSES, (2, 3, 0), 5)}, r"expected world_from_place .* in row 2"),
         ({"world_from_place": POSES.astype(np.float32)}, "expected world_from_place as float64"),
