@@ -51,8 +51,16 @@ def _section(name: str, command: type) -> str:
 
 def _flags(command: type) -> list[Field]:
     """The fields of a command, with those of the options that several commands share in their place."""
-    each = [fields_of(type(f.default)) if "OmitArgPrefixes" in f.annotation else [f] for f in fields_of(command)]
-    return [field for fields in each for field in fields]
+    return [flag for field in fields_of(command) for flag in _expanded(field)]
+
+
+def _expanded(field: Field) -> list[Field]:
+    """A field, or the fields of the options in it, with its name as a prefix. Those of a preset have their own page."""
+    if not dataclasses.is_dataclass(field.default) or field.name == "config":
+        return [field]
+    prefix = "" if "OmitArgPrefixes" in field.annotation else f"{field.name}."
+    nested = [flag for one in fields_of(type(field.default)) for flag in _expanded(one)]
+    return [one._replace(name=prefix + one.name) for one in nested]
 
 
 def _row(field: Field) -> tuple[str, str, str]:

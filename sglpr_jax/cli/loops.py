@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
@@ -11,10 +11,15 @@ from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, repo
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, Degenerate, OdometryFormat
+from sglpr_jax.loops.config import (
+    CandidateConfig,
+    ConsistencyConfig,
+    DetectorConfig,
+    DriftModel,
+    SequenceConfig,
+    VerificationConfig,
+)
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
-
-if TYPE_CHECKING:
-    from sglpr_jax.loops.config import DetectorConfig
 
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""
@@ -65,18 +70,34 @@ class LoopsCommand:
     `keep` writes them with that information matrix, `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
+    min_neighbour_probability: float = DetectorConfig.min_neighbour_probability
+    """Minimum probability of a neighbouring pair that supports a loop."""
+    near_m: float = DetectorConfig.near_m
+    """With odometry, a loop must agree with at least half of the loops within this travelled distance, in metres."""
+    candidates: CandidateConfig = DetectorConfig.candidates
+    verification: VerificationConfig = DetectorConfig.verification
+    consistency: ConsistencyConfig = DetectorConfig.consistency
+    sequence: SequenceConfig = DetectorConfig.sequence
+    motion_drift: DriftModel = DetectorConfig.motion_drift
 
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.config import DetectorConfig, DriftModel
-    from sglpr_jax.loops.unfinished import alone  # slow imports, not needed for --help
+    from sglpr_jax.loops.unfinished import alone  # slow import, not needed for --help
 
     _check(command)
-    drift = DriftModel(command.drift_percent / 100, command.drift_deg_per_100m / 100)
-    config = DetectorConfig(min_probability=command.min_probability, drift=drift)
+    config = _config(command)
     with alone(command.out / UNFINISHED):
         return _search(command, config)
+
+
+def _config(command: LoopsCommand) -> DetectorConfig:
+    same = {
+        field.name: getattr(command, field.name)
+        for field in dataclasses.fields(DetectorConfig)
+        if field.name != "drift"
+    }
+    return DetectorConfig(drift=DriftModel(command.drift_percent / 100, command.drift_deg_per_100m / 100), **same)
 
 
 def _check(command: LoopsCommand) -> None:
@@ -96,7 +117,7 @@ def _check(command: LoopsCommand) -> None:
             )
 
 
-def _search(command: LoopsCommand, config: "DetectorConfig") -> int:
+def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.evaluation.page.of_loops import write_loops_page
     from sglpr_jax.loops.explanation import why_few_queries, why_none
     from sglpr_jax.loops.find import find_loops

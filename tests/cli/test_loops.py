@@ -5,6 +5,9 @@ import sys
 import numpy as np
 import pytest
 
+from sglpr_jax.cli import loops
+from sglpr_jax.cli.loops import LoopsCommand
+from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import find
@@ -92,6 +95,14 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == status, ended.error
     assert ("run the same command again to continue" in ended.error) == bool(status)
+
+
+def test_every_setting_of_the_detector_is_a_flag():
+    command = parse_command(LoopsCommand, "loops", ["scans", "--out", "found"])
+    assert loops._config(command) == DetectorConfig()
+    flags = ["--candidates.candidates", "10", "--sequence.support", "3", "--candidates.rivals.of-query", "4"]
+    changed = loops._config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
+    assert (changed.candidates.candidates, changed.sequence.support, changed.candidates.rivals.of_query) == (10, 3, 4)
 
 
 def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):

@@ -40,7 +40,7 @@ OTHER_UNIT = "expected times in seconds, found steps of .*, which fit (milli|mic
 
 @pytest.fixture(scope="module")
 def params():
-    return sglpr_jax.load("rings")
+    return sglpr_jax.load("circular")
 
 
 def detector_of(params, **options) -> LoopDetector:
