@@ -32,6 +32,14 @@ class PrecisionRecallCurve:
         """Index of the highest F1. If several are equal, the one with the highest threshold."""
         return len(self.thresholds) - 1 - int(np.argmax(self.f1[::-1]))
 
+    def at_precision(self, precision: float) -> int | None:
+        """Index of the highest recall with at least this precision, or None if no threshold has both.
+
+        If several are equal, the one with the highest threshold.
+        """
+        recall = np.where(self.precision >= precision, self.recall, 0.0)
+        return len(recall) - 1 - int(np.argmax(recall[::-1])) if recall.any() else None
+
     @property
     def f1_max(self) -> float:
         """Highest F1 over all thresholds."""

@@ -1,5 +1,6 @@
 """Test-wide settings: strict ranks, compiled programs that are kept, and where the development data lies."""
 
+import contextlib
 import os
 import resource
 from pathlib import Path
@@ -67,10 +68,19 @@ def _free_compiled_programs():
 
 @pytest.fixture
 def small_files():
-    """`small_files(size)`: from now on the system lets no file of this process grow beyond that many bytes."""
+    """`with small_files(size):` the system lets no file of this process grow beyond that many bytes. It may
+    afterwards, because pytest's own output may go to a file."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    @contextlib.contextmanager
+    def limited(size):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 @pytest.fixture

@@ -126,8 +126,7 @@ assert sglpr_jax.describe(params, sglpr_jax.scan_image(points, params.config)).s
 
 def test_a_full_disk_is_an_error_that_names_the_file_once(tmp_path, small_files):
     path = tmp_path / "a.bin"
-    small_files(10)
-    with pytest.raises(WriteError) as raised, writing(tmp_path), replacing(path) as temporary:
+    with small_files(10), pytest.raises(WriteError) as raised, writing(tmp_path), replacing(path) as temporary:
         temporary.write_bytes(bytes(100))
     assert str(raised.value) == f"{path}: cannot be written: File too large"
     assert names(tmp_path) == []

@@ -99,3 +99,13 @@ def test_a_score_of_minus_infinity_is_never_accepted():
 def test_scores_that_are_not_finite_are_refused():
     with pytest.raises(ValueError, match="expected finite scores, found 1 of 2"):
         classification_curve(np.array([np.nan, 1.0]), np.array([True, False]))
+
+
+def test_a_threshold_for_a_precision_keeps_as_much_recall_as_it_allows():
+    """By hand: right, right, wrong, right, wrong, from the highest score."""
+    curve = classification_curve(np.array([5.0, 4, 3, 2, 1]), np.array([True, True, False, True, False]))
+    assert curve.thresholds[curve.at_precision(1.0)] == 4
+    assert curve.thresholds[curve.at_precision(0.7)] == 2
+    assert curve.thresholds[curve.at_precision(0.6)] == 2  # 1 adds no recall
+    wrong = classification_curve(np.array([2.0, 1]), np.array([False, True]))
+    assert wrong.at_precision(0.99) is None

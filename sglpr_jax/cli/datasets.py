@@ -15,14 +15,19 @@ if TYPE_CHECKING:
     from sglpr_jax.sim import Simulated
 
 
-def dataset_root(data: Path | None) -> Path:
+def dataset_root(data: Path | None, *, write: bool = True) -> Path:
     """Return the dataset's folder. Without one, the simulated recordings are created in the user's cache on first
-    use."""
+    use. Raises FileNotFoundError if they do not exist and `write` is false."""
     if data is not None:
         return data
     from sglpr_jax.sim.simulation import default_dataset  # imports the simulator, not needed for real data
 
     root, options = default_dataset(cache_folder())
+    if not write and not root.is_dir():
+        raise FileNotFoundError(
+            f"{root}: expected the simulated recordings, found none; the command without --plan writes them first, "
+            "--data states another dataset"
+        )
     print(
         f"no --data: using the simulated recordings in {root} "
         "(for real KITTI: --data FOLDER that contains sequences/NN/velodyne)",

@@ -79,7 +79,7 @@ def reproduce(command: ReproduceCommand) -> Path:
     from sglpr_jax.reproduce.runs import Runs
 
     names = chosen_experiments(command.what)
-    root = dataset_root(command.data)
+    root = dataset_root(command.data, write=not command.plan)
     runs = Runs(command.out, root, command.preset, command.config, command.pose_source, progress_bar)
     seqs = command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(runs.data))
     check(runs, names, seqs, command.method, command.nclt)

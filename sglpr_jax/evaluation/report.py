@@ -9,6 +9,7 @@ from rich.console import Console
 from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.published import LEARNED, TABLE_1
+from sglpr_jax.metrics import PrecisionRecallCurve
 from sglpr_jax.names import printable
 
 WIDTH = 140
@@ -16,6 +17,9 @@ WIDTH = 140
 MOST_COLUMNS = 6
 """Maximum number of protocols side by side. More do not fit a terminal."""
 COLUMNS = ("protocol", "rule", "score", "95 %", "rests on", "distance", "poses")
+PRECISIONS = (0.99, 1.0)
+"""Precisions for which results state a threshold."""
+THRESHOLD_COLUMNS = ("protocol", "threshold for", "descriptor distance", "precision", "recall")
 PUBLISHED_COLUMNS = ("method", "published F1max", "numbers from")
 PUBLISHED_NOTE = (
     f"Published: learned methods in table 1 of the SG-LPR paper, on {TABLE_1.dataset}. The rows do not share one "
@@ -37,6 +41,28 @@ def cells(result: Result) -> tuple[str, ...]:
     distance = "as given" if result.dimensions is None else f"{result.dimensions}-D"
     poses = result.pose_source or ""
     return result.name, result.rule, format_score(result), _format_interval(result), counts, distance, poses
+
+
+def threshold_table(results: Sequence[Result]) -> PlainTable:
+    """Return a table of descriptor distances up to which answers or pairs are accepted (`threshold_rows`)."""
+    rows = PlainTable(*THRESHOLD_COLUMNS)
+    for row in threshold_rows(results):
+        rows.add_row(*row)
+    return rows
+
+
+def threshold_rows(results: Sequence[Result]) -> list[tuple[str, ...]]:
+    """Return the rows of `threshold_table`: for each result with a curve, the highest F1 and each of `PRECISIONS`."""
+    return [
+        (
+            result.name,
+            goal,
+            *("" if point is None else f"{point[name]:.3f}" for name in ("distance", "precision", "recall")),
+        )
+        for result in results
+        if result.curve is not None
+        for goal, point in {"highest F1": _at_f1max(result), **_at_precisions(result, "precision {:g}")}.items()
+    ]
 
 
 def comparison(methods: Mapping[str, Sequence[Result]], *, title: str = "") -> PlainTable:
@@ -119,6 +145,7 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
             "published_on": result.published_on,
             "average_precision": None if result.curve is None else result.curve.average_precision,
             "at_f1max": _at_f1max(result),
+            "at_precision": _at_precisions(result, "{:g}"),
             "recall_at": {str(n): recall for n, recall in result.recalls.items()},
         }
         for result in results
@@ -127,11 +154,19 @@ def to_json(results: Sequence[Result]) -> list[dict[str, Any]]:
 
 def _at_f1max(result: Result) -> dict[str, float] | None:
     """Return precision, recall and largest accepted descriptor distance at the highest F1."""
+    return None if result.curve is None else _point(result.curve, result.curve.best)
+
+
+def _at_precisions(result: Result, name: str) -> dict[str, dict[str, float] | None]:
+    """Return the same for each of `PRECISIONS`, None for a precision that no threshold reaches."""
     curve = result.curve
     if curve is None:
+        return {}
+    return {name.format(goal): _point(curve, curve.at_precision(goal)) for goal in PRECISIONS}
+
+
+def _point(curve: PrecisionRecallCurve, index: int | None) -> dict[str, float] | None:
+    if index is None:
         return None
-    return {
-        "precision": float(curve.precision[curve.best]),
-        "recall": float(curve.recall[curve.best]),
-        "distance": float(-curve.thresholds[curve.best]),
-    }
+    precision, recall, threshold = curve.precision[index], curve.recall[index], curve.thresholds[index]
+    return {"precision": float(precision), "recall": float(recall), "distance": float(-threshold)}

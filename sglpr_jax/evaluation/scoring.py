@@ -72,6 +72,8 @@ class Evaluation(report.PrintsItself):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[PlainTable | str]:
         yield report.table(self.results, title=self.title)
+        if any(result.curve is not None for result in self.results):
+            yield report.threshold_table(self.results)
         if len(self.methods) > 1:
             yield report.comparison(self.methods)
         if self.published:

@@ -1,5 +1,6 @@
-"""Progress bar of a training run on stderr."""
+"""Progress of a training run on stderr: a bar, or lines if there is no terminal."""
 
+import sys
 from collections.abc import Mapping
 
 from rich.console import Console
@@ -12,11 +13,15 @@ _SHOWN = ("loss", *TERM_NAMES, *MEASURES, "steps_per_second")
 
 
 class ProgressBar(Callback):
-    """Shows finished steps, remaining time and the latest measurements. Without a terminal it shows nothing."""
+    """Shows finished steps, remaining time and the latest measurements.
+
+    Without a terminal it prints a line for each call of `on_step`.
+    """
 
     def __init__(self):
         self._progress: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
+        self._steps = 0
 
     def on_pack(self, recording: str, done: int, scans: int) -> None:
         """Show how many scans of the recording are packed."""
@@ -24,12 +29,15 @@ class ProgressBar(Callback):
 
     def on_start(self, step: int, steps: int) -> None:
         """Show the number of finished steps."""
+        self._steps = steps
         self._show("train", step, steps)
 
     def on_step(self, step: int, values: Mapping[str, float]) -> None:
         """Show the step and its measurements."""
         terms = "  ".join(f"{name} {values[name]:.3g}" for name in _SHOWN if name in values)
         self._show("train", step, None, terms=terms)
+        if self._progress is not None and self._progress.disable:
+            print(f"step {step} of {self._steps}: {terms}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Stop the bar and leave it on the screen."""

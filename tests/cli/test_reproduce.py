@@ -223,3 +223,10 @@ def test_the_plan_tells_the_recordings_that_never_come_back(town, images, preset
     assert straight.text(1.0).splitlines()[-2] == "no revisits in 00, 06: no scores for them, and no means"
     assert plan(town, ["table1", "table3"], "08").without_revisits == ()
     assert plan(images, ["table3"], "00").without_revisits == ()
+
+
+def test_a_plan_writes_no_simulated_recordings(command, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    ended = command("reproduce", "table5", "--plan", "--out", tmp_path / "out")
+    assert_one_line_error(ended, "expected the simulated recordings, found none", "--data")
+    assert not list(tmp_path.glob("cache/**/*.bin"))

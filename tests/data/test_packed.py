@@ -147,10 +147,8 @@ def test_an_interruption_leaves_nothing(recording, tmp_path):
 
 @pytest.mark.parametrize("size", [10, 400])
 def test_a_full_disk_is_one_error_that_names_the_file_and_leaves_nothing(recording, tmp_path, small_files, size):
-    small_files(size)  # too small for the points; for the list of files
-    with pytest.raises(OSError, match=r"cache/.*08-.*: cannot be written: File too large"):
+    with small_files(size), pytest.raises(OSError, match=r"cache/.*08-.*: cannot be written: File too large"):
         packed(recording, tmp_path / "cache")
-    small_files(10**6)
     assert packs(tmp_path / "cache") == []
 
 

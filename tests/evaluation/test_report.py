@@ -96,5 +96,13 @@ def test_json_says_the_same(found, nothing_to_find):
     harmonic = 2 * best["precision"] * best["recall"] / (best["precision"] + best["recall"])
     assert harmonic == pytest.approx(pairs["score"])
     assert best["distance"] > 0
-    assert recall["at_f1max"] is None
+    assert recall["at_f1max"] is None and recall["at_precision"] == {}
+    assert pairs["at_precision"].keys() == {"0.99", "1"}
+    rows = report.threshold_rows(found)
+    assert [row[:2] for row in rows[:3]] == [
+        (found[0].name, "highest F1"),
+        (found[0].name, "precision 0.99"),
+        (found[0].name, "precision 1"),
+    ]
+    assert len(rows) == 6 and float(rows[3][2]) == pytest.approx(best["distance"], abs=5e-4)
     assert [entry["score"] for entry in report.to_json(nothing_to_find)] == [None, None, None]

@@ -63,8 +63,10 @@ def test_where_no_evaluation_was_nothing_is_removed(sessions, tmp_path, numbers)
 def test_a_full_disk_leaves_the_earlier_evaluation_as_it_was(one, sessions, tmp_path, small_files):
     write_sessions(sessions, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    small_files(len(before["results.json"]) * 4)  # the page is larger, the numbers are not
-    with pytest.raises(WriteError, match=r"(precision-recall\.png|report\.html): cannot be written: File too large"):
+    with (
+        small_files(len(before["results.json"]) * 4),
+        pytest.raises(WriteError, match=r"(precision-recall\.png|report\.html): cannot be written: File too large"),
+    ):
         write_evaluation(one, tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 

@@ -86,8 +86,7 @@ def test_a_segmentation_head_that_sees_more_channels_begins_with_those_it_had(pa
 
 def test_a_full_disk_is_an_error_that_names_the_folder_and_leaves_what_was_there(params, tmp_path, small_files):
     folder = save(params, tmp_path / "weights")
-    small_files(10_000)
-    with pytest.raises(OSError, match=rf"{folder}: cannot be written: File too large"):
+    with small_files(10_000), pytest.raises(OSError, match=rf"{folder}: cannot be written: File too large"):
         save(jax.tree.map(np.zeros_like, params), folder)
     assert weights_hash(load(folder)) == weights_hash(params)
     assert [path.name for path in tmp_path.iterdir()] == ["weights"]

@@ -137,8 +137,7 @@ def test_a_file_with_types_that_numpy_lacks_is_refused(tmp_path):
 def test_a_full_disk_leaves_the_index_that_was_there(tmp_path, small_files):
     path = tmp_path / "places.safetensors"
     index_of(20).save(path)
-    small_files(4000)
-    with pytest.raises(WriteError, match=r"places\.safetensors"):
+    with small_files(4000), pytest.raises(WriteError, match=r"places\.safetensors"):
         index_of(2000).save(path)
     assert len(Index.load(path)) == 20 and list(tmp_path.iterdir()) == [path]
 

@@ -62,13 +62,12 @@ def test_a_full_disk_is_an_error_that_names_the_file_and_what_was_cut_short_is_r
     path = tmp_path / "metrics.jsonl"
     log = write(path, [1, 2])
     whole = path.read_bytes()
-    small_files(len(whole) + 10)
-    with pytest.raises(OSError, match=rf"{path}: cannot be written: File too large"):
+    with small_files(len(whole) + 10), pytest.raises(OSError, match=rf"{path}: cannot be written: File too large"):
         log.append(3, {"loss": 0.3})
     log.close()
     assert len(path.read_bytes()) == len(whole) + 10  # a part of the third line
-    small_files(len(whole))
-    write(path, [], start_step=2).close()
+    with small_files(len(whole)):
+        write(path, [], start_step=2).close()
     assert path.read_bytes() == whole
 
 
@@ -76,8 +75,7 @@ def test_a_full_disk_leaves_the_metrics_of_a_run_to_be_resumed_as_they_were(tmp_
     path = tmp_path / "metrics.jsonl"
     write(path, [1, 2, 3]).close()
     whole = path.read_bytes()
-    small_files(10)
-    with pytest.raises(OSError, match=rf"{path}: cannot be written: File too large"):
+    with small_files(10), pytest.raises(OSError, match=rf"{path}: cannot be written: File too large"):
         write(path, [], start_step=3)
     assert path.read_bytes() == whole
 

@@ -11,7 +11,15 @@ from sglpr_jax.evaluation.page.document import Section, bev_html, figure_html, h
 from sglpr_jax.evaluation.page.pictures import HeatPicture, SemanticPicture
 from sglpr_jax.evaluation.page.plots import Plots
 from sglpr_jax.evaluation.protocols import Result
-from sglpr_jax.evaluation.report import COLUMNS, PUBLISHED_COLUMNS, PUBLISHED_NOTE, cells, format_score
+from sglpr_jax.evaluation.report import (
+    COLUMNS,
+    PUBLISHED_COLUMNS,
+    PUBLISHED_NOTE,
+    THRESHOLD_COLUMNS,
+    cells,
+    format_score,
+    threshold_rows,
+)
 
 NO_MATPLOTLIB = "Drawings: install the extra viz (pip install 'sglpr-jax[viz]')."
 INTERVALS = (
@@ -21,10 +29,11 @@ INTERVALS = (
 
 
 def results_section(results: Sequence[Result]) -> Section:
-    """Table of one method: rule, score, interval, counts and poses of every protocol."""
+    """Tables of one method: rule, score, interval, counts and poses of every protocol, and thresholds."""
     rows = [(*cells(result), result.published_on) for result in results]
     table = html_table((*COLUMNS, "published on"), rows, numbers=("score", "95 %", "rests on"))
-    return Section("Results", f"{table}\n<p class='about'>{INTERVALS}</p>")
+    thresholds = html_table(THRESHOLD_COLUMNS, threshold_rows(results), numbers=THRESHOLD_COLUMNS[2:])
+    return Section("Results", f"{table}\n<p class='about'>{INTERVALS}</p>\n{thresholds}")
 
 
 def comparison_section(methods: Mapping[str, Sequence[Result]]) -> Section:
