@@ -1,4 +1,4 @@
-"""Distances that define "the same place", and ages that define a revisit."""
+"""Distances within which two scans show the same place, and the minimum time between them for a revisit."""
 
 POSITIVE_M = 3.0
 """Maximum distance of two scans that show the same place, in metres."""

@@ -24,7 +24,7 @@ class StressCommand:
     """
 
     data: Path
-    """A dataset (KITTI's layout, ready-made BEV images) or a folder of scans with poses."""
+    """A dataset, in KITTI's layout or as ready-made BEV images, or a folder of scans with poses."""
     out: Path
     """Folder for results.json, config.json, stress.png and the descriptors. It is created if it does not exist."""
     weights: str | None = None

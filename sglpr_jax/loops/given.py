@@ -15,7 +15,7 @@ from sglpr_jax.files import in_short
 from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
 
 MOST_COLUMNS = 8
-"""Arrays with 4 to this number of columns are points with intensity or more, not images, which are wider."""
+"""Maximum number of columns of an array of points (x, y, z, intensity and further fields). Wider arrays are images."""
 
 DATES = (datetime.datetime, datetime.timedelta, np.datetime64, np.timedelta64)
 """Types of times that have a unit."""

@@ -49,7 +49,7 @@ def new_places(
       ids: Names of the places. By default their rows.
       times: Times in seconds, or None.
       positions: Positions in metres, or None.
-      before: Columns that the existing places have.
+      before: Names of the columns of the places in the index. New places need the same columns.
 
     Raises:
       ValueError: If the descriptors have another width, a value is not finite, or the columns differ from `before`.

@@ -92,7 +92,7 @@ def furnish(
 ) -> tuple[Shapes, list[Part]]:
     """Places things along the streets of `network`, clear of the streets and of `path`.
 
-    Returns the shapes, and the part of each row.
+    Returns the shapes, and the part that each shape belongs to.
     """
     placed, place_of = [], []
     makers = bystanders(rng)
@@ -218,7 +218,7 @@ def plant_islands(
 ) -> tuple[Shapes, list[Part]]:
     """Places a thing drawn by `make` in the middle of each roundabout.
 
-    Returns the shapes, and the part of each row.
+    Returns the shapes, and the part that each shape belongs to.
     """
     things = [make(rng) for _ in islands]
     owner = np.repeat(np.arange(len(things)), [len(thing) for thing in things])

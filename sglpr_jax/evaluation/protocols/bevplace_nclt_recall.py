@@ -15,11 +15,11 @@ from sglpr_jax.revisits import has_near
 def bevplace_nclt_recall(database: DescriptorFile, queries: DescriptorFile, *, seed: int = 0) -> Result:
     """Score Recall@1 across two sessions as BEVPlace++ does on NCLT: 5 m in x and y.
 
-    All frames of one session are the database, and all frames of the other are queries. A query counts if the database
-    has a frame less than 5 m away. It is found if the frame of the nearest descriptor is less than 5 m away. Published
-    on NCLT's ground truth with 2012-01-15 as the database, and 2012-02-04, 03-17, 06-15, 09-28, 11-16 and 2013-02-23 as
-    queries (zjuluolun/BEVPlace2, nclt_dataset.py). The frames used there are not published. The interval resamples the
-    queries that count.
+    All frames of one session are the database, and all frames of the other are queries. A query counts if the
+    database has a frame less than 5 m away. It is found if the frame of the nearest descriptor is less than 5 m
+    away. The published scores use NCLT's ground-truth poses, with 2012-01-15 as the database, and 2012-02-04,
+    03-17, 06-15, 09-28, 11-16 and 2013-02-23 as queries (zjuluolun/BEVPlace2, nclt_dataset.py). The frames used
+    there are not published. The interval resamples the queries that count.
     """
     check_same_method(database, queries)
     there, here = positions_of(database, 2), positions_of(queries, 2)

@@ -64,7 +64,7 @@ def _ranking(database: Float[np.ndarray, "n d"], distance: str) -> Callable[[np.
 def first_hits(
     queries: Float[np.ndarray, "q d"], database: Float[np.ndarray, "n d"], nearest: Int[np.ndarray, "q k"], near: Near
 ) -> Int[np.ndarray, " q"]:
-    """Return the rank, from 0, of the first answer of each query that is near, or k if no answer is near."""
+    """Return for each query the rank, from 0, of the first retrieved frame that is near the query, or k if none is."""
     apart = np.linalg.norm(queries[:, None] - database[nearest], axis=2)
     return first_true(near(apart) & (nearest >= 0))
 
