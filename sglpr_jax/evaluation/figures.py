@@ -317,13 +317,13 @@ def loops_in_time(
     wrong: Sequence[tuple[int, int]] = (),
     rejected: Sequence[tuple[int, int]] = (),
 ) -> "matplotlib.figure.Figure":
-    """Draw the match of each query, in frames.
+    """Plot the frame number of each match over that of its query.
 
     Arguments:
       found: Query, match and probability of each loop. Less probable loops are lighter.
       frames: Number of frames.
       wrong: Query and match of each loop known to be wrong, drawn as red crosses.
-      rejected: Query and match of each rejected pair, drawn as small grey dots below the loops.
+      rejected: Query and match of each rejected pair, drawn as small grey dots behind the loops.
     """
     figure = _figure(5.0, 4.2)
     axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))

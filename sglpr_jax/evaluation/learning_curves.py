@@ -30,7 +30,10 @@ class LearningCurves(Callback):
 
 
 def draw_learning_curves(folder: Path) -> None:
-    """Draw the metrics in the folder of a run. Does nothing without matplotlib or without metrics."""
+    """Plot the metrics of a run and save the figure in the run's folder.
+
+    Does nothing without matplotlib or without metrics.
+    """
     lines = read_metrics(folder / METRICS_FILE)
     if lines and figures.can_draw():
         panels = {title: _curves(lines, names) for title, names in _PANELS.items()}

@@ -20,7 +20,7 @@ class PlainTable(Table):
             self.add_column(header)
 
     def add_column(self, header: Any = "", *args: Any, **options: Any) -> None:
-        """Add a column with a plain header. The options are those of rich."""
+        """Add a column whose header may contain any characters. The options are those of rich's `Table.add_column`."""
         super().add_column(_plain(header), *args, **options)
 
     def add_row(self, *cells: Any, **options: Any) -> None:

@@ -132,7 +132,10 @@ def _try_on(recording: Recording, corruption: Corruption, seed: int) -> None:
 
 
 def write_stress_test(found: StressTest, folder: Path) -> list[Path]:
-    """Write configuration, results and, with matplotlib, the plot. Returns the paths of the results and the plot."""
+    """Write the configuration, the results and, if matplotlib is installed, the plot.
+
+    Returns the paths of the results and the plot.
+    """
     write_json(folder / "config.json", found.config)
     write_json(folder / "results.json", found.to_json())
     if not figures.can_draw():

@@ -111,7 +111,7 @@ class CandidateConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VerificationConfig:
-    """Settings of the comparison of two images."""
+    """Settings of the comparison of the bird's-eye-view images of two scans."""
 
     resolution_m: float = RESOLUTION_M
     """Edge of an image's cell, in metres."""

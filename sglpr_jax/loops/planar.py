@@ -66,7 +66,7 @@ def inverted(a: Planar) -> Planar:
 
 
 def relative(a: Planar, b: Planar) -> Planar:
-    """Returns a_from_b of two poses in one frame."""
+    """Returns the pose of b in the frame of a (`a_from_b`), from the poses of both in one common frame."""
     return compose(inverted(a), b)
 
 

@@ -118,7 +118,10 @@ class LoopModel:
 
     @classmethod
     def from_json(cls, value: Any, *, source: str) -> "LoopModel":
-        """Read a value of `to_json`. Raises ValueError, naming the `source`, if the value is invalid."""
+        """Build a model from the output of `to_json`.
+
+        Raises ValueError if it is invalid. The message names `source`, its file.
+        """
         try:
             curves = {name: Curve(**{k: tuple(v) for k, v in one.items()}) for name, one in value["curves"].items()}
             model = cls(curves, value["bias"], value["made_with"])

@@ -109,7 +109,10 @@ def expected_poses(
     *,
     config: RivalConfig = RivalConfig(),
 ) -> tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]:
-    """Expected poses and tolerances for `rival_share`, for a query with a known pose in the frame of `frame`."""
+    """Return the expected pose of the query in the frame of each rival, with tolerances, as input for `rival_share`.
+
+    The query's pose is known relative to the scan `frame`.
+    """
     poses, known = motion.from_frame(frame, rows)
     travelled = np.abs(np.array([motion.travelled[row] for row in rows]) - motion.travelled[frame])
     tolerance = np.where(known, config.agree_m + config.agree_share * travelled, np.nan)

@@ -17,7 +17,7 @@ from sglpr_jax.grid import Grid
 
 
 class Taps(NamedTuple):
-    """Source pixels of a resampling: k pixels of the flat image and their weights for each of n values."""
+    """Source pixels of a resampling: each of n output values is a weighted sum of k pixels of the flattened image."""
 
     pixel: np.ndarray  # (k, n) int32
     weight: np.ndarray  # (k, n) float32

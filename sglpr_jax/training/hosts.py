@@ -56,7 +56,7 @@ def connected(*, hosts: int, host_index: int, coordinator: str | None) -> Iterat
 
 
 def is_first_host() -> bool:
-    """Whether this process is the host that writes."""
+    """Whether this process runs on the first host, the only one that writes files."""
     return jax.process_index() == 0
 
 

@@ -18,10 +18,10 @@ class Throughput:
 
 
 def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
-    """Return the throughput over all lines that contain a speed, or None without such lines.
+    """Return the mean throughput over all lines of the log that state a speed, or None if none does.
 
-    The first line after each start has no speed, because the step is compiled then. Older logs have a speed there:
-    their first line is skipped, but lines after a resume are counted.
+    The first line after a start or a resume states none, because the step is compiled then. Logs of earlier versions
+    state one on these lines: the very first line is skipped, but the first line after each resume is counted.
     """
     timed = [(line["step"] - before["step"], line) for before, line in pairwise(lines) if "steps_per_second" in line]
     if not timed:

@@ -98,9 +98,10 @@ def record_of_scan(path: Path) -> RecordFormat:
 
 
 def unusual_record(paths: Sequence[Path], *, usual: RecordFormat = "kitti") -> RecordFormat | None:
-    """Return the format of scans that do not have the format of their dataset layout.
+    """Detect scans whose format differs from the usual one of their dataset layout.
 
-    Users put their own recordings into the layout of a dataset. With another record size, the points would be wrong.
+    Users put their own recordings into the layout of a known dataset. If their points have another record size, they
+    would be read incorrectly.
 
     Returns:
       The detected format, or None if the scans fit `usual` or no single format is detected.

@@ -12,7 +12,10 @@ from sglpr_jax.revisits import close_pairs
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Split:
-    """Frames of one recording, in ascending order. Frames near the validation part are in neither part."""
+    """Training and validation frames of one recording, in ascending order.
+
+    Frames close to a validation frame are in neither.
+    """
 
     training: Int[np.ndarray, "_"]
     validation: Int[np.ndarray, "_"]

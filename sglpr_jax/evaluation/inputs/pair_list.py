@@ -16,7 +16,9 @@ LABELS = {"0": False, "1": True}
 
 
 def read_pair_list(path: Path, trajectory: Trajectory | None) -> ScoredPairs:
-    """Read pairs of frames, the query first. Higher scores mean closer. Pairs without labels need positions.
+    """Read pairs of frames, the query first. A higher score means more similar.
+
+    Pairs without a label are labelled by the distance between their positions, so these are needed then.
 
     Raises ValueError if the file is empty, if a line is malformed or names a frame without a pose, or if positions are
     needed but missing. The message names the line or the file.

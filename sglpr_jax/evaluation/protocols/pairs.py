@@ -83,7 +83,7 @@ def _kept_in_blocks(
 
 
 def pair_distances(file: DescriptorFile, pairs: Int[np.ndarray, "2 pairs"]) -> Float[np.ndarray, " pairs"]:
-    """Return the distance between the descriptors of each pair, by the distance of the file."""
+    """Return the distance between the descriptors of each pair, by the kind of distance that the file states."""
     if file.distance != "l2":
         return _distances_by_row(file, pairs)
     apart = np.empty(pairs.shape[1])

@@ -51,7 +51,8 @@ class CircularConfig:
 
     @property
     def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this, the size of one pixel of the last map."""
+        """Numbers that must divide the rows and columns of the image: how many of its pixels one pixel of the last map
+        covers."""
         return self.token
 
     @property
