@@ -1,8 +1,7 @@
 """Settings of the loop detector as plain values, readable without JAX. `bin/loops` has a flag for each."""
 
 import dataclasses
-
-import numpy as np
+import math
 
 from sglpr_jax.data.density_grid import RESOLUTION_M
 from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY
@@ -29,7 +28,7 @@ class DriftModel:
         """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
         for name, value in dataclasses.asdict(self).items():
             positive = name in ("position_m", "yaw_deg", "max_deviation")
-            if not np.isfinite(value) or value < 0 or (positive and value == 0):
+            if not math.isfinite(value) or value < 0 or (positive and value == 0):
                 raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
 
     def scaled(self, factor: float) -> "DriftModel":
