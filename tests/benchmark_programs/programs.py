@@ -8,7 +8,7 @@ from pathlib import Path
 from sglpr_jax.sim import Sensor
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = ROOT / "configs" / "tiny.py"
+TINY = ROOT / "tests" / "tiny.py"
 """A preset of next to no arithmetic."""
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
 

@@ -17,7 +17,7 @@ from sglpr_jax.sim import Sensor, write_dataset
 
 SCANS = 40
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
-TINY = Path(__file__).resolve().parents[2] / "configs" / "tiny.py"
+TINY = Path(__file__).resolve().parents[1] / "tiny.py"
 
 
 class Ended(NamedTuple):
@@ -102,7 +102,7 @@ def write_images(root: Path, *, labels: bool = False) -> None:
 
 @pytest.fixture(scope="session")
 def preset() -> Path:
-    """The path of a preset: a model of next to no arithmetic, four steps."""
+    """A preset that is no file of configs/: a model of next to no arithmetic, four steps."""
     return TINY
 
 
