@@ -60,7 +60,7 @@ def main(kills: int = 100, scans: int = 200, seed: int = 0) -> None:
             outcomes["ended before the kill" if process.poll() is not None else "killed"] += 1
             process.kill()
             process.wait()
-            outcomes["left half of a file beside it"] += bool(half_written(out.parent, out.name))
+            outcomes["left half of a file beside it"] += bool(half_written(out.parent))
             remove_half_written(folder)
             outcomes[state(out, places, scans)] += 1
             if places > 20 * scans:
@@ -97,7 +97,7 @@ def duration(command: list[str]) -> float:
 
 def wait_for_write(process: subprocess.Popen, out: Path) -> None:
     """Until the map's hidden file is there, or the process has ended."""
-    while process.poll() is None and not half_written(out.parent, out.name):
+    while process.poll() is None and not half_written(out.parent):
         time.sleep(0.001)
 
 

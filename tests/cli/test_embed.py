@@ -122,8 +122,12 @@ def test_poses_that_are_missing_or_not_numbers_are_named(embed, town, tmp_path):
     assert_one_line_error(embed(*options)[0], f"{poses}, line 3", "finite numbers", "nan")
     poses.write_text("\n".join(lines[:30]))
     assert_one_line_error(embed(*options)[0], poses, "at least 40 rows", "found 30")
-    poses.unlink()
-    assert_one_line_error(embed(*options)[0], root, "sequences/08/poses.txt", "found none")
+    poses.unlink()  # KITTI's test sequences have none, unless they are asked for
+    assert_one_line_error(
+        embed(*options, "--pose-source", "semantickitti")[0], root, "sequences/08/poses.txt", "found none"
+    )
+    ended, out = embed(*options)
+    assert ended.status == 0 and load(out).positions is None
 
 
 def test_a_sequence_or_dataset_that_does_not_exist_is_named(embed, town, tmp_path):
