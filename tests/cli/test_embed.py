@@ -1,3 +1,4 @@
+import dataclasses
 import errno
 import json
 import shutil
@@ -209,11 +210,10 @@ def test_weights_of_another_model_or_damaged_ones_are_named(embed, town, trained
 
 
 def test_images_smaller_than_the_models_window_are_refused(embed, images, trained, tmp_path):
-    folder = tmp_path / "weights"
-    shutil.copytree(trained.folder / "weights", folder)
-    config = json.loads((folder / "config.json").read_text())
-    config["grid"] |= {"height": 32, "width": 32}
-    (folder / "config.json").write_text(json.dumps(config))
+    params = sglpr_jax.load(trained.folder)
+    grid = dataclasses.replace(params.config.grid, height=32, width=32)
+    larger = sglpr_jax.Params(params.weights, dataclasses.replace(params.config, grid=grid))
+    folder = sglpr_jax.save(larger, tmp_path / "weights")
     ended, _ = embed("--data", images, "--seq", "06", "--weights", folder)
     assert_one_line_error(ended, "32 x 32", "(22, 20)")
 

@@ -41,7 +41,8 @@ def test_every_protocol_is_printed_written_and_drawn(command, recording, tmp_pat
     for words in ("top-1 F1max", "pairs F1max", "Recall@1", "3 m / 20 m", "400 revisits", "3-D", "2-D"):
         assert words in ended.out
     assert ended.out.count("sequences/08/poses.txt") == 3
-    assert ended.out.count("1.000") == 9  # scores, and both ends of their intervals
+    scores, thresholds = 3, 2 * 3  # of each protocol, and three for each of two curves
+    assert ended.out.count("1.000") == 3 * scores + 2 * thresholds  # an interval has two ends
     folder = tmp_path / "08"
     written = [Path(path) for path in re.findall(r"^written: (.*)$", ended.out, re.MULTILINE)]
     assert written == [folder / name for name in FILES]

@@ -154,7 +154,7 @@ def test_a_corruption_that_needs_rings_is_left_out_of_scans_without(stress, tmp_
         np.random.default_rng(place).normal(scale=9, size=(300, 4)).astype("<f4").tofile(scans / f"{i}.bin")
     rows = "".join(f"1 0 0 {30 * place} 0 1 0 0 0 0 1 0\n" for place in places)
     (scans / "poses.txt").write_text(rows)
-    (scans / "times.txt").write_text("".join(f"{i}\n" for i in range(len(places))))
+    (scans / "times.txt").write_text("".join(f"{1.5 * i}\n" for i in range(len(places))))
     options = ("--data", scans, "--method", "solid", "--format", "kitti", "--protocol", "top1-f1max")
     ended, out = stress(*options, "--corruption", "beams-16", "noise-0.05")
     assert ended.status == 0

@@ -252,7 +252,7 @@ def test_what_cannot_be_trained_on_leaves_no_run(command, town, preset, tmp_path
     flags = ("--train-seq", "00")
     if missing == "poses":
         poses.unlink()
-        words = (root, "sequences/00/poses.txt", "poses/00.txt")
+        words = (root, "sequence 00 has no poses")
     else:
         flags = (*flags, "--sampling.positive-m", "0.001")
         words = ("0.001 m", "nothing can be a positive")

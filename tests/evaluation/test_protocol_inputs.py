@@ -148,9 +148,7 @@ def test_an_empty_sequence_is_refused(make_file):
 
 
 def test_as_many_descriptors_as_poses_are_needed(make_file, two_laps):
-    with pytest.raises(
-        ValueError, match=r"expected positions as float64 \(700, 3\) for 700 ids, found float64 \(800, 3\)"
-    ):
+    with pytest.raises(ValueError, match=r"expected positions as float64 \(700, 3\), found float64 \(800, 3\)"):
         make_file(two_laps, np.ones((700, 4)))
 
 

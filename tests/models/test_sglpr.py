@@ -217,7 +217,7 @@ def test_init_makes_every_weight_of_its_preset_from_its_key(random_params):
     assert params.config is config
     kernel = params.weights["segmentation_head"]["kernel"]
     assert 0.9 * config.backbone.width**-0.5 < np.abs(kernel).max() <= config.backbone.width**-0.5
-    with pytest.raises(ValueError, match=r"expected a model preset \(paper, .*\), found 'huge'"):
+    with pytest.raises(ValueError, match=r"expected a model preset \(sglpr, .*\), found 'huge'"):
         init(jax.random.key(0), preset="huge")
 
 
