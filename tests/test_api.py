@@ -79,5 +79,5 @@ def test_the_readmes_lines(tmp_path):
 
 
 def test_an_unknown_preset_lists_those_that_exist():
-    with pytest.raises(ValueError, match=r"\(paper, .*small.*'smal'"):
+    with pytest.raises(ValueError, match=r"\(sglpr, .*'smal'"):
         sglpr_jax.init(jax.random.key(0), preset="smal")

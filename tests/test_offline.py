@@ -21,7 +21,7 @@ def no_network(monkeypatch):
 
 @pytest.mark.slow
 def test_weights_descriptors_and_scores_need_no_network(no_network, tmp_path):
-    sglpr_jax.simulate(tmp_path / "town", routes=["08"], scans=6, azimuth_steps=30)
+    sglpr_jax.simulate(tmp_path / "town", routes=["08"], scans=10, azimuth_steps=30)
     recording = sglpr_jax.open_recording(tmp_path / "town", "08")
     file = sglpr_jax.embed(sglpr_jax.load("circular"), recording)
     file.save(tmp_path / "08.npz")
