@@ -2,7 +2,7 @@
 
 Reproduces no result of the paper.
 
-Expect: 4 steps of 8 images take a second or two after compilation. The descriptors are no better than untrained ones.
+Expect: 4 steps of 8 images, which train nothing useful.
 
 Command: bin/train --seq 08 --preset tiny
 """

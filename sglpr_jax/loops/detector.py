@@ -15,9 +15,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.times import PROOF, doubt
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
-from sglpr_jax.loops.config import (
-    DetectorConfig,
-)
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.given import DATES, given_pose, given_record, given_time

@@ -25,7 +25,7 @@ MODELS: dict[str, ModelConfig] = {
     # The default: the paper's parts in a form that follows rotations. Circular convolutions, then windows, CBAM and
     # NetVLAD, on polar images of the window of the ready-made KITTI images (+-25.6 m).
     "sglpr": _POLAR,
-    # A circular CNN with NetVLAD: half the computation, without CBAM and attention.
+    # A circular CNN with NetVLAD: less computation, without CBAM and attention.
     "circular": dataclasses.replace(
         _POLAR,
         backbone=CircularConfig(),

@@ -115,11 +115,9 @@ def plan_walk(rng: np.random.Generator, role: Role, *, blocks: int) -> list[Node
 def plan_days(rng: np.random.Generator, role: Role, *, blocks: int, days: int) -> list[Node]:
     """Returns a walk that is `days` times as long as one of `plan_walk`.
 
-    The later days use the streets of the first day.
-
-    Each later day begins with a U-turn at a roundabout. At a crossing, the walk takes the street
-    ahead that was driven least often in that direction. The later days therefore partly drive in the opposite
-    direction.
+    The later days use the streets of the first day. Each later day begins with a U-turn at a roundabout. At a crossing,
+    the walk takes the street ahead that was driven least often in that direction. The later days therefore partly drive
+    in the opposite direction.
     """
     walk = plan_walk(rng, role, blocks=blocks)
     ahead = defaultdict(set)

@@ -27,7 +27,7 @@ class CircularBackbone:
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
         """Computes the features: the last map. There is no stochastic depth."""
-        maps = CircularNet(self.config, name="rings")(image)
+        maps = CircularNet(self.config, name="rings")(image)  # the name in weight files
         return Seen(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
