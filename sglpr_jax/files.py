@@ -206,9 +206,9 @@ def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
     return arrays
 
 
-def in_short(error: Exception) -> str:
-    """Return the message of another library's error, on one line of at most 100 characters."""
-    return _cut(" ".join(str(error).split()) or type(error).__name__, most=100)
+def in_short(error: Exception, *, most: int = 100) -> str:
+    """Return the message of another library's error, on one line of at most that many characters."""
+    return _cut(" ".join(str(error).split()) or type(error).__name__, most=most)
 
 
 def json_in_short(value: Any) -> str:

@@ -1,4 +1,5 @@
-"""How long commands take to start: the help of each, and bin/embed of one scan once its programs have been compiled.
+"""How long programs take to start: the help of each command, random weights of each preset, and the descriptor of one
+scan, cold (nothing compiled yet, timed once) and warm.
 
     taskset -c 1 python -m benchmarks.speed.start_up
 
@@ -20,36 +21,47 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from sglpr_jax.models.presets import MODELS
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
+INIT = "import jax, sglpr_jax; jax.block_until_ready(sglpr_jax.init(jax.random.key(0), preset={!r}).weights)"
 COMMANDS = tuple(
     sorted(path.stem for path in (ROOT / "sglpr_jax" / "cli").glob("*.py") if (ROOT / "bin" / path.stem).exists())
 )
 
 
-def main(*, commands: tuple[str, ...] = COMMANDS, weights: str = "sglpr", repeats: int = 9) -> None:
+def main(
+    *,
+    commands: tuple[str, ...] = COMMANDS,
+    presets: tuple[str, ...] = tuple(MODELS),
+    weights: str = "sglpr",
+    repeats: int = 9,
+) -> None:
     """Time commands in processes of their own, one after another.
 
     Args:
         commands: whose help is timed.
+        presets: whose random weights are timed.
         weights: what bin/embed describes by.
         repeats: how often each is timed.
     """
-    lines = {f"{command} --help": (command, "--help") for command in commands}
+    lines = {f"{command} --help": _command(command, "--help") for command in commands}
+    lines |= {f"init, {preset}": ("-c", INIT.format(preset)) for preset in presets}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scan = simulate_recording("08", scans=1, sensor=dataclasses.replace(SENSORS["hdl64e"], azimuth_steps=900))
         (folder / "scans").mkdir()
         points = scan.record(0).points
         np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(folder / "scans" / "000000.bin")
-        embed = ("embed", "--data", f"{folder}/scans", "--weights", weights, "--out", f"{folder}/scans.npz")
+        embed = _command("embed", "--data", f"{folder}/scans", "--weights", weights, "--out", f"{folder}/scans.npz")
         environment = {**os.environ, "XDG_CACHE_HOME": name}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-        seconds(embed, environment)  # compiles
-        lines[f"embed one scan, {weights}"] = embed
         table = Table("", "seconds, least", "median", "processor seconds, least", "median")
+        wall, processor = seconds(embed, environment)
+        table.add_row(f"embed one scan, {weights}, cold", f"{wall:.2f}", "", f"{processor:.2f}", "")
+        lines[f"embed one scan, {weights}, warm"] = embed
         for title, line in lines.items():
             wall, processor = zip(*(seconds(line, environment) for _ in range(repeats)), strict=True)
             found = (min(wall), statistics.median(wall), min(processor), statistics.median(processor))
@@ -59,12 +71,14 @@ def main(*, commands: tuple[str, ...] = COMMANDS, weights: str = "sglpr", repeat
 
 
 def seconds(line: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float]:
-    """How long a command takes, and how long processors work for it."""
-    command, *arguments = line
+    """How long Python takes for a command line, and how long processors work for it."""
     start, before = time.perf_counter(), _processor_s()
-    module = (sys.executable, "-m", f"sglpr_jax.cli.{command}")
-    subprocess.run((*module, *arguments), env=environment, check=True, capture_output=True)
+    subprocess.run((sys.executable, *line), env=environment, check=True, capture_output=True)
     return time.perf_counter() - start, _processor_s() - before
+
+
+def _command(command: str, *arguments: str) -> tuple[str, ...]:
+    return "-m", f"sglpr_jax.cli.{command}", *arguments
 
 
 def _processor_s() -> float:

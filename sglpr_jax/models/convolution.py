@@ -7,13 +7,14 @@ On a CPU, XLA computes the gradient of a kernel by a slow general loop if the st
 """
 
 import functools
-from collections.abc import Callable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models import initial
+from sglpr_jax.models.initial import Initial
 from sglpr_jax.models.layers import product, weight
 
 FEW_INPUTS = 16
@@ -34,14 +35,14 @@ class Convolution(nn.Module):
     strides: tuple[int, int] = (1, 1)
     """Strides along rows and columns."""
     circular: bool = False
-    kernel_init: Callable = nn.initializers.he_normal()
+    kernel_init: Initial = initial.he_normal
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.features}"]:
         """Convolves images. With a border, an odd kernel gives ceil(size / stride) rows and columns."""
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = jnp.asarray(weight(self, "kernel", self.kernel_init, shape), x.dtype)
-        bias = weight(self, "bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)
+        bias = weight(self, "bias", initial.zeros, (self.features,)).astype(x.dtype)
         y = convolve(x, kernel, self.strides, self.circular)
         return y + bias[None, None, None]
 

@@ -6,7 +6,6 @@ image (`ModelConfig.compute`), except where a module requests float32.
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -14,9 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models import initial
+from sglpr_jax.models.initial import Initial
 
-def weight(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...]) -> Any:
+
+def weight(module: nn.Module, name: str, init: Initial, shape: tuple[int, ...]) -> Any:
     """Return a weight of the calling module, and create it at initialisation.
+
+    At initialisation, the collection `initial` also gets the distribution `init`, for `draw_all`.
 
     Flax's `param` traces `init` in every call to find the shape. This takes half of the time of tracing a network.
 
@@ -24,6 +28,8 @@ def weight(module: nn.Module, name: str, init: Callable, shape: tuple[int, ...])
       ValueError: If the weight has another shape.
     """
     if not module.has_variable("params", name):
+        if module.is_initializing():
+            module.put_variable("initial", name, init)
         return module.param(name, init, shape)
     value = module.get_variable("params", name)
     if value.shape != shape:
@@ -39,7 +45,7 @@ class Linear(nn.Module):
 
     features: int
     use_bias: bool = True
-    kernel_init: Callable = nn.initializers.normal(0.02)
+    kernel_init: Initial = initial.normal(0.02)
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
@@ -48,7 +54,7 @@ class Linear(nn.Module):
         kernel = weight(self, "kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
         y = product(x.reshape(-1, c), jnp.asarray(kernel))
         if self.use_bias:
-            y = y + weight(self, "bias", nn.initializers.zeros, (self.features,)).astype(x.dtype)[None]
+            y = y + weight(self, "bias", initial.zeros, (self.features,)).astype(x.dtype)[None]
         return y.reshape(*x.shape[:-1], self.features)
 
 
@@ -90,8 +96,8 @@ class LayerNorm(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
         """The output has the data type of the input."""
-        scale = jnp.asarray(weight(self, "scale", nn.initializers.ones, x.shape[-1:]))
-        bias = jnp.asarray(weight(self, "bias", nn.initializers.zeros, x.shape[-1:]))
+        scale = jnp.asarray(weight(self, "scale", initial.ones, x.shape[-1:]))
+        bias = jnp.asarray(weight(self, "bias", initial.zeros, x.shape[-1:]))
         rows = x.astype(jnp.float32).reshape(-1, x.shape[-1])
         return layer_norm(rows, scale, bias, self.epsilon).astype(x.dtype).reshape(x.shape)
 
@@ -125,9 +131,6 @@ def _statistics(x: Float[Array, "n c"], epsilon: float) -> tuple[Float[Array, "n
 def _mean(x: Float[Array, "n c"]) -> Float[Array, "n 1"]:
     return x.mean(-1, keepdims=True)
 
-
-torch_uniform = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
-"""PyTorch's default initialisation of convolutions, U(-1/sqrt(fan_in), 1/sqrt(fan_in))."""
 
 NORM_FLOOR = 1e-12
 

@@ -14,6 +14,7 @@ from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.heads.place import PlaceHead
 from sglpr_jax.models.heads.raw_input import raw_input
 from sglpr_jax.models.heads.segmentation import segmentation_head
+from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.presets import model_preset
@@ -193,9 +194,11 @@ def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelCon
 def init(key: Array, *, preset: str = "sglpr", config: ModelConfig | None = None) -> Params:
     """Initialise the weights of a named preset, or of `config` if it is given.
 
-    Only the weights that the configuration needs are created.
+    Only the weights that the configuration needs are created. No program is compiled.
     """
     config = model_preset(preset) if config is None else config
-    image = jnp.zeros((1, config.grid.height, config.grid.width, config.channels))
-    labels = jnp.zeros(image.shape[:-1], jnp.int32) if config.head.reads_labels else None
-    return Params(jax.jit(SGLPR(config).init)(key, image, labels)["params"], config)
+    shape = (1, config.grid.height, config.grid.width)
+    image = jax.ShapeDtypeStruct((*shape, config.channels), jnp.float32)
+    labels = jax.ShapeDtypeStruct(shape, jnp.int32) if config.head.reads_labels else None
+    created = jax.eval_shape(SGLPR(config).init, key, image, labels)
+    return Params(draw_all(key, created["initial"], created["params"]), config)

@@ -8,8 +8,6 @@ damaged-17/       renamed checkpoint whose files do not match their checksums
 
 import asyncio
 import contextlib
-import os
-import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +20,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 from orbax.checkpoint.path import atomicity
 
+from sglpr_jax.files import in_short
 from sglpr_jax.models.params import Params
 from sglpr_jax.training.checksums import damage, write_checksums
 from sglpr_jax.training.config import TrainConfig
@@ -29,6 +28,8 @@ from sglpr_jax.training.hosts import is_first_host, on_all_hosts
 from sglpr_jax.training.state import TrainState, new_state
 
 _KEPT_LATEST = 2
+_MOST_OF_AN_ERROR = 500
+"""Maximum number of characters of an error of orbax, whose reason comes last."""
 _INTACT = "the last checkpoint is intact"
 _UNLOGGED = "unlogged"
 _OUTDATED = "outdated"
@@ -177,8 +178,7 @@ class Checkpoints:
         try:
             yield
         except (OSError, ValueError) as error:
-            code = re.search(r"os_error_code='(\d+)'", str(error))
-            reason = os.strerror(int(code[1])) if code else getattr(error, "strerror", None) or error
+            reason = getattr(error, "strerror", None) or in_short(error, most=_MOST_OF_AN_ERROR)
             raise OSError(f"{self._folder}: expected to write a checkpoint, found: {reason}; {_INTACT}") from error
 
 

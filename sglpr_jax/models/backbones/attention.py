@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sglpr_jax.models import initial
 from sglpr_jax.models.layers import Linear, weight
 
 BLOCKED = -100.0
@@ -93,7 +94,7 @@ class WindowAttention(nn.Module):
         """Looks up the table by a product with one-hot rows, whose gradient is a product instead of a slow scatter."""
         window = round(tokens**0.5)
         rows = (2 * window - 1) ** 2
-        table = weight(self, "position_bias", nn.initializers.normal(0.02), (rows, self.heads))
+        table = weight(self, "position_bias", initial.normal(0.02), (rows, self.heads))
         one_hot = jax.nn.one_hot(relative_position_index(window).reshape(-1), rows)
         bias = jnp.matmul(one_hot, table, precision=jax.lax.Precision.HIGHEST)
         return bias.T.reshape(self.heads, tokens, tokens)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.backbones.attention import WindowAttention, join_windows, shift_mask, split_windows
-from sglpr_jax.models.layers import LayerNorm, Linear, gelu, torch_uniform
+from sglpr_jax.models.initial import torch_uniform, uniform
+from sglpr_jax.models.layers import LayerNorm, Linear, gelu, weight
 
 MLP_RATIO = 4
 """Hidden units of a block's MLP per channel, in the paper."""
@@ -26,23 +27,24 @@ class PatchEmbed(nn.Module):
         self, image: Float[Array, "b h w c"]
     ) -> Float[Array, "b h//{self.patch[0]} w//{self.patch[1]} {self.channels}"]:
         """Maps `c` input channels to `channels` and divides height and width by those of the patch."""
-        bound = (math.prod(self.patch) * image.shape[-1]) ** -0.5
+        return LayerNorm(name="norm")(PatchProjection(self.channels, self.patch, name="projection")(image))
 
-        def bias_init(key, shape, dtype):
-            return jax.random.uniform(key, shape, dtype, -bound, bound)
 
-        size = self.patch
-        tokens = nn.Conv(
-            self.channels,
-            size,
-            size,
-            "VALID",
-            dtype=image.dtype,
-            kernel_init=torch_uniform,
-            bias_init=bias_init,
-            name="projection",
-        )(image)
-        return LayerNorm(name="norm")(tokens)
+class PatchProjection(nn.Module):
+    """Linear map of each patch: a convolution with stride equal to its kernel, initialised as in PyTorch."""
+
+    channels: int
+    patch: tuple[int, int]
+
+    @nn.compact
+    def __call__(self, image: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.channels}"]:
+        """Maps `c` input channels to `channels` and divides height and width by those of the patch."""
+        shape = (*self.patch, image.shape[-1], self.channels)
+        kernel = jnp.asarray(weight(self, "kernel", torch_uniform, shape), image.dtype)
+        bias = weight(self, "bias", uniform(math.prod(shape[:-1]) ** -0.5), (self.channels,)).astype(image.dtype)
+        axes = ("NHWC", "HWIO", "NHWC")
+        tokens = jax.lax.conv_general_dilated(image, kernel, self.patch, "VALID", dimension_numbers=axes)
+        return tokens + bias[None, None, None]
 
 
 class DropPath(nn.Module):

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.convolution import Convolution
-from sglpr_jax.models.layers import Linear, torch_uniform
+from sglpr_jax.models.initial import torch_uniform
+from sglpr_jax.models.layers import Linear
 
 ROUNDING = 1e-6
 

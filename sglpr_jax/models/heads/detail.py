@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sglpr_jax.models.convolution import Convolution
+from sglpr_jax.models.initial import lecun_normal
 from sglpr_jax.models.layers import Linear, gelu
 
-_INIT = nn.initializers.lecun_normal()
 _LOCAL = ((5, 16), (3, 16))
 """Kernel size in cells, and channels, of the convolutions. Together they reach three cells in each direction."""
 
@@ -25,6 +25,6 @@ class Detail(nn.Module):
         """Returns the mixed features, with `width` numbers for each cell."""
         image = image.astype(features.dtype)
         for i, (cells, channels) in enumerate(_LOCAL):
-            image = nn.relu(Convolution(channels, cells, kernel_init=_INIT, name=f"local{i}")(image))
+            image = nn.relu(Convolution(channels, cells, kernel_init=lecun_normal, name=f"local{i}")(image))
         both = jnp.concatenate([features, image], axis=-1)
         return gelu(Linear(self.width, name="mix")(both))

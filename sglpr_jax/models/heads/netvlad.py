@@ -4,6 +4,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models import initial
 from sglpr_jax.models.layers import Linear, l2_normalize, weight
 
 
@@ -30,7 +31,7 @@ class NetVLAD(nn.Module):
         The sums over the features and all later steps are float32.
         """
         d = features.shape[-1]
-        weights_init = nn.initializers.normal(d**-0.5)
+        weights_init = initial.normal(d**-0.5)
         logits = Linear(self.clusters, kernel_init=weights_init, name="assignment")(features)
         assignment = nn.softmax(logits.astype(jnp.float32))
         centres = weight(self, "centres", weights_init, (d, self.clusters))
@@ -41,5 +42,5 @@ class NetVLAD(nn.Module):
         y = Linear(self.output, kernel_init=weights_init, name="hidden")(l2_normalize(vlad))
         if not self.gating:
             return y
-        gate_init = nn.initializers.normal(self.output**-0.5)
+        gate_init = initial.normal(self.output**-0.5)
         return y * nn.sigmoid(Linear(self.output, kernel_init=gate_init, name="gate")(y))

@@ -5,7 +5,8 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.heads.detail import Detail
-from sglpr_jax.models.layers import Linear, torch_uniform
+from sglpr_jax.models.initial import torch_uniform
+from sglpr_jax.models.layers import Linear
 from sglpr_jax.models.polar import from_polar
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sglpr_jax.models import initial
 from sglpr_jax.models.layers import Linear
 
 FLOOR = 1e-6
@@ -27,10 +28,10 @@ class Spectrum(nn.Module):
         """
         b, radii, sectors, c = features.shape
         columns = features.swapaxes(1, 2).reshape(b, sectors, radii * c)
-        columns = Linear(self.channels, kernel_init=nn.initializers.he_normal(), name="narrow")(columns)
+        columns = Linear(self.channels, kernel_init=initial.he_normal, name="narrow")(columns)
         size = amplitudes(columns.astype(jnp.float32), self.frequencies)
-        init = nn.initializers.variance_scaling(1.0, "fan_in", "normal")
-        return Linear(self.output, use_bias=False, kernel_init=init, name="linear")(size.reshape(b, -1))
+        unit = initial.scaled_normal(1.0)
+        return Linear(self.output, use_bias=False, kernel_init=unit, name="linear")(size.reshape(b, -1))
 
 
 def amplitudes(columns: Float[Array, "b s c"], frequencies: int) -> Float[Array, "b {frequencies} c"]:

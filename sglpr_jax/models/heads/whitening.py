@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sglpr_jax.models import initial
 from sglpr_jax.models.layers import l2_normalize, weight
 
 
@@ -15,6 +16,6 @@ class Whitening(nn.Module):
     def __call__(self, descriptor: Float[Array, "b d"]) -> Float[Array, "b d"]:
         """Returns descriptors of length 1."""
         d = descriptor.shape[-1]
-        kernel = weight(self, "kernel", lambda key, shape: jnp.eye(*shape), (d, d))
-        bias = weight(self, "bias", nn.initializers.zeros, (d,))
+        kernel = weight(self, "kernel", initial.identity, (d, d))
+        bias = weight(self, "bias", initial.zeros, (d,))
         return l2_normalize(jnp.matmul(descriptor, kernel, precision=jax.lax.Precision.HIGHEST) + bias[None])

@@ -1,0 +1,82 @@
+"""Initial values: distributions equal to Flax's initializers, drawn without compiling."""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+import sglpr_jax
+from sglpr_jax.models import initial
+from sglpr_jax.models.sglpr import SGLPR
+from tests.tiny import MODEL
+
+SHAPE = (5, 3, 40, 200)
+OF_FLAX = {
+    "normal": (initial.normal(0.02), nn.initializers.normal(0.02)),
+    "he_normal": (initial.he_normal, nn.initializers.he_normal()),
+    "lecun_normal": (initial.lecun_normal, nn.initializers.lecun_normal()),
+    "scaled_normal": (initial.scaled_normal(1.0), nn.initializers.variance_scaling(1.0, "fan_in", "normal")),
+    "torch_uniform": (initial.torch_uniform, nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")),
+    "uniform": (initial.uniform(0.3), lambda key, shape: jax.random.uniform(key, shape, minval=-0.3, maxval=0.3)),
+}
+BOUNDED = ("he_normal", "lecun_normal", "torch_uniform", "uniform")
+
+
+@pytest.mark.parametrize("name", OF_FLAX)
+def test_a_distribution_is_that_of_flax(name):
+    ours, flax = (np.asarray(draw(jax.random.key(1), SHAPE)).ravel() for draw in OF_FLAX[name])
+    assert ours.dtype == np.float32
+    different: Any = stats.ks_2samp(ours, flax)
+    assert different.statistic < 0.008
+    np.testing.assert_allclose(ours.std(), flax.std(), rtol=0.01)
+    if name in BOUNDED:
+        np.testing.assert_allclose(np.abs(ours).max(), np.abs(flax).max(), rtol=0.02)
+
+
+def test_constants_and_identity():
+    key = jax.random.key(0)
+    assert not np.any(initial.zeros(key, (3,))) and np.all(initial.ones(key, (3,)) == 1)
+    np.testing.assert_array_equal(initial.identity(key, (3, 3)), np.eye(3))
+
+
+def test_weights_differ_by_key_and_by_name_and_not_by_shape_of_others():
+    drawn = [sglpr_jax.init(jax.random.key(seed), config=MODEL).weights for seed in (0, 0, 1)]
+    kernels = [
+        {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+        for tree in drawn
+    ]
+    random = [name for name, leaf in kernels[0].items() if leaf.std() > 0]
+    assert all(np.array_equal(kernels[0][name], kernels[1][name]) for name in random)
+    assert not any(np.array_equal(kernels[0][name], kernels[2][name]) for name in random)
+    first = {kernels[0][name].ravel()[:4].tobytes() for name in random}
+    assert len(first) == len(random)
+
+
+def test_init_is_the_same_in_a_compiled_function_and_maps_over_keys():
+    keys = jax.random.split(jax.random.key(3), 2)
+    one = sglpr_jax.init(keys[0], config=MODEL).weights
+    compiled = jax.jit(lambda key: sglpr_jax.init(key, config=MODEL).weights)(keys[0])
+    mapped = jax.vmap(lambda key: sglpr_jax.init(key, config=MODEL).weights)(keys)
+    jax.tree.map(np.testing.assert_array_equal, one, compiled)
+    jax.tree.map(lambda leaf, of_both: np.testing.assert_array_equal(leaf, of_both[0]), one, mapped)
+
+
+def test_init_compiles_nothing(monkeypatch):
+    def compiled(*_args, **_options):
+        raise AssertionError("a program was compiled")
+
+    key = jax.random.key(5)
+    sglpr_jax.init(key, config=MODEL)
+    monkeypatch.setattr("jax._src.compiler.compile_or_get_cached", compiled)
+    jax.clear_caches()
+    sglpr_jax.init(key, config=MODEL)
+
+
+def test_flax_itself_creates_the_same_weights():
+    image = np.zeros((1, MODEL.grid.height, MODEL.grid.width, MODEL.channels), np.float32)
+    shapes = jax.eval_shape(SGLPR(MODEL).init, jax.random.key(0), image, None)["params"]
+    drawn = sglpr_jax.init(jax.random.key(0), config=MODEL).weights
+    assert jax.tree.map(lambda leaf: leaf.shape, drawn) == jax.tree.map(lambda leaf: leaf.shape, shapes)
