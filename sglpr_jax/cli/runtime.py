@@ -7,6 +7,7 @@ import functools
 import gc
 import inspect
 import io
+import json
 import logging
 import os
 import re
@@ -17,14 +18,15 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import distribution
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sglpr_jax.cli.config_file import ConfigFlags, flag_values, read_flag_values, with_flag_values
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.fields import check_value, field_types, has_bounds
+from sglpr_jax.fields import check_value, field_types, has_bounds, read_value
 from sglpr_jax.names import printable
 
 _TABLE_WIDTH = 140
@@ -56,13 +58,6 @@ def _temporary_folder() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix="sglpr-jax-")
 
 
-def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
-    """Read --preset before the other flags, because the preset sets their defaults."""
-    chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    chooser.add_argument("--preset", default=default)
-    return chooser.parse_known_args(arguments)[0].preset
-
-
 def own_names(text: str) -> str:
     """Replace command names in `text` by those of this installation: bin/embed by sglpr-embed after `pip install`.
 
@@ -81,15 +76,81 @@ def _installed_commands() -> tuple[str, ...]:
     return tuple(script.name.removeprefix(_INSTALLED_AS) for script in scripts)
 
 
-def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:
-    """Parse the flags of a command. `options` are passed to `tyro.cli`.
+def parse_command(
+    command: type[T],
+    name: str,
+    arguments: list[str] | None = None,
+    *,
+    load_preset: Callable[[str], Any] | None = None,
+    description: str | None = None,
+) -> T:
+    """Parse the flags of a command. With --dump-config, print their values and exit.
 
-    Raises ValueError if a number is outside the bounds of its annotation (`fields.py`).
+    Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults.
+
+    Arguments:
+      command: Dataclass of the command.
+      name: Name of the command in `bin/`.
+      arguments: Command line without the name. None: that of this process.
+      load_preset: Loads the default of the field `config`, given the value of --preset. None: no presets.
+      description: Text of --help. None: the docstring of the command.
+
+    Raises:
+      ValueError: If a number is outside the bounds of its annotation (`fields.py`), or if the file of --config is
+        invalid.
     """
-    about = {"prog": own_names(f"bin/{name}"), "description": own_names(inspect.getdoc(command) or ""), **options}
-    found = tyro.cli(command, args=arguments, **about)
-    _check_numbers(found)
-    return found
+    defaults = object.__new__(command)  # not by its constructor, which takes no missing values
+    vars(defaults).update(_default_fields(command, arguments, load_preset))
+    line_type = dataclasses.make_dataclass(
+        "Line",
+        [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
+    )
+    about = own_names(description or inspect.getdoc(command) or "")
+    default = line_type(defaults, ConfigFlags())
+    line = tyro.cli(line_type, args=arguments, prog=own_names(f"bin/{name}"), description=about, default=default)
+    _check_numbers(line.command)
+    if line.common.dump_config:
+        print(json.dumps(flag_values(line.command), indent=2))
+        sys.exit(0)
+    return line.command
+
+
+def _default_fields(
+    command: type, arguments: list[str] | None, load_preset: Callable[[str], Any] | None
+) -> dict[str, Any]:
+    """Return the fields of a command by the file of --config, the preset and the defaults."""
+    file, preset = _early_flags(arguments)
+    fields = {field.name: _default(field) for field in dataclasses.fields(command)}
+    values = {} if file is None else read_flag_values(file)
+    if load_preset is not None and preset is None and "preset" in values:
+        fields["config"] = _preset_in_file(values["preset"], load_preset, source=file)
+    elif load_preset is not None:
+        fields["config"] = load_preset(preset or fields["preset"])
+    return fields if file is None else with_flag_values(command, fields, values, source=file)
+
+
+def _preset_in_file(preset: Any, load_preset: Callable[[str], Any], *, source: Path | None) -> Any:
+    """Load the preset that a file of --config names. The message of an error names the file."""
+    try:
+        return load_preset(read_value(preset, str, ""))
+    except ValueError as error:
+        raise ValueError(f"{source}: preset: {error}") from error
+
+
+def _early_flags(arguments: list[str] | None) -> tuple[Path | None, str | None]:
+    """Read --config and --preset before the other flags, because they set the defaults of these."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--preset")
+    early, _ = parser.parse_known_args(arguments)
+    return early.config, early.preset
+
+
+def _default(field: dataclasses.Field) -> Any:
+    """Return the default of a field, or `tyro.MISSING` if it is required."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return tyro.MISSING if field.default is dataclasses.MISSING else field.default
 
 
 def _check_numbers(command: Any) -> None:
