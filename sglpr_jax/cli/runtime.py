@@ -1,6 +1,5 @@
 """Common parts of all commands: compilation cache, orderly interruption, one-line errors."""
 
-import argparse
 import contextlib
 import dataclasses
 import functools
@@ -24,9 +23,10 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from sglpr_jax.cli.config_file import ConfigFlags, flag_values, read_flag_values, with_flag_values
+from sglpr_jax.cli.config_file import ConfigFlags, flag_values
+from sglpr_jax.cli.defaults import default_command
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.fields import check_value, field_types, has_bounds, read_value
+from sglpr_jax.fields import check_value, field_types, has_bounds
 from sglpr_jax.names import printable
 
 _TABLE_WIDTH = 140
@@ -99,58 +99,18 @@ def parse_command(
       ValueError: If a number is outside the bounds of its annotation (`fields.py`), or if the file of --config is
         invalid.
     """
-    defaults = object.__new__(command)  # not by its constructor, which takes no missing values
-    vars(defaults).update(_default_fields(command, arguments, load_preset))
     line_type = dataclasses.make_dataclass(
         "Line",
         [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
     )
     about = own_names(description or inspect.getdoc(command) or "")
-    default = line_type(defaults, ConfigFlags())
+    default = line_type(default_command(command, arguments, load_preset=load_preset), ConfigFlags())
     line = tyro.cli(line_type, args=arguments, prog=own_names(f"bin/{name}"), description=about, default=default)
     _check_numbers(line.command)
     if line.common.dump_config:
         print(json.dumps(flag_values(line.command), indent=2))
         sys.exit(0)
     return line.command
-
-
-def _default_fields(
-    command: type, arguments: list[str] | None, load_preset: Callable[[str], Any] | None
-) -> dict[str, Any]:
-    """Return the fields of a command by the file of --config, the preset and the defaults."""
-    file, preset = _early_flags(arguments)
-    fields = {field.name: _default(field) for field in dataclasses.fields(command)}
-    values = {} if file is None else read_flag_values(file)
-    if load_preset is not None and preset is None and "preset" in values:
-        fields["config"] = _preset_in_file(values["preset"], load_preset, source=file)
-    elif load_preset is not None:
-        fields["config"] = load_preset(preset or fields["preset"])
-    return fields if file is None else with_flag_values(command, fields, values, source=file)
-
-
-def _preset_in_file(preset: Any, load_preset: Callable[[str], Any], *, source: Path | None) -> Any:
-    """Load the preset that a file of --config names. The message of an error names the file."""
-    try:
-        return load_preset(read_value(preset, str, ""))
-    except ValueError as error:
-        raise ValueError(f"{source}: preset: {error}") from error
-
-
-def _early_flags(arguments: list[str] | None) -> tuple[Path | None, str | None]:
-    """Read --config and --preset before the other flags, because they set the defaults of these."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config", type=Path)
-    parser.add_argument("--preset")
-    early, _ = parser.parse_known_args(arguments)
-    return early.config, early.preset
-
-
-def _default(field: dataclasses.Field) -> Any:
-    """Return the default of a field, or `tyro.MISSING` if it is required."""
-    if field.default_factory is not dataclasses.MISSING:
-        return field.default_factory()
-    return tyro.MISSING if field.default is dataclasses.MISSING else field.default
 
 
 def _check_numbers(command: Any) -> None:
