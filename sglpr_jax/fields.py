@@ -10,6 +10,7 @@ import math
 import sys
 import types
 import typing
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 
@@ -87,6 +88,35 @@ def check_value(value: Any, annotation: Any, field: str) -> None:
         require(value, type(value) is annotation, expected, field)
 
 
+def read_value(value: Any, annotation: Any, field: str) -> Any:
+    """Convert a JSON value to the type of a field: lists to tuples, strings to paths, integers to floats.
+
+    Arguments:
+      value: JSON value, or the value of a field.
+      annotation: Annotation of the field, without nested configurations.
+      field: Name of the field for the message.
+
+    Raises:
+      ValueError: If the field rejects the value. A `float` without bounds accepts infinity.
+    """
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        read = read_value(value, parts[0], field)
+        if has_bounds(annotation):
+            check_value(read, annotation, field)
+        return read
+    if origin in (typing.Union, types.UnionType):
+        return _read_union(value, parts, field)
+    if origin is tuple and isinstance(value, list | tuple):
+        items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        require(value, len(value) == len(items), f"a list of {len(items)}", field)
+        return tuple(read_value(one, item, field) for one, item in zip(value, items, strict=True))
+    if annotation is float and isinstance(value, float):
+        return value
+    check_value(value, str if annotation is Path else annotation, field)
+    return annotation(value) if annotation in (Path, float) else value
+
+
 def require(value: Any, fits: bool, expected: str, field: str) -> None:
     """Raise ValueError with the field, the expected and the found value, unless `fits` is True."""
     if not fits:
@@ -105,6 +135,23 @@ def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
         require(value, isinstance(value, tuple(configs)), f"the fields of a {names}", field)
     else:
         check_value(value, next(member for member in members if member is not types.NoneType), field)
+
+
+def _read_union(value: Any, members: tuple[Any, ...], field: str) -> Any:
+    """Converts a value by the first member that accepts it. The message has what each member but None expects."""
+    if value is None and types.NoneType in members:
+        return None
+    *others, last = (member for member in members if member is not types.NoneType)
+    expected = ""
+    for member in others:
+        try:
+            return read_value(value, member, field)
+        except ValueError as error:
+            expected += str(error).partition("expected ")[2].rpartition(", found")[0] + " or "
+    try:
+        return read_value(value, last, field)
+    except ValueError as error:
+        raise ValueError(str(error).replace("expected ", f"expected {expected}", 1)) from error
 
 
 def _check_tuple(value: Any, items: tuple[Any, ...], field: str) -> None:

@@ -8,16 +8,25 @@ from pathlib import Path
 
 from fields import Field, fields_of, paragraph, table
 
+from sglpr_jax.cli.config_file import ConfigFlags
+
 HEAD = """# Commands
 
 Each command stands in `bin/`, and after `pip install` as `sglpr-NAME`. `--help` prints the same. This page is made from
 the parsers.
+
+Every command also has these flags:
+
+{common}
 """
+
+COLUMNS = ("flag", "default", "meaning")
 
 
 def commands_page(root: Path) -> str:
     """All commands of `bin/` that are a module of `sglpr_jax.cli`, by name."""
-    return "\n".join([HEAD, *(_section(script.name, _command_of(script)) for script in _scripts(root))])
+    head = HEAD.format(common=table(COLUMNS, [_row(field) for field in fields_of(ConfigFlags)]))
+    return "\n".join([head, *(_section(script.name, _command_of(script)) for script in _scripts(root))])
 
 
 def _scripts(root: Path) -> list[Path]:
@@ -46,7 +55,7 @@ def _section(name: str, command: type) -> str:
     ]
     if commands:
         lines += ["```bash", *commands, "```", ""]
-    return "\n".join([*lines, table(("flag", "default", "meaning"), [_row(field) for field in _flags(command)]), ""])
+    return "\n".join([*lines, table(COLUMNS, [_row(field) for field in _flags(command)]), ""])
 
 
 def _flags(command: type) -> list[Field]:

@@ -16,6 +16,9 @@ HEAD = """# Configuration
 A training run is told everything by one `TrainConfig`, and a model is described by the `ModelConfig` within it. Every
 field can be set in a preset, a file of `configs/`, and on the command line: `bin/train --optimizer.learning-rate 1e-4`,
 `bin/train --model.head.cbam False`. A run writes all of them to its `config.json`. This page is made from the code.
+
+`bin/train --preset paper --dump-config` prints every field as JSON. `bin/train --config mine.json` reads such a file,
+also with some of the fields only. The file overrides the preset, and flags override the file.
 """
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import PoseFormat
@@ -36,7 +37,7 @@ class EvaluateCommand:
     published: bool = False
     """Also print the paper's numbers, marked as published: table 1 for the sequence, or table 3 with --database."""
     out: Path | None = None
-    """Folder for results.json, report.html and the pictures. None: FILE without its suffix."""
+    """Folder for results.json, report.html, command.json and the pictures. None: FILE without its suffix."""
     poses: Path | None = None
     """Pose file with one row per frame. If FILE has times, poses at other times are interpolated. If --skip-bad skipped
     scans of FILE, a row for every scan is accepted, too. None: the poses in FILE, or those of --data."""
@@ -76,7 +77,7 @@ def evaluate_file(command: EvaluateCommand) -> Path:
         written = write_sessions(across, folder)
     else:
         written = _evaluate_recording(command, folder)
-    for path in written:
+    for path in (*written, record_command(command, folder)):
         print(f"written: {path}")
     return folder
 

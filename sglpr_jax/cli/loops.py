@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.warning import warn
@@ -29,8 +30,9 @@ UNFINISHED = "unfinished"
 class LoopsCommand:
     """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
-    Writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons) and index.html. With
-    odometry also trajectory.tum and trajectory.kitti, with --optimize also the corrected trajectory.
+    Writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons), index.html and
+    command.json (the flags). With odometry also trajectory.tum and trajectory.kitti, with --optimize also the corrected
+    trajectory.
     Ctrl-C writes the loops found until then. The same command continues after that, and after a run that was killed.
 
     Example:
@@ -151,7 +153,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         found = found.without_degenerate()
     corrected = optimize_trajectory(found) if command.optimize else None
     paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses)
-    paths.append(write_loops_page(found, command.out, optimized=corrected))
+    paths += write_loops_page(found, command.out, optimized=corrected), record_command(command, command.out)
     print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
     if corrected is not None:
         print(corrected)

@@ -1,14 +1,14 @@
 """bin/reproduce: reproduce the paper's tables and figures on any dataset, beside the paper's numbers."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.runtime import console, parse_command, preset_asked_for, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.config_file import record_command
+from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.cli.train import exit_unless_finished
 from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.reproduce.experiments import EXPERIMENTS
@@ -63,10 +63,8 @@ class ReproduceCommand:
 
 
 def parse(arguments: list[str] | None = None) -> ReproduceCommand:
-    """Parse the command line. The preset overrides the defaults, and the flags override the preset."""
-    preset = preset_asked_for(arguments, default=ReproduceCommand.preset)
-    default = ReproduceCommand(what=(), preset=preset, config=load_preset(preset))
-    return parse_command(ReproduceCommand, "reproduce", arguments, default=default)
+    """Parse the command line."""
+    return parse_command(ReproduceCommand, "reproduce", arguments, load_preset=load_preset)
 
 
 def reproduce(command: ReproduceCommand) -> Path:
@@ -104,11 +102,10 @@ def _train(runs: "Runs", plan: "Plan") -> None:
 def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tuple[str, ...]) -> None:
     """Compute, write and print the tables and figures of finished runs."""
     from sglpr_jax.cli.datasets import cached_sessions
-    from sglpr_jax.files import write_json
     from sglpr_jax.reproduce.reproduction import Reproduction, write_experiment
     from sglpr_jax.reproduce.tables import PaperTable
 
-    write_json(command.out / "config.json", json.loads(json.dumps(dataclasses.asdict(command), default=str)))
+    record_command(command, command.out)
     found = Reproduction(runs, seqs, command.method, lambda: command.nclt or cached_sessions())
     for name in names:
         made = write_experiment(name, found, command.out)

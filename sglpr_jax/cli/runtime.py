@@ -1,12 +1,12 @@
 """Common parts of all commands: compilation cache, orderly interruption, one-line errors."""
 
-import argparse
 import contextlib
 import dataclasses
 import functools
 import gc
 import inspect
 import io
+import json
 import logging
 import os
 import re
@@ -17,12 +17,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import distribution
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sglpr_jax.cli.config_file import ConfigFlags, flag_values
+from sglpr_jax.cli.defaults import default_command
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.fields import check_value, field_types, has_bounds
 from sglpr_jax.names import printable
@@ -56,13 +58,6 @@ def _temporary_folder() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix="sglpr-jax-")
 
 
-def preset_asked_for(arguments: list[str] | None, *, default: str) -> str:
-    """Read --preset before the other flags, because the preset sets their defaults."""
-    chooser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    chooser.add_argument("--preset", default=default)
-    return chooser.parse_known_args(arguments)[0].preset
-
-
 def own_names(text: str) -> str:
     """Replace command names in `text` by those of this installation: bin/embed by sglpr-embed after `pip install`.
 
@@ -81,15 +76,41 @@ def _installed_commands() -> tuple[str, ...]:
     return tuple(script.name.removeprefix(_INSTALLED_AS) for script in scripts)
 
 
-def parse_command(command: type[T], name: str, arguments: list[str] | None = None, **options: Any) -> T:
-    """Parse the flags of a command. `options` are passed to `tyro.cli`.
+def parse_command(
+    command: type[T],
+    name: str,
+    arguments: list[str] | None = None,
+    *,
+    load_preset: Callable[[str], Any] | None = None,
+    description: str | None = None,
+) -> T:
+    """Parse the flags of a command. With --dump-config, print their values and exit.
 
-    Raises ValueError if a number is outside the bounds of its annotation (`fields.py`).
+    Flags override the file of --config, the file overrides the preset, and the preset overrides the defaults.
+
+    Arguments:
+      command: Dataclass of the command.
+      name: Name of the command in `bin/`.
+      arguments: Command line without the name. None: that of this process.
+      load_preset: Loads the default of the field `config`, given the value of --preset. None: no presets.
+      description: Text of --help. None: the docstring of the command.
+
+    Raises:
+      ValueError: If a number is outside the bounds of its annotation (`fields.py`), or if the file of --config is
+        invalid.
     """
-    about = {"prog": own_names(f"bin/{name}"), "description": own_names(inspect.getdoc(command) or ""), **options}
-    found = tyro.cli(command, args=arguments, **about)
-    _check_numbers(found)
-    return found
+    line_type = dataclasses.make_dataclass(
+        "Line",
+        [("command", Annotated[command, tyro.conf.arg(name="")]), ("common", tyro.conf.OmitArgPrefixes[ConfigFlags])],
+    )
+    about = own_names(description or inspect.getdoc(command) or "")
+    default = line_type(default_command(command, arguments, load_preset=load_preset), ConfigFlags())
+    line = tyro.cli(line_type, args=arguments, prog=own_names(f"bin/{name}"), description=about, default=default)
+    _check_numbers(line.command)
+    if line.common.dump_config:
+        print(json.dumps(flag_values(line.command), indent=2))
+        sys.exit(0)
+    return line.command
 
 
 def _check_numbers(command: Any) -> None:

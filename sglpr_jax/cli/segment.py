@@ -5,6 +5,7 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
 from sglpr_jax.fields import Share
@@ -68,6 +69,7 @@ def segment_recording(command: SegmentCommand) -> Path:
         draw_semantics(params, recording, command.out, min_confidence=least)
         console().print(scores)
         write_json(command.out / RESULT_FILE, scores.to_json())
+    record_command(command, command.out)
     return command.out
 
 

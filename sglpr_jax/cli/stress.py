@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import PosedRecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, progress_bar, run
 from sglpr_jax.fields import CountOrNone, Size
@@ -26,7 +27,8 @@ class StressCommand:
     data: Path
     """A dataset, in KITTI's layout or as ready-made BEV images, or a folder of scans with poses."""
     out: Path
-    """Folder for results.json, config.json, stress.png and the descriptors. It is created if it does not exist."""
+    """Folder for results.json, config.json, command.json, stress.png and the descriptors. It is created if it does not
+    exist."""
     weights: str | None = None
     """Name of shipped weights or folder of a training run; adds the network to the methods. None: sglpr if --method is
     not given, otherwise no network."""
@@ -74,7 +76,7 @@ def run_stress_test(command: StressCommand) -> Path:
     for name, reason in found.left_out.items():
         print(f"skipped {name}: {reason}", file=sys.stderr)
     console().print(found)
-    for path in write_stress_test(found, command.out):
+    for path in (*write_stress_test(found, command.out), record_command(command, command.out)):
         print(f"written: {path}")
     if not figures.can_draw():
         print("no drawing: it needs the extra `viz` (pip install 'sglpr-jax[viz]')", file=sys.stderr)

@@ -12,9 +12,7 @@ from sglpr_jax.cli.recording import report_bad_scan
 from sglpr_jax.cli.runtime import (
     StopRequest,
     console,
-    own_names,
     parse_command,
-    preset_asked_for,
     progress_bar,
     run,
     stop_on_signal,
@@ -100,11 +98,9 @@ class TrainCommand:
 
 
 def parse(arguments: list[str] | None = None) -> TrainCommand:
-    """Parse the command line. The preset overrides the defaults, and the flags override the preset."""
-    preset = preset_asked_for(arguments, default=TrainCommand.preset)
+    """Parse the command line."""
     description = f"{TrainCommand.__doc__}\nPresets: {', '.join(preset_names())}"
-    default = TrainCommand(preset=preset, config=load_preset(preset))
-    command = parse_command(TrainCommand, "train", arguments, default=default, description=own_names(description))
+    command = parse_command(TrainCommand, "train", arguments, load_preset=load_preset, description=description)
     return dataclasses.replace(command, config=without_untrained_head(command.config))
 
 

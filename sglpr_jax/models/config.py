@@ -11,12 +11,8 @@ from sglpr_jax.categories import RAW_IDS, Categories
 from sglpr_jax.data.density_grid import check_density_grid
 from sglpr_jax.fields import NotNegative, Size, SizeOrNone, Sizes, check_fields
 from sglpr_jax.grid import Grid, ImageKind
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
+from sglpr_jax.models.backbones.config import BackboneConfig
 from sglpr_jax.models.backbones.swin_config import SwinConfig
-
-BackboneConfig = SwinConfig | CircularConfig | SglprConfig
-"""All backbone configurations. `models/backbones/interface.py` defines the properties that they share."""
 
 WHITENING_POWER = 0.4
 """Default power of whitening: each principal component is divided by its spread raised to this power."""

@@ -1,11 +1,10 @@
 """Conversion of the plain values of a JSON file to a model configuration, with a check of every field."""
 
-import types
 import typing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from sglpr_jax.fields import check_value, field_types, is_config, require
+from sglpr_jax.fields import field_types, is_config, read_value, require
 from sglpr_jax.models.config import ModelConfig
 
 RENAMED = {"rings": "circular"}
@@ -32,21 +31,14 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
 
 
 def _read(annotation: Any, value: Any, field: str) -> Any:
-    """Converts a value to a field's type: dictionaries to dataclasses, lists to tuples, whole numbers to floats."""
-    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    """Converts a value to a field's type, and dictionaries to dataclasses."""
     value = _of_today(value, f"{field}." if field else "")
     if is_config(annotation):
         return _read_dataclass(annotation, value, field)
-    if origin in (typing.Union, types.UnionType):
-        return None if value is None and types.NoneType in parts else _read(_member(parts, value, field), value, field)
-    if origin is tuple:
-        require(value, isinstance(value, list | tuple), "a list", field)
-        items = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-        require(value, len(value) == len(items), f"a list of {len(items)}", field)
-        value = tuple(_read(item, one, field) for item, one in zip(items, value, strict=True))
-    check_value(value, annotation, field)
-    plain = parts[0] if origin is Annotated else annotation
-    return float(value) if plain is float else value
+    members = typing.get_args(annotation)
+    if any(map(is_config, members)):
+        return _read(_member(members, value, field), value, field)
+    return read_value(value, annotation, field)
 
 
 def _of_today(value: Any, prefix: str) -> Any:
@@ -81,11 +73,9 @@ def _differing(value: dict[str, Any], annotations: dict[str, Any]) -> tuple[set[
 
 
 def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:
-    """The member of a union that fits a value. Several configurations are distinguished by their `kind`."""
-    configs: dict[str, Any] = {member.kind: member for member in members if is_config(member)}
-    if not configs:
-        return next(member for member in members if member is not types.NoneType)
-    names = " or ".join(member.__name__ for member in configs.values())
+    """The configuration of a union that has the `kind` of the value."""
+    configs: dict[str, Any] = {member.kind: member for member in members}
+    names = " or ".join(member.__name__ for member in members)
     require(value, isinstance(value, dict), f"the fields of a {names}", field)
     kind = value.get("kind")
     require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)

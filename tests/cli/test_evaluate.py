@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 from .conftest import assert_one_line_error
 
-FILES = ("results.json", "precision-recall.png", "trajectory.png", "report.html")
+FILES = ("results.json", "precision-recall.png", "trajectory.png", "report.html", "command.json")
 BIN = Path(__file__).resolve().parents[2] / "bin"
 
 
@@ -61,6 +62,17 @@ def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, re
     assert "290 frames" in ended.out
 
 
+def test_the_record_beside_the_results_repeats_them(command, recording, tmp_path):
+    recording.save(tmp_path / "08.npz")
+    out = tmp_path / "out"
+    assert command("evaluate", tmp_path / "08.npz", "--protocol", "top1-f1max", "--out", out).status == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    shutil.move(out, tmp_path / "first")
+    assert command("evaluate", "--config", tmp_path / "first" / "command.json").status == 0
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert len(json.loads(before["results.json"])["results"]) == 1
+
+
 def test_a_drive_without_revisits_says_so(command, recording, tmp_path):
     straight = np.arange(800.0)[:, None] * [[6.0, 0.0, 0.0]]  # farther apart than any "same place"
     dataclasses.replace(recording, positions=straight).save(tmp_path / "08.npz")
@@ -76,7 +88,7 @@ def test_without_matplotlib_the_table_is_all_and_the_extra_is_named(command, rec
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     ended = command("evaluate", tmp_path / "08.npz")
     assert ended.status == 0 and "sglpr-jax[viz]" in ended.error
-    assert sorted(path.name for path in (tmp_path / "08").iterdir()) == ["report.html", "results.json"]
+    assert sorted(path.name for path in (tmp_path / "08").iterdir()) == ["command.json", "report.html", "results.json"]
     assert "sglpr-jax[viz]" in (tmp_path / "08" / "report.html").read_text()
 
 

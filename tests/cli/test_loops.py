@@ -19,7 +19,7 @@ from sglpr_jax.models.weights_file import load
 
 from .conftest import SCANS, assert_one_line_error
 
-FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "rejected.jsonl", "index.html"}
+FILES = {"loops.g2o", "loops.jsonl", "loops.csv", "rejected.jsonl", "index.html", "command.json"}
 TRAJECTORIES = {"trajectory.tum", "trajectory.kitti"}
 TWICE = DetectorConfig(min_probability=1e-4, drift=DriftModel(0.02, 0.01))
 OPTIMIZED = {"trajectory-optimized.tum", "trajectory-optimized.kitti"}

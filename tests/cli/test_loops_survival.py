@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sglpr_jax.cli.config_file import COMMAND_FILE
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops.graph_files import write_tum
 from sglpr_jax.sim import Sensor, write_dataset
@@ -36,7 +37,7 @@ def start(name: str, arguments: tuple[object, ...], out: Path) -> subprocess.Pop
 
 def finish(arguments: tuple[object, ...], out: Path) -> dict[str, bytes]:
     assert start("loops", arguments, out).wait(TIMEOUT_S) == 0, (out.parent / "errors.txt").read_text()
-    return {path.name: path.read_bytes() for path in out.iterdir()}
+    return {path.name: path.read_bytes() for path in out.iterdir() if path.name != COMMAND_FILE}  # it names `out`
 
 
 def wait_for(process: subprocess.Popen, path: Path) -> None:

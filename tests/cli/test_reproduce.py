@@ -54,6 +54,7 @@ def test_a_scan_that_vanishes_on_the_way_is_missed(town, preset, tmp_path):
 def test_the_plan_says_what_is_trained_and_only_that_is(reproduced):
     folder, ended, _ = reproduced
     assert "3 leave-one-out runs of 4 steps, 0 of them already trained" in ended.error
+    assert json.loads((folder / "command.json").read_text())["steps"] == 4
     assert "s a step" in ended.error and "run 3 of 3" in ended.error
     assert {path.parent.parent.name for path in folder.glob("*/08/trained.json")} == {
         "full",

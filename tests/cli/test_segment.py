@@ -43,6 +43,7 @@ def test_scans_without_labels_get_maps_but_no_scores(segment, trained, town, tmp
     ended, maps = segment("--weights", trained.folder, "--data", scans)
     assert ended.status == 0, ended.error
     assert len(list(maps.glob("*.png"))) == 40
+    assert json.loads((maps / "command.json").read_text())["data"] == str(scans)
     assert not (maps / "segmentation.json").exists()
 
 

@@ -37,7 +37,8 @@ def test_everything_on_the_network_and_a_baseline(stress, rings, trained):
     options = ("--data", rings, "--weights", trained.folder, "--method", "polar-fft", "solid")
     ended, out = stress(*options, "--protocol", "pairs-all-f1max", "ssc-recall")
     assert ended.status == 0, ended.error
-    assert {path.name for path in out.iterdir()} == {"results.json", "config.json", "stress.png", "descriptors"}
+    names = {"results.json", "config.json", "command.json", "stress.png", "descriptors"}
+    assert {path.name for path in out.iterdir()} == names
     names = ["clean", *(corruption.name for corruption in CORRUPTIONS)]
     files = {f"{name}-{method}.npz" for name in names for method in ("sglpr", "polar-fft", "solid")}
     assert {path.name for path in (out / "descriptors").iterdir()} == files

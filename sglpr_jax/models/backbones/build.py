@@ -2,12 +2,12 @@
 
 from sglpr_jax.models.backbones.circular import CircularBackbone
 from sglpr_jax.models.backbones.circular_config import CircularConfig
+from sglpr_jax.models.backbones.config import BackboneConfig
 from sglpr_jax.models.backbones.interface import Backbone
 from sglpr_jax.models.backbones.sglpr import SglprBackbone
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.backbones.swin import SwinBackbone
 from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import BackboneConfig
 
 
 def build(config: BackboneConfig, *, circular: bool) -> Backbone:

@@ -4,7 +4,7 @@ A backbone consists of two files in this folder. NAME_config.py has a frozen con
 `BackboneConfig`. It imports no JAX, so a command line can list its fields quickly. NAME.py has a class with the two
 calls of `Backbone`.
 
-To add a backbone, add its configuration to the union in `models/config.py` and its class to `build.py`. No other code
+To add a backbone, add its configuration to the union in `config.py` and its class to `build.py`. No other code
 depends on it.
 """
 

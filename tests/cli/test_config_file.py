@@ -1,0 +1,162 @@
+"""Values of flags survive a file: --dump-config prints them, --config reads them, and wrong files are one line."""
+
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sglpr_jax.cli import runtime
+from sglpr_jax.cli.config_file import COMMAND_FILE, record_command
+
+from .conftest import assert_one_line_error, run_command
+
+LINES = {
+    "convert": ("swin.safetensors", "--out", "start", "--network", "swin-unet", "--seed", "3"),
+    "demo": ("--scans", "40", "--steps", "0"),
+    "embed": ("--data", "scans", "--out", "07.npz", "--seq", "07", "--sensor-height", "2", "--rotate"),
+    "evaluate": ("a.npz", "b.npz", "--database", "c.npz", "--protocol", "all", "--seq", "no"),
+    "export": ("--out", "mine", "--average", "1e3", "--shares", "1", "1e-4", "--image", "density"),
+    "loops": ("scans", "--out", "found", "--seq", "1_0", "--near-m", "inf", "--candidates.rivals.age", "0", "1e-1"),
+    "map": ("scans", "--poses", "poses.tum", "--out", "a.safetensors", "--spacing-m", "0", "--skip-bad"),
+    "relocalize": ("drive", "--map", "a.safetensors", "--frame", "0", "--sensor-height", "estimate"),
+    "reproduce": ("table1", "figure5", "--preset", "paper", "--seq", "00", "07", "--loss.margin", "0.25"),
+    "segment": ("--data", "scans", "--out", "maps", "--min-confidence", "1", "--seq", "null"),
+    "simulate": ("--out", "towns", "--seq", "00", "05", "--sensor", "vlp16", "--rate-hz", "5"),
+    "stress": ("--data", "scans", "--out", "stress", "--method", "solid", "random", "--batch", "2"),
+    "train": ("--seq", "07", "--preset", "circular", "--model.head.cbam", "True", "--optimizer.clip-norm", "None"),
+}
+"""A command line of each command, with texts that YAML or a careless reader takes for other values."""
+TINY = Path(__file__).resolve().parents[1] / "tiny.py"
+
+
+def parsed(name: str, *arguments: object) -> Any:
+    """Return the command that `bin/<name> <arguments>` runs."""
+    module, found = importlib.import_module(f"sglpr_jax.cli.{name}"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "run", lambda parse, work: found.append(parse()))
+        ended = run_command(name, *arguments)
+    assert ended.status == 0, ended
+    return found[0]
+
+
+@pytest.fixture
+def file(tmp_path) -> Callable[..., Path]:
+    """`file(values)` writes a file for --config."""
+
+    def write(values: object) -> Path:
+        path = tmp_path / "mine.json"
+        path.write_text(values if isinstance(values, str) else json.dumps(values))
+        return path
+
+    return write
+
+
+def test_every_command_is_tested():
+    folder = Path(runtime.__file__).parent
+    assert set(LINES) == {path.stem for path in folder.glob("*.py") if (folder.parents[1] / "bin" / path.stem).exists()}
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_a_dump_gives_the_same_command(name, tmp_path):
+    ended = run_command(name, *LINES[name], "--dump-config")
+    assert ended.status == 0 and not ended.error
+    (tmp_path / "dump.json").write_text(ended.out)
+    expected = parsed(name, *LINES[name])
+    assert parsed(name, "--config", tmp_path / "dump.json") == expected
+    assert run_command(name, "--config", tmp_path / "dump.json", "--dump-config").out == ended.out
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_a_dump_has_the_flags_of_the_help(name):
+    ended = run_command(name, *LINES[name], "--dump-config")
+    shown = run_command(name, *LINES[name], "--help").out
+    flags = {word.strip(",│") for word in shown.split() if word.startswith("--")}
+    positional = {"checkpoint", "recording", "scan", "file", "more", "what"}
+    dumped = {f"--{flag}" for flag in json.loads(ended.out) if flag not in positional}
+    assert dumped <= flags and {"--config", "--dump-config"} <= flags - dumped
+
+
+def test_a_dump_needs_the_required_flags_and_does_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ended = run_command("loops", "nowhere", "--dump-config")
+    assert ended.status == 2 and "--out" in ended.error and not ended.out
+    assert run_command("loops", "nowhere", "--out", "found", "--dump-config").status == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_flags_override_the_file_and_the_file_overrides_the_defaults(file):
+    path = file({"recording": "scans", "out": "found", "seq": "07", "register": True, "candidates.elsewhere": 5})
+    found = parsed("loops", "drive", "--config", path, "--seq", "08", "--no-register", "--candidates.candidates", "7")
+    assert (found.recording, found.out, found.source.seq) == (Path("drive"), Path("found"), "08")
+    assert (found.register, found.candidates.candidates, found.candidates.elsewhere) == (False, 7, 5)
+    assert found.candidates.min_cells == 20
+
+
+@pytest.mark.parametrize("name", ["train", "reproduce"])
+def test_the_file_may_name_the_preset_and_overrides_it(name, file):
+    path = file({"preset": "paper", "steps": 5, "optimizer.learning-rate": 1})
+    found = parsed(name, "--config", path, "--loss.margin", "0.5")
+    assert found.preset == "paper" and found.config.model == parsed(name, "--preset", "paper").config.model
+    assert (found.config.steps, found.config.loss.margin) == (5, 0.5)
+    assert found.config.optimizer.learning_rate == 1.0 and type(found.config.optimizer.learning_rate) is float
+    other = parsed(name, f"--config={path}", "--preset", TINY)
+    assert (other.preset, other.config.steps) == (str(TINY), 5)
+    assert other.config.model == parsed(name, "--preset", TINY).config.model
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("loops", "seq: 07", ["expected JSON, found invalid JSON"]),
+        ("loops", '{"seq": "07", "seq": "08"}', ["'seq' appears twice"]),
+        ("loops", [], ["expected an object with a value for each flag, found []"]),
+        ("loops", {"min_probability": 1}, ["found 'min_probability'; did you mean 'min-probability'?"]),
+        ("loops", {"candidates": {}}, ["expected flags of the command, found 'candidates'"]),
+        ("loops", {"nothing-like-it": 1}, ["expected flags of the command, found 'nothing-like-it'"]),
+        ("loops", {"config": "a"}, ["expected flags of the command, found 'config'"]),
+        ("loops", {"seq": 7}, ["seq: expected a value of type str, found 7"]),
+        ("loops", {"out": None}, ["out: expected a value of type str, found None"]),
+        ("loops", {"register": 1}, ["register: expected a value of type bool, found 1"]),
+        ("loops", {"near-m": "1e-4"}, ["near-m: expected a value of type float, found '1e-4'"]),
+        ("loops", {"near-m": True}, ["near-m: expected a value of type float, found True"]),
+        ("loops", {"degenerate": "sometimes"}, ["degenerate: expected one of 'keep', 'drop', found 'sometimes'"]),
+        ("loops", {"candidates.rivals.age": [1]}, ["candidates.rivals.age: expected a list of 2, found [1]"]),
+        (
+            "loops",
+            {"sensor-height": "high"},
+            ["sensor-height: expected a value of type float or one of 'auto', 'estimate', found 'high'"],
+        ),
+        ("loops", {"motion-drift.yaw-deg": -1}, ["motion-drift: expected yaw_deg > 0, found -1"]),
+        ("embed", {"batch": 0}, ["batch: expected a number from 1 up to 1048576, found 0"]),
+        ("export", {"shares": [1, -1]}, ["shares: expected a number from 0, found -1"]),
+        ("stress", {"method": "solid"}, ["method: expected a list, found 'solid'"]),
+        ("relocalize", {"frame": 1.5}, ["frame: expected a value of type int, found 1.5"]),
+        ("train", {"steps": 0}, ["steps: expected a number from 1"]),
+        ("train", {"chunk": 7}, ["chunk must divide the"]),
+        ("train", {"preset": 7}, ["preset: expected a value of type str, found 7"]),
+        ("train", {"preset": "smal"}, ["preset: no preset 'smal': expected a .py file or one of"]),
+        ("train", {"model.backbone.kind": "swin"}, ["model.backbone.kind: expected one of 'sglpr', found 'swin'"]),
+    ],
+)
+def test_a_wrong_file_is_one_line(name, values, words, file):
+    path = file(values)
+    assert_one_line_error(run_command(name, "--config", path), f"error: {path}: ", *words)
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    ended = run_command("loops", "scans", "--out", "found", "--config", tmp_path / "mine.json")
+    assert_one_line_error(ended, tmp_path / "mine.json", "expected a JSON file, found none")
+
+
+def test_the_record_of_a_command_is_its_dump(tmp_path):
+    path = record_command(parsed("segment", *LINES["segment"]), tmp_path)
+    assert path == tmp_path / COMMAND_FILE
+    assert path.read_text() == run_command("segment", *LINES["segment"], "--dump-config").out
+
+
+def test_paths_that_are_not_utf_8_survive(tmp_path):
+    command = parsed("segment", "--data", "n\udcff", "--out", "maps")
+    assert parsed("segment", "--config", record_command(command, tmp_path)) == command
