@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.runtime import parse_command, run
 
 
@@ -52,7 +51,6 @@ def convert(command: ConvertCommand) -> Path:
         params, unused = import_swin_unet(fresh, command.checkpoint), ()
         copied = tuple(name for name in by_name(params.weights) if not name.startswith("place_head/"))
     save(params, command.out)
-    record_command(command, command.out)
     share = _share({name: leaf.size for name, leaf in by_name(params.weights).items()}, copied)
     print(f"{command.out}: {share} of {command.checkpoint.name}, the rest random (seed {command.seed})")
     if unused:

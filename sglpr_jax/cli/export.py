@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.models.config import WHITENING_POWER
@@ -76,7 +75,6 @@ def export(command: ExportCommand) -> Path:
         save(params, command.out, half=command.half)
     else:
         save_program(params, command.out, format=command.format)
-    record_command(command, command.out)
     size = sum(file.stat().st_size for file in command.out.iterdir())
     print(f"{command.out}: {size / 1e6:.1f} MB of {'weights' if command.format == 'weights' else command.format}")
     return command.out

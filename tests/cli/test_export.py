@@ -99,7 +99,7 @@ def test_a_program_is_written_in_place_of_weights(command, weights, tmp_path):
     ended = command("export", "--weights", weights, "--out", tmp_path / "out", "--format", "stablehlo")
     assert ended.status == 0 and "MB of stablehlo" in ended.out, ended.error
     files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files == {"describe.stablehlo", "config.json", "input.json", "command.json"}
+    assert files == {"describe.stablehlo", "config.json", "input.json"}
 
 
 def test_flags_of_weights_are_refused_beside_a_program(command, weights, tmp_path):
