@@ -72,8 +72,6 @@ class LoopsCommand:
     `keep` writes them with that information matrix, `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
-    min_neighbour_probability: float = DetectorConfig.min_neighbour_probability
-    """Minimum probability of a neighbouring pair that supports a loop."""
     near_m: float = DetectorConfig.near_m
     """With odometry, a loop must agree with at least half of the loops within this travelled distance, in metres."""
     candidates: CandidateConfig = DetectorConfig.candidates

@@ -66,7 +66,8 @@ def write_map(command: MapCommand) -> int:
 
 
 def _add_places(command: MapCommand, params: "Params") -> int:
-    from sglpr_jax.loops.places import PlaceMap, map_recording, poses_by_id
+    from sglpr_jax.loops.place_names import poses_by_id
+    from sglpr_jax.loops.places import PlaceMap, map_recording
     from sglpr_jax.loops.unfinished import remove
     from sglpr_jax.models.weights import weights_hash
 

@@ -18,7 +18,7 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
 
 if TYPE_CHECKING:
-    from sglpr_jax.loops.places import Relocated
+    from sglpr_jax.loops.relocated import Relocated
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,14 +3,14 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 
 
 def readable(
     recording: Recording,
     *,
-    on_bad_scan: Callable[[str, Exception], None],
+    on_bad_scan: OnBadScan,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> Recording:
     """Read every scan or image with its labels, and return the recording without invalid scans.
@@ -25,18 +25,9 @@ def readable(
     Raises:
       ValueError: If all scans are invalid.
     """
-    good = []
-    for row, scan in enumerate(recording.ids):
-        try:
-            record = recording.record(row)
-            if record.points is not None:
-                check_cloud(record.points, name=record.name)
-            good.append(row)
-        except (ValueError, OSError) as error:
-            on_bad_scan(scan, error)
-        on_progress(row + 1)
-    if not good:
-        raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+    options = {"labels": True, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
+    good = [row for row, read in scan_stream(recording, lambda row, record: True, **options) if read]
+    check_readable(recording, len(good))
     return recording if len(good) == len(recording) else only(recording, good)
 
 

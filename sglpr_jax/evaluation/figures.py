@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 DOTS_PER_INCH = 150
-LOOP_COLOUR, WRONG_COLOUR = "#2b5fc4", "#d62728"
 MOST_INSIDE = 4
 """Maximum number of lines with a legend inside the axes. A longer legend would cover the lines."""
 LEGEND_CHARACTERS = 40
@@ -68,7 +67,7 @@ def write(figure: "matplotlib.figure.Figure", to: Path | io.BytesIO, *, format: 
 def precision_recall(curves: Mapping[str, PrecisionRecallCurve], *, title: str = "") -> "matplotlib.figure.Figure":
     """Draw precision over recall: one line for each named curve, with a dot at the highest F1 (figure 5)."""
     many = len(curves) > MOST_INSIDE
-    figure = _figure(8.0 if many else 5.2, 4.8)
+    figure = new_figure(8.0 if many else 5.2, 4.8)
     axes = figure.add_subplot(title=title, xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
     _draw_equal_f1(axes)
     for name, curve in curves.items():
@@ -86,8 +85,7 @@ def trajectory(
     positions: Float[np.ndarray, "n 3"], decisions: Int[np.ndarray, " n"], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
     """Draw the position of every frame from above, coloured by its `Decision` (figure 6)."""
-    across, along = np.ptp(positions[:, :2], axis=0)
-    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))  # flat for a long street
+    figure = figure_from_above(positions)
     axes = figure.add_subplot(title=title, xlabel="x [m]", ylabel="y [m]")
     for decision, (name, colour, size) in DECISIONS.items():
         x, y = positions[decisions == decision, :2].T
@@ -110,7 +108,7 @@ def learning_curve(
     title: str = "",
 ) -> "matplotlib.figure.Figure":
     """Draw named curves of (step, value), with named reference values as dashed lines."""
-    figure = _figure(6.4, 4.2)
+    figure = new_figure(6.4, 4.2)
     axes = figure.add_subplot(title=title, xlabel=xlabel, ylabel=ylabel)
     for name, points in curves.items():
         steps, values = np.array(points, dtype=np.float64).reshape(-1, 2).T
@@ -126,7 +124,7 @@ def learning_curve(
 
 def learning_curves(panels: Mapping[str, Mapping[str, Sequence[tuple[int, float]]]]) -> "matplotlib.figure.Figure":
     """Draw named curves of (step, value) in stacked panels, one for each title, with a common axis of steps."""
-    figure = _figure(6.4, 0.8 + 2.2 * len(panels))
+    figure = new_figure(6.4, 0.8 + 2.2 * len(panels))
     rows = figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0]
     for axes, (title, curves) in zip(rows, panels.items(), strict=True):
         for name, points in curves.items():
@@ -149,7 +147,7 @@ def stress(
       title: Title of the figure.
     """
     protocols, kinds = (list(dict.fromkeys(names)) for names in zip(*changes, strict=True))
-    figure = _figure(max(1.6 + 1.9 * len(kinds), 4.0), 1.0 + 2.4 * len(protocols))
+    figure = new_figure(max(1.6 + 1.9 * len(kinds), 4.0), 1.0 + 2.4 * len(protocols))
     figure.suptitle(title)
     panels = figure.subplots(len(protocols), len(kinds), sharey="row", squeeze=False)
     for (protocol, kind), methods in changes.items():
@@ -191,7 +189,7 @@ def segmentation_panel(
     if truth is not None:
         pictures["true classes"] = labels.colors[truth]
     pictures["predicted classes"] = labels.colors[prediction]
-    figure = _figure(3.7 * len(pictures), 5.2)
+    figure = new_figure(3.7 * len(pictures), 5.2)
     figure.suptitle(title)
     height, width = np.array(bev.shape) * resolution_m / 2
     for axes, (name, picture) in zip(figure.subplots(1, len(pictures), sharey=True), pictures.items(), strict=True):
@@ -206,7 +204,7 @@ def heat_maps(
     bev: Num[np.ndarray, "h w"], maps: Mapping[str, Float[np.ndarray, "h w"]], *, title: str = ""
 ) -> "matplotlib.figure.Figure":
     """Draw point counts and named maps of feature activations, each on its own scale (figure 8)."""
-    figure = _figure(2.1 * (1 + len(maps)), 2.6)
+    figure = new_figure(2.1 * (1 + len(maps)), 2.6)
     figure.suptitle(title)
     panels = figure.subplots(1, 1 + len(maps), squeeze=False)[0]
     panels[0].imshow(brightness(bev), cmap="gray")
@@ -224,13 +222,19 @@ def brightness(bev: Num[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.log1p(bev) / max(np.log1p(bev).max(), 1e-9)
 
 
-def _figure(width: float, height: float) -> "matplotlib.figure.Figure":
+def new_figure(width: float, height: float) -> "matplotlib.figure.Figure":
     """Return an empty figure of this size in inches. Raises ImportError if matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError("pictures need matplotlib: pip install 'sglpr-jax[viz]'") from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def figure_from_above(positions: Float[np.ndarray, "n 3"]) -> "matplotlib.figure.Figure":
+    """Return an empty figure for a drive seen from above. It is flat for a long street."""
+    across, along = np.ptp(positions[:, :2], axis=0)
+    return new_figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
 
 
 def _draw_equal_f1(axes: "matplotlib.axes.Axes") -> None:
@@ -247,109 +251,3 @@ def _add_class_legend(figure: "matplotlib.figure.Figure", labels: Taxonomy, clas
 
     patches = [Patch(facecolor=tuple(labels.colors[c] / 255), edgecolor="0.6", label=labels.names[c]) for c in classes]
     figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 8), frameon=False)
-
-
-def loops(
-    positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
-) -> "matplotlib.figure.Figure":
-    """Draw a trajectory from above, with a line between the two frames of each loop.
-
-    Arguments:
-      positions: Position of each frame, in metres.
-      pairs: Query and match of each loop, except those known to be wrong.
-      wrong: Query and match of each loop known to be wrong, drawn in red.
-    """
-    across, along = np.ptp(positions[:, :2], axis=0)
-    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
-    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
-    axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
-    for name, some, colour, layer in (("loops", pairs, LOOP_COLOUR, 3), ("wrong", wrong, WRONG_COLOUR, 4)):
-        if name == "wrong" and not some:
-            continue
-        for query, match in some:
-            axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
-        seen = positions[[query for query, _ in some], :2]
-        axes.scatter(*seen.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(some)})", zorder=layer)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
-    axes.legend(loc="best", framealpha=0.95)
-    return figure
-
-
-def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
-    """Draw named trajectories from above. The first is grey; a dot marks the end of each."""
-    across, along = np.ptp(np.concatenate(list(named.values()))[:, :2], axis=0)
-    figure = _figure(7.0, float(np.clip(1.8 + 5.6 * along / max(across, 1e-9), 3.0, 5.6)))
-    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
-    for (name, positions), colour in zip(named.items(), ("0.6", "#2b5fc4", "#d62728"), strict=False):
-        axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
-        axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
-    axes.legend(loc="best", framealpha=0.95)
-    return figure
-
-
-def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
-    """Draw the share of loops over the predicted probability.
-
-    Arguments:
-      bins: Mean predicted probability, share of loops and number of pairs of each bin. The number labels its point.
-    """
-    figure = _figure(5.0, 4.6)
-    axes = figure.add_subplot(xlabel="predicted probability", ylabel="share of loops", xlim=(-0.03, 1.09))
-    axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
-    said, share, _ = np.array(bins).T
-    axes.plot(said, share, "o-", color="#2b5fc4", markersize=5, linewidth=1.4)
-    for x, y, pairs in bins:
-        axes.annotate(f"{pairs}", (x, y), xytext=(5, -10), textcoords="offset points", fontsize=8, color="0.35")
-    axes.set_ylim(-0.08, 1.05)
-    axes.grid(color="0.92")
-    return figure
-
-
-def loops_in_time(
-    found: Sequence[tuple[int, int, float]],
-    frames: int,
-    *,
-    wrong: Sequence[tuple[int, int]] = (),
-    rejected: Sequence[tuple[int, int]] = (),
-) -> "matplotlib.figure.Figure":
-    """Plot the frame number of each match over that of its query.
-
-    Arguments:
-      found: Query, match and probability of each loop. Less probable loops are lighter.
-      frames: Number of frames.
-      wrong: Query and match of each loop known to be wrong, drawn as red crosses.
-      rejected: Query and match of each rejected pair, drawn as small grey dots behind the loops.
-    """
-    figure = _figure(5.0, 4.2)
-    axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))
-    axes.plot([0, frames], [0, frames], color="0.8", linewidth=1)
-    if rejected:
-        axes.scatter(*np.array(rejected).T, s=5, color="0.7", linewidths=0, label=f"rejected ({len(rejected)})")
-    if found:
-        query, match, probability = np.array(found).T
-        dots = axes.scatter(query, match, s=8, c=probability, cmap="viridis", vmin=0.9, vmax=1, linewidths=0)
-        figure.colorbar(dots, label="probability")
-    if wrong:
-        axes.scatter(*np.array(wrong).T, s=24, marker="x", color=WRONG_COLOUR, label=f"wrong ({len(wrong)})")
-    if wrong or rejected:
-        axes.legend(loc="upper left", framealpha=0.95)
-    axes.grid(color="0.92")
-    return figure
-
-
-def overlays(pictures: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
-    """Draw coloured images with their titles, three in a row."""
-    rows = -(-len(pictures) // 3)
-    figure = _figure(9.0, 3.2 * rows)
-    panels = figure.subplots(rows, 3, squeeze=False).ravel()
-    for axes in panels:
-        axes.set_axis_off()
-    for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
-        axes.imshow(picture, interpolation="nearest")
-        axes.set_title(title, fontsize=9)
-    return figure

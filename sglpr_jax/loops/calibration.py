@@ -10,11 +10,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateFinder, Seen
 from sglpr_jax.loops.config import CandidateConfig
@@ -59,7 +60,8 @@ def calibrated(
       on_progress: Called with the number of frames done.
 
     Raises:
-      ValueError: If the odometry has another length, or if the drive has no pairs of one kind.
+      ValueError: If the odometry has another length, if a scan is bad (`scan_stream`), or if the drive has no pairs of
+        one kind.
     """
     evidence, is_loop = certain_pairs(
         params, recording, odometry, pairs=pairs, seed=seed, config=config, on_progress=on_progress
@@ -111,10 +113,11 @@ class _Places:
         self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], config: CandidateConfig
     ):
         self.finder, self.recording, self.config = CandidateFinder(params, config=config), recording, config
-        seen = [self.finder.seen(recording.record(i, labels=False)) for i in range(len(recording))]
-        self.images = [one.image for one in seen]
-        for one in seen:
-            self.finder.index.add(one.descriptor)
+        self.images: list[UInt8[np.ndarray, "n n"]] = []
+        for _, seen in scan_stream(recording, lambda row, record: self.finder.seen(record)):
+            assert seen is not None  # the stream raises the error of a bad scan
+            self.images.append(seen.image)
+            self.finder.index.add(seen.descriptor)
         self.positions, self.way = odometry[:, :3, 3], travelled(odometry)
 
     def apart(self, frame: int) -> Float[np.ndarray, " n"]:

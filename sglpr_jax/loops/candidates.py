@@ -9,11 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num, UInt8
 
 from sglpr_jax.bev import centre_crop, even_cells
-from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import check_ready_made, image_view, picture, view
 from sglpr_jax.loops.background import Background
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
@@ -29,7 +27,6 @@ from sglpr_jax.loops.verification import Alignment, refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
-from sglpr_jax.retrieval.embed import OnBadScan
 from sglpr_jax.retrieval.index import Index
 
 
@@ -161,23 +158,6 @@ class CandidateFinder:
         else:
             bev = view(record, model.grid, image=model.image).image
         return Seen(np.asarray(describe(self.params, bev)), _kept(whole), record.mounting)
-
-    def seen_scan(self, recording: Recording, i: int, on_bad_scan: OnBadScan | None) -> Seen | None:
-        """Read and describe scan `i` of a recording.
-
-        If the scan cannot be read or is invalid (no finite points, not in metres), `on_bad_scan(id, error)` is called
-        and None is returned. Without `on_bad_scan` the error is raised.
-        """
-        try:
-            record = recording.record(i, labels=False)
-            if record.points is not None:
-                check_cloud(record.points, name=record.name)
-            return self.seen(record)
-        except (ValueError, OSError) as error:
-            if on_bad_scan is None:
-                raise
-            on_bad_scan(recording.ids[i], error)
-            return None
 
     def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
         """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""

@@ -8,6 +8,11 @@ from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBA
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
 
+def _check_probability(name: str, value: float) -> None:
+    if not 0 <= value <= 1:
+        raise ValueError(f"expected {name} from 0 to 1, found {value}")
+
+
 @dataclasses.dataclass(frozen=True)
 class DriftModel:
     """Standard deviations of odometry per metre of travelled distance."""
@@ -159,7 +164,8 @@ class SequenceConfig:
     independent_m: float = 15.0
     """Travelled distance after which two frames are nearly independent, in metres."""
     least_probability: float = 0.2
-    """Minimum probability of a neighbour. It counts with the excess of its log odds over those of this probability."""
+    """Minimum probability of a neighbouring pair alone, at most `min_probability` of the detector. The pair counts with
+    the excess of its log odds over those of this probability."""
     unknown_m: float = 1.0
     """Assumed distance between consecutive frames if the motion is unknown, in metres."""
     max_log_odds: float = 4.0
@@ -176,6 +182,10 @@ class SequenceConfig:
     guess_deg_per_m: float = 0.2
     """Additional tolerance for each metre of `Motion.guessed_m`, in metres and degrees."""
 
+    def __post_init__(self):
+        """Raises ValueError if the probability is outside [0, 1]."""
+        _check_probability("least_probability", self.least_probability)
+
 
 @dataclasses.dataclass(frozen=True)
 class DetectorConfig:
@@ -183,8 +193,6 @@ class DetectorConfig:
 
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a returned loop, given its neighbours."""
-    min_neighbour_probability: float = 0.2
-    """Minimum probability of a pair alone that takes part in the sequential test, at most `min_probability`."""
     near_m: float = 200.0
     """With odometry, a loop must be consistent with at least half of the loops within this travelled distance, in
     metres."""
@@ -200,7 +208,5 @@ class DetectorConfig:
     """Drift of the odometry. Loops that contradict it are rejected."""
 
     def __post_init__(self):
-        """Raises ValueError if a probability is outside [0, 1]."""
-        for name in ("min_probability", "min_neighbour_probability"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"expected {name} from 0 to 1, found {getattr(self, name)}")
+        """Raises ValueError if the probability is outside [0, 1]."""
+        _check_probability("min_probability", self.min_probability)

@@ -150,7 +150,7 @@ class LoopDetector:
 
     def _consider(self, one: Candidate) -> None:
         """Keep a candidate until its neighbours are known, unless it is improbable."""
-        log_odds, least = float(self.model.log_odds(one.evidence)), self.config.min_neighbour_probability
+        log_odds, least = float(self.model.log_odds(one.evidence)), self.config.sequence.least_probability
         loop = self._loop(one, float(expit(log_odds)))
         if log_odds >= logit(min(least, self.config.min_probability)):
             self._waiting.append(loop)

@@ -4,17 +4,17 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.candidates import Candidate, Compared, Seen
+from sglpr_jax.loops.add_scans import add_scans
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import check_is, given_poses
@@ -23,10 +23,8 @@ from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.reasons import counted, listed
 from sglpr_jax.loops.registration import check_installed
-from sglpr_jax.loops.unfinished import Unfinished, settings
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
-from sglpr_jax.retrieval.embed import OnBadScan
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,88 +122,99 @@ def find_loops(
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
     check_is(recording, Recording, by="open_recording")
+    odometry = _checked(recording, odometry, registered=registered)
+    detector = LoopDetector(params, model=model, config=config)
+    add_scans(
+        recording,
+        detector.finder,
+        functools.partial(_add, detector, recording, odometry),
+        candidates=detector.candidates,
+        kept_in=kept_in,
+        on_bad_scan=on_bad_scan,
+        should_stop=should_stop,
+        on_progress=on_progress,
+        odometry=odometry,
+    )
+    _check_scans(detector.finder, recording)
+    loops, rejected = _accepted(detector, recording, odometry, registered=registered, should_stop=should_stop)
+    missing = detector.finder.missing
+    return FoundLoops(
+        recording,
+        len(detector),
+        loops,
+        rejected,
+        odometry,
+        skipped=tuple(recording.ids[i] for i in missing),
+        candidates=tuple(detector.candidates),
+        model=detector.model,
+        unregistered=sum(loop.overlap is None for loop in loops) if registered else 0,
+        config=config,
+        empty=sum(detector.finder.empty) - len(missing),
+    )
+
+
+def _checked(
+    recording: Recording, odometry: ArrayLike | None, *, registered: bool
+) -> Float[np.ndarray, "n 4 4"] | None:
+    """Check recording and odometry before any work, and return the odometry as an array."""
     if recording.times is not None and (doubted := doubt(recording.times)):
         warn(f"{recording.name}: expected times in seconds, found {doubted}; 30 s decide which frames are recent")
-    odometry = None if odometry is None else given_poses(odometry, of="odometry")
-    if odometry is not None and len(odometry) != len(recording):
+    poses = None if odometry is None else given_poses(odometry, of="odometry")
+    if poses is not None and len(poses) != len(recording):
         raise ValueError(
-            f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(odometry)}"
+            f"expected odometry of {len(recording)} poses, one for each scan of {recording.name}, found {len(poses)}"
         )
     if registered and recording.has_images:
         raise ValueError(f"sequence {recording.name}: expected scans to register, found ready-made images")
     if registered:
         check_installed()
-    if odometry is not None:
-        check_level(odometry, recording.mounting, name=recording.name)
-    detector = LoopDetector(params, model=model, config=config)
-    given = functools.partial(_given, recording, odometry)
-    kept = None
-    if kept_in is not None:
-        kept = Unfinished.opened(Path(kept_in), settings(recording, detector.finder, odometry=odometry))
-        _recall(kept, detector, recording.mounting, given, missing=on_bad_scan is not None)
-        if len(detector):
-            on_progress(len(detector))
-    for i in range(len(detector), len(recording)):
-        if should_stop():
-            break
-        detector.add_seen(detector.finder.seen_scan(recording, i, on_bad_scan), **given(i))
-        if kept is not None:
-            kept.keep(detector.finder, detector.candidates)
-        on_progress(i + 1)
-    if kept is not None:
-        kept.keep(detector.finder, detector.candidates, all=True)
-    skipped = tuple(recording.ids[i] for i in detector.finder.missing)
-    if len(skipped) == len(recording):
-        raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
-    if all(detector.finder.empty) and len(detector) == len(recording):
+    if poses is not None:
+        check_level(poses, recording.mounting, name=recording.name)
+    return poses
+
+
+def _add(
+    detector: LoopDetector,
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    seen: Seen | None,
+    compared: Compared | None,
+) -> None:
+    """Add the next frame to the detector, with its time and odometry."""
+    i = len(detector)
+    time = None if recording.times is None else float(recording.times[i])
+    detector.add_seen(seen, time=time, odometry=None if odometry is None else odometry[i], compared=compared)
+
+
+def _check_scans(finder: CandidateFinder, recording: Recording) -> None:
+    """Raises ValueError if all scans of a recording are unreadable or almost empty."""
+    check_readable(recording, len(recording) - len(finder.missing))
+    if all(finder.empty) and len(finder.index) == len(recording):
         raise ValueError(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
+
+
+def _accepted(
+    detector: LoopDetector,
+    recording: Recording,
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    *,
+    registered: bool,
+    should_stop: Callable[[], bool],
+) -> tuple[tuple[Loop, ...], tuple[Rejected, ...]]:
+    """Joint acceptance of the loops of a detector. Returns accepted and rejected loops, and warns of wrong odometry."""
+    config = detector.config
     loops, rejected = settled(
         recording, detector.supported, odometry, config, registered=registered, should_stop=should_stop
     )
     supported = {loop.query for loop in detector.supported}  # `settled` accepted or rejected these
     rejected = _in_order([*rejected, *(one for one in detector.rejected if one.loop.query not in supported)])
     if odometry is not None:
-        check_odometry(
-            recording.name, detector.by_scans, loops, rejected, odometry, config, mounting=recording.mounting
-        )
-    return FoundLoops(
-        recording,
-        len(detector),
-        tuple(loops),
-        rejected,
-        odometry,
-        skipped=skipped,
-        candidates=tuple(detector.candidates),
-        model=detector.model,
-        unregistered=sum(loop.overlap is None for loop in loops) if registered else 0,
-        config=config,
-        empty=sum(detector.finder.empty) - len(skipped),
-    )
+        name, mounting = recording.name, recording.mounting
+        check_odometry(name, detector.by_scans, loops, rejected, odometry, config, mounting=mounting)
+    return tuple(loops), rejected
 
 
 def _in_order(rejected: Iterable[Rejected]) -> tuple[Rejected, ...]:
     return tuple(sorted(rejected, key=lambda one: (one.loop.query, one.loop.match)))
-
-
-def _recall(
-    kept: Unfinished,
-    detector: LoopDetector,
-    mounting: Mounting | None,
-    given: Callable[[int], dict[str, Any]],
-    *,
-    missing: bool,
-) -> None:
-    """Add the frames of a checkpoint directory to a detector. `given` returns time and odometry of a frame."""
-
-    def add(seen: Seen | None, compared: Compared) -> None:
-        detector.add_seen(seen, **given(len(detector)), compared=compared)
-
-    kept.recall(detector.finder, mounting, add, missing=missing)
-
-
-def _given(recording: Recording, odometry: Float[np.ndarray, "n 4 4"] | None, i: int) -> dict[str, Any]:
-    """Time and odometry of a frame."""
-    time = None if recording.times is None else float(recording.times[i])
-    return {"time": time, "odometry": None if odometry is None else odometry[i]}

@@ -17,6 +17,11 @@ from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import yaw_of
 
+MAP_RIVALS = 10
+"""Maximum number of rivals of a match in a map."""
+RIVAL_SPACING_M = 8.0
+"""Minimum distance between rivals in a map, and from rivals to the match, in metres."""
+
 
 def rivals(
     descriptor: Float[np.ndarray, " d"],
@@ -53,6 +58,28 @@ def rivals(
             if len(pool):
                 chosen.append(pool[np.linalg.norm(descriptors[pool] - descriptor, axis=1).argmin()])
     return np.unique(np.array(chosen, np.int64))
+
+
+def rival_places(
+    apart: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"], match: int
+) -> Int[np.ndarray, " k"]:
+    """Choose the rivals of a match in a map: the places with the nearest descriptors, at least `RIVAL_SPACING_M` apart.
+
+    Arguments:
+      apart: Distance of the query's descriptor to that of each place.
+      positions: Position of each place, in metres.
+      match: Row of the match.
+
+    Returns:
+      Rows, the nearest descriptor first.
+    """
+    left, chosen = apart.copy(), [match]
+    for _ in range(MAP_RIVALS):
+        left[np.linalg.norm(positions - positions[chosen[-1]], axis=1) < RIVAL_SPACING_M] = np.inf
+        if not np.isfinite(left).any():
+            break
+        chosen.append(int(left.argmin()))
+    return np.array(chosen[1:], np.int64)
 
 
 def rival_share(

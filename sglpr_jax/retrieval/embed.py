@@ -1,21 +1,16 @@
 """Computes the descriptor file of a recording, with a model or with any function of images or points."""
 
-import functools
-import os
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32, Num
 
-from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
@@ -26,8 +21,6 @@ from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
 
-OnBadScan = Callable[[str, Exception], None]
-T = TypeVar("T")
 SCANS_AHEAD = 8
 """Number of scans that are read ahead."""
 
@@ -85,25 +78,24 @@ def embed_images(
     rows, views = [], []
     descriptors = _Descriptors()
 
-    def read(row: int) -> tuple[int, Record]:
-        return row, recording.record(row, labels=bool(method.categories))
-
     def see(row: int, record: Record) -> View:
         angle = None if angles is None else jnp.float32(angles[row])
         found = view(record, method.grid, image=method.image, categories=method.categories, angle=angle)
         _check_view(np.asarray(found.image), method.field, name=record.name)
         return found
 
-    for row, seen in _readable(recording, read, see, on_bad_scan):
+    labels = bool(method.categories)
+    options = {"labels": labels, "ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
+    for row, seen in scan_stream(recording, see, **options):
+        if seen is None:
+            continue
         rows.append(row)
         views.append(seen)
         if len(views) == batch:
             descriptors.add(_describe_padded(method.describe, views, batch))
             views = []
-            on_progress(row + 1)
     if views:
         descriptors.add(_describe_padded(method.describe, views, batch))
-    on_progress(len(recording))
     return _file(method, recording, rows, descriptors.all(), rotation_seed=rotation_seed)
 
 
@@ -140,15 +132,15 @@ def embed_scans(
     angles = _angles(len(recording), rotation_seed)
     rows, descriptors = [], []
 
-    def read(row: int) -> tuple[Record]:
-        return (recording.record(row, labels=method.labels),)
+    def see(row: int, record: Record) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
+        points, classes = _finite_points(record, labels=method.labels)
+        return points if angles is None else rotated(points, angles[row]), classes
 
-    finite = functools.partial(_finite_points, labels=method.labels)
-    for row, (points, classes) in _readable(recording, read, finite, on_bad_scan):
-        rows.append(row)
-        seen = points if angles is None else rotated(points, angles[row])
-        descriptors.append(method.describe(seen, classes)[None])
-        on_progress(row + 1)
+    options = {"labels": method.labels, "ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
+    for row, seen in scan_stream(recording, see, **options):
+        if seen is not None:
+            rows.append(row)
+            descriptors.append(method.describe(*seen)[None])
     return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
 
 
@@ -201,42 +193,6 @@ def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
     return None if seed is None else np.random.default_rng(seed).uniform(0, 2 * np.pi, n)
 
 
-def _readable(
-    recording: Recording,
-    read: Callable[[int], tuple],
-    then: Callable[..., T],
-    on_bad_scan: OnBadScan | None,
-) -> Iterator[tuple[int, T]]:
-    """Yields the row of every readable scan, and the result of `then` for the output of `read`, in order.
-
-    `read` runs in this thread, because not every file can be read in parallel. `then` is a pure function and runs in
-    other threads, a few scans ahead.
-    """
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        ahead: deque[tuple[int, Future[T]]] = deque()
-        for row in range(len(recording) + SCANS_AHEAD):
-            if row < len(recording):
-                ahead.append((row, _begun(threads, read, then, row)))
-            if row >= SCANS_AHEAD and ahead:
-                done, seen = ahead.popleft()
-                try:
-                    yield done, seen.result()
-                except (ValueError, OSError) as error:
-                    if on_bad_scan is None:
-                        raise
-                    on_bad_scan(recording.ids[done], error)
-
-
-def _begun(threads: ThreadPoolExecutor, read: Callable[[int], tuple], then: Callable[..., T], row: int) -> Future[T]:
-    """Starts `then` for a row. If the row cannot be read, the future raises the error."""
-    try:
-        return threads.submit(then, *read(row))
-    except (ValueError, OSError) as error:
-        failed: Future[T] = Future()
-        failed.set_exception(error)
-        return failed
-
-
 def _file(
     method: Method, recording: Recording, rows: list[int], descriptors: list[np.ndarray], *, rotation_seed: int | None
 ) -> DescriptorFile:
@@ -244,8 +200,7 @@ def _file(
 
     `descriptors` may contain additional rows at the end, the padding of the last batch.
     """
-    if not rows:
-        raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+    check_readable(recording, len(rows))
     sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
     skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
     config = {"data": recording.name, **sensor, **method.about, "rotation_seed": rotation_seed}
@@ -265,10 +220,8 @@ def _file(
 def _finite_points(
     record: Record, *, labels: bool
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """Returns the finite points of one scan and, with `labels`, their classes. Raises ValueError if it shows no
-    place."""
+    """Returns the finite points of one scan and, with `labels`, their classes."""
     assert record.points is not None
-    check_cloud(record.points, name=record.name)
     finite = np.isfinite(record.points).all(axis=1)
     return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
 

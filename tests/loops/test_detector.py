@@ -8,7 +8,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen, square_image
-from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, SequenceConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import MIN_OVERLAP
@@ -155,11 +155,13 @@ def test_pairs_that_other_places_fit_as_well_are_rejected_with_that_reason(param
         assert [one.reason for one in detector.rejected] == reasons
 
 
-@pytest.mark.parametrize("name", ["min_probability", "min_neighbour_probability"])
+@pytest.mark.parametrize(
+    ("config", "name"), [(DetectorConfig, "min_probability"), (SequenceConfig, "least_probability")]
+)
 @pytest.mark.parametrize("value", [-0.1, 1.01, np.nan])
-def test_what_is_no_probability_is_refused(name, value):
+def test_what_is_no_probability_is_refused(config, name, value):
     with pytest.raises(ValueError, match=f"expected {name} from 0 to 1, found {value}"):
-        DetectorConfig(**{name: value})
+        config(**{name: value})
 
 
 def test_scans_without_points_or_with_one_close_no_loops(params):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation import figures, loop_figures
 from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing, paragraph
 from sglpr_jax.files import write_text
 from sglpr_jax.loops.candidates import square_image
@@ -62,11 +62,11 @@ def _where(found: FoundLoops) -> str:
         what = "from the odometry" if found.odometry is not None else f"from {found.recording.pose_source}"
         lines = "Long lines are drift, or wrong loops."
         caption = f"The trajectory {what}. A line connects the two frames of each loop. {_judged(found) or lines}"
-        drawn = figures.loops(positions[: found.frames], right, wrong=wrong)
+        drawn = loop_figures.loops(positions[: found.frames], right, wrong=wrong)
         parts.append(figure_html(drawn, "The loops on the trajectory", caption=caption))
     shown = [(one.query, one.match, one.probability) for one in found.loops]
     rejected = _frames(one.loop for one in found.rejected)
-    order = figures.loops_in_time(shown, found.frames, wrong=wrong, rejected=rejected)
+    order = loop_figures.loops_in_time(shown, found.frames, wrong=wrong, rejected=rejected)
     caption = "The match of each query. Rejected pairs are grey." if rejected else "The match of each query."
     parts.append(figure_html(order, "The loops in time", caption=caption))
     return "\n".join(parts)
@@ -108,7 +108,7 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
     if not figures.can_draw():
         return missing(about)
     level = {name: upright_odometry(poses, found.recording.mounting)[:, :3, 3] for name, poses in both.items()}
-    return figure_html(figures.trajectories(level), "The trajectory before and after", caption=about)
+    return figure_html(loop_figures.trajectories(level), "The trajectory before and after", caption=about)
 
 
 def _sure(found: FoundLoops) -> str:
@@ -128,7 +128,7 @@ def _sure(found: FoundLoops) -> str:
     table = html_table(header, rows, numbers=header[1:])
     if not figures.can_draw():
         return table
-    drawn = figures.reliability([(one.said, one.share, one.pairs) for one in bins])
+    drawn = loop_figures.reliability([(one.said, one.share, one.pairs) for one in bins])
     return figure_html(drawn, "Share of loops over probability", caption=caption) + table
 
 
@@ -140,7 +140,7 @@ def _pairs(found: FoundLoops) -> str:
     rows = np.unique(np.linspace(0, len(found.loops) - 1, SHOWN_PAIRS).astype(int))
     pictures = {_title(found, found.loops[row]): _overlay(found, found.loops[row]) for row in rows}
     caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
-    return figure_html(figures.overlays(pictures), "Pairs of images", caption=caption)
+    return figure_html(loop_figures.overlays(pictures), "Pairs of images", caption=caption)
 
 
 def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:

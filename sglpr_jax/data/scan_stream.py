@@ -1,0 +1,96 @@
+"""Reads the scans of a recording in order and decides what happens to bad ones, for every program that describes
+scans."""
+
+import functools
+import itertools
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NoReturn, TypeVar
+
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+
+OnBadScan = Callable[[str, Exception], None]
+"""Receives the id and the error of a bad scan."""
+T = TypeVar("T")
+Look = Callable[[int, Record], T]
+"""Computes a result from the row and the record of a scan."""
+
+
+def scan_stream(
+    recording: Recording,
+    look: Look[T],
+    *,
+    rows: Iterable[int] | None = None,
+    labels: bool = False,
+    ahead: int = 0,
+    on_bad_scan: OnBadScan | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Iterator[tuple[int, T | None]]:
+    """Yield the row of every scan or image, in order, and the result of `look`, or None for a bad scan.
+
+    A scan is bad if it cannot be read, if it shows no place (`check_cloud`), or if `look` raises ValueError or OSError.
+
+    Arguments:
+      recording: Scans or images to read.
+      look: Function of the row and the record. With `ahead` it must be pure, because it runs in other threads.
+      rows: Rows to read, by default all. Without `ahead`, a row is taken after the previous scan was processed.
+      labels: Whether to read the labels, too.
+      ahead: Number of scans that are read ahead.
+      on_bad_scan: Called with the id and the error of each bad scan. By default, the error is raised.
+      should_stop: Asked before a scan is read. If it returns True, no further scan is read.
+      on_progress: Called with the number of rows up to a scan, after the caller has processed the scan.
+    """
+    wanted = range(len(recording)) if rows is None else rows
+    read = itertools.takewhile(lambda row: not should_stop(), wanted)
+    for row, result in _results(recording, look, read, labels=labels, ahead=ahead):
+        seen = None
+        try:
+            seen = result()
+        except (ValueError, OSError) as error:
+            if on_bad_scan is None:
+                raise
+            on_bad_scan(recording.ids[row], error)
+        yield row, seen
+        on_progress(row + 1)
+
+
+def check_readable(recording: Recording, readable: int) -> None:
+    """Raises ValueError if the number of readable scans of a recording is 0."""
+    if not readable:
+        raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
+
+
+def _results(
+    recording: Recording, look: Look[T], rows: Iterable[int], *, labels: bool, ahead: int
+) -> Iterator[tuple[int, Callable[[], T]]]:
+    """Yields each row and a function that returns the result for it or raises its error.
+
+    This thread reads the files, because not every file can be read in parallel. Other threads call `look`.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        waiting: deque[tuple[int, Callable[[], T]]] = deque()
+        for row in rows:
+            try:
+                record = recording.record(row, labels=labels)
+                compute = functools.partial(_checked, look, row, record)
+                waiting.append((row, threads.submit(compute).result if ahead else compute))
+            except (ValueError, OSError) as error:
+                waiting.append((row, functools.partial(_fail, error)))
+            if len(waiting) > ahead:
+                yield waiting.popleft()
+        yield from waiting
+
+
+def _checked(look: Look[T], row: int, record: Record) -> T:
+    if record.points is not None:
+        check_cloud(record.points, name=record.name)
+    return look(row, record)
+
+
+def _fail(error: Exception) -> NoReturn:
+    raise error

@@ -1,0 +1,118 @@
+"""Figures of a loop search (extra `viz`): its loops, trajectories and probabilities."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.evaluation.figures import figure_from_above, new_figure
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+LOOP_COLOUR, WRONG_COLOUR = "#2b5fc4", "#d62728"
+
+
+def loops(
+    positions: Float[np.ndarray, "n 3"], pairs: Sequence[tuple[int, int]], *, wrong: Sequence[tuple[int, int]] = ()
+) -> "matplotlib.figure.Figure":
+    """Draw a trajectory from above, with a line between the two frames of each loop.
+
+    Arguments:
+      positions: Position of each frame, in metres.
+      pairs: Query and match of each loop, except those known to be wrong.
+      wrong: Query and match of each loop known to be wrong, drawn in red.
+    """
+    figure = figure_from_above(positions)
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    axes.plot(*positions[:, :2].T, color="0.6", linewidth=1)
+    for name, some, colour, layer in (("loops", pairs, LOOP_COLOUR, 3), ("wrong", wrong, WRONG_COLOUR, 4)):
+        if name == "wrong" and not some:
+            continue
+        for query, match in some:
+            axes.plot(*positions[[query, match], :2].T, color=colour, linewidth=1, zorder=layer)
+        seen = positions[[query for query, _ in some], :2]
+        axes.scatter(*seen.T, s=9, color=colour, linewidths=0, label=f"{name} ({len(some)})", zorder=layer)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    axes.legend(loc="best", framealpha=0.95)
+    return figure
+
+
+def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
+    """Draw named trajectories from above. The first is grey; a dot marks the end of each."""
+    figure = figure_from_above(np.concatenate(list(named.values())))
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    for (name, positions), colour in zip(named.items(), ("0.6", "#2b5fc4", "#d62728"), strict=False):
+        axes.plot(*positions[:, :2].T, color=colour, linewidth=1.2, label=name)
+        axes.plot(*positions[-1, :2], "o", color=colour, markersize=4)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    axes.legend(loc="best", framealpha=0.95)
+    return figure
+
+
+def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
+    """Draw the share of loops over the predicted probability.
+
+    Arguments:
+      bins: Mean predicted probability, share of loops and number of pairs of each bin. The number labels its point.
+    """
+    figure = new_figure(5.0, 4.6)
+    axes = figure.add_subplot(xlabel="predicted probability", ylabel="share of loops", xlim=(-0.03, 1.09))
+    axes.plot([0, 1], [0, 1], color="0.8", linewidth=1)
+    said, share, _ = np.array(bins).T
+    axes.plot(said, share, "o-", color="#2b5fc4", markersize=5, linewidth=1.4)
+    for x, y, pairs in bins:
+        axes.annotate(f"{pairs}", (x, y), xytext=(5, -10), textcoords="offset points", fontsize=8, color="0.35")
+    axes.set_ylim(-0.08, 1.05)
+    axes.grid(color="0.92")
+    return figure
+
+
+def loops_in_time(
+    found: Sequence[tuple[int, int, float]],
+    frames: int,
+    *,
+    wrong: Sequence[tuple[int, int]] = (),
+    rejected: Sequence[tuple[int, int]] = (),
+) -> "matplotlib.figure.Figure":
+    """Plot the frame number of each match over that of its query.
+
+    Arguments:
+      found: Query, match and probability of each loop. Less probable loops are lighter.
+      frames: Number of frames.
+      wrong: Query and match of each loop known to be wrong, drawn as red crosses.
+      rejected: Query and match of each rejected pair, drawn as small grey dots behind the loops.
+    """
+    figure = new_figure(5.0, 4.2)
+    axes = figure.add_subplot(xlabel="query (frame)", ylabel="match (frame)", xlim=(0, frames), ylim=(0, frames))
+    axes.plot([0, frames], [0, frames], color="0.8", linewidth=1)
+    if rejected:
+        axes.scatter(*np.array(rejected).T, s=5, color="0.7", linewidths=0, label=f"rejected ({len(rejected)})")
+    if found:
+        query, match, probability = np.array(found).T
+        dots = axes.scatter(query, match, s=8, c=probability, cmap="viridis", vmin=0.9, vmax=1, linewidths=0)
+        figure.colorbar(dots, label="probability")
+    if wrong:
+        axes.scatter(*np.array(wrong).T, s=24, marker="x", color=WRONG_COLOUR, label=f"wrong ({len(wrong)})")
+    if wrong or rejected:
+        axes.legend(loc="upper left", framealpha=0.95)
+    axes.grid(color="0.92")
+    return figure
+
+
+def overlays(pictures: Mapping[str, Float[np.ndarray, "h w 3"]]) -> "matplotlib.figure.Figure":
+    """Draw coloured images with their titles, three in a row."""
+    rows = -(-len(pictures) // 3)
+    figure = new_figure(9.0, 3.2 * rows)
+    panels = figure.subplots(rows, 3, squeeze=False).ravel()
+    for axes in panels:
+        axes.set_axis_off()
+    for axes, (title, picture) in zip(panels, pictures.items(), strict=False):
+        axes.imshow(picture, interpolation="nearest")
+        axes.set_title(title, fontsize=9)
+    return figure
