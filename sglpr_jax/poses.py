@@ -18,7 +18,7 @@ def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Floa
 
 
 def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b"]:
-    """Whether each matrix R is a rotation: all entries of R R^T - I are below .01, and R is not a reflection."""
+    """Whether each matrix R is a rotation: all entries of R R^T - I are below 0.01, and R is not a reflection."""
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.abs(matrices @ matrices.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
         return np.asarray((apart < ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))

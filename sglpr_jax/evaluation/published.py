@@ -9,7 +9,7 @@ our reading (docs/concepts/protocols.md):
 - OWN_RUN, "run by SG-LPR's authors": not stated; most likely `top1-f1max`.
 - BEVPLACE_2, "BEVPlace++'s paper": `bevplace-nclt-recall`, Recall@1 across sessions of NCLT with 5 m.
 
-In tables 1 and 2 the printed mean of SC_LPR is .850, but the mean of its row is .853. All other means agree within
+In tables 1 and 2 the printed mean of SC_LPR is 0.850, but the mean of its row is 0.853. All other means agree within
 rounding.
 
 Our numbers are comparable with these only under the same protocol, on the same poses and on the real dataset.

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 NEIGHBOURS = 20
 """Number of neighbours from which the normal of a point is estimated. With 10, normals on the rings of 16 beams are
-arbitrary, and GICP aligns the rings of the two scans. Roll and pitch were .3 degrees off."""
+arbitrary, and GICP aligns the rings of the two scans. Roll and pitch were 0.3 degrees off."""
 POINTS = 4000
 """Target number of points of the query for the covariance. Clouds with fewer points are not thinned."""
 BLOCK_M = 8.0
