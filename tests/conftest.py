@@ -40,7 +40,7 @@ the numbers themselves compile programs as users do."""
 AS_INSTALLED = ("benchmark_programs/", "cli/", "docs/")
 """Tests that run whole programs as users do, without the type checks that the tests of the library have."""
 MOST_GROWTH = 1.5e9
-"""Bytes by which a process may grow before JAX's compiled programs are freed."""
+"""Bytes by which a process may grow before JAX's compiled programs are freed (again)."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before fixtures of any scope compile
