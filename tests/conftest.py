@@ -18,34 +18,40 @@ from sglpr_jax.models.sglpr import init
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax-tests"
-"""Two thirds of the suite's time is XLA's: what it has compiled is kept, for all workers and for the next time."""
-KEPT_FROM_S = 0.2
+"""Compiled programs, kept for all workers and for the next run. Small ones too: tests call thousands of them."""
+KEPT = {"JAX_COMPILATION_CACHE_DIR": str(COMPILED), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 jax.config.update("jax_compilation_cache_dir", str(COMPILED))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", KEPT_FROM_S)
-os.environ |= {  # for the processes that tests start
-    "JAX_COMPILATION_CACHE_DIR": str(COMPILED),
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(KEPT_FROM_S),
-}
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+os.environ |= KEPT  # for the processes that tests start
 
 TESTS = Path(__file__).resolve().parent
 QUICKLY = (
     "benchmark_programs/test_gpu.py",
+    "benchmark_programs/test_load.py",
+    "benchmark_programs/test_scores.py",
     "benchmark_programs/test_speed.py",
     "cli/",
     "docs/",
     "training/",
     "test_wheel.py",
 )
-"""What is tested there is what is done with numbers: XLA need not optimize, which halves the time that it takes. The
-numbers themselves are tested elsewhere, of programs compiled as users' are."""
+"""Tests of what happens with numbers. XLA compiles their programs without optimizing, in half the time. The tests of
+the numbers themselves compile programs as users do."""
+AS_INSTALLED = ("benchmark_programs/", "cli/", "docs/")
+"""Tests that run whole programs as users do, without the type checks that the tests of the library have."""
+MOST_GROWTH = 1.5e9
+"""Bytes by which a process may grow before JAX's compiled programs are freed (again)."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before fixtures of any scope compile
 def pytest_runtest_setup(item):
     where = item.path.relative_to(TESTS).as_posix()
     quickly = where.startswith(QUICKLY) and "loops" not in where  # their programs run for longer than they compile
-    jax.config.update("jax_disable_most_optimizations", quickly)
-    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quickly))
+    if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") != str(int(quickly)):
+        jax.clear_caches()  # of programs compiled the other way
+        jax.config.update("jax_disable_most_optimizations", quickly)
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quickly))
+    jaxtyping.config.update("jaxtyping_disable", where.startswith(AS_INSTALLED))
 
 
 SHARED = TESTS.parents[1] / "shared"
@@ -59,11 +65,24 @@ def shared() -> Path:
     return SHARED
 
 
+_freed_at = [0.0]
+
+
+def _resident_bytes() -> float:
+    """Return the memory of this process; infinite if the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except FileNotFoundError:
+        return float("inf")
+
+
 @pytest.fixture(scope="module", autouse=True)
-def _free_compiled_programs():
-    """No test file needs the programs that another one compiled: kept, they grow to gigabytes."""
+def _bounded_memory():
+    """Free compiled programs once they have grown to gigabytes; until then the next test files use them again."""
     yield
-    jax.clear_caches()
+    if _resident_bytes() > _freed_at[0] + MOST_GROWTH:
+        jax.clear_caches()
+        _freed_at[0] = min(_resident_bytes(), MOST_GROWTH)
 
 
 @pytest.fixture
@@ -85,7 +104,7 @@ def small_files():
 
 @pytest.fixture
 def as_installed():
-    """Without the checks of types, which tests alone have: a wrong word comes as far as a user's does."""
+    """No type checks, which only tests have: a wrong word gets as far as a user's does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,9 +1,16 @@
-"""The benchmarks run for real, as a user runs them."""
+"""Benchmarks run as a user runs them: in this process, which has imported and compiled what they share."""
 
+import concurrent.futures
+import contextlib
+import io
 import os
-import subprocess
+import runpy
 import sys
+import warnings
 from pathlib import Path
+from unittest import mock
+
+import pytest
 
 from sglpr_jax.sim import Sensor
 
@@ -13,13 +20,32 @@ TINY = ROOT / "tests" / "tiny.py"
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -8.0, -16.0), azimuth_steps=90)
 
 
+class _ThreadPool(concurrent.futures.ThreadPoolExecutor):
+    """Stands in for a pool of processes: a process that starts spends seconds on imports."""
+
+    def __init__(self, workers: int, *, mp_context: object):
+        super().__init__(workers)
+
+
 def printed(benchmark: str, *options: object) -> str:
-    """What a benchmark, `FOLDER.NAME`, prints."""
-    command = (sys.executable, "-m", f"benchmarks.{benchmark}", *map(str, options))
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    """Run `python -m benchmarks.FOLDER.NAME` and return what it prints."""
+    module, out, errors = f"benchmarks.{benchmark}", io.StringIO(), io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        mock.patch.dict(os.environ),  # benchmarks set variables for processes to come
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(errors),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("default")  # only tests make errors of them
+        patch.setattr(sys, "argv", [benchmark, *map(str, options)])
+        patch.setattr(concurrent.futures, "ProcessPoolExecutor", _ThreadPool)
+        patch.delitem(sys.modules, module, raising=False)  # runpy warns of a module that is there
+        try:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            assert end.code in (None, 0), errors.getvalue() or end.code
+    return out.getvalue()
 
 
 def table(output: str) -> list[list[str]]:

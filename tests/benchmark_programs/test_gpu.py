@@ -35,7 +35,9 @@ for line in sys.argv[1:]:
 import sglpr_jax
 print(sglpr_jax.__file__)
 """
-SIMULATE = "simulate --out towns --seq 00 08 --scans 20 --azimuth-steps 90 --batch 2 --points 500 --repeats 1"
+SIMULATE = (
+    "simulate --out towns --seq 00 08 --scans 20 --sensor vlp16 --azimuth-steps 90 --batch 2 --points 500 --repeats 1"
+)
 TRAIN = "train --data towns --preset tiny.py --out runs/tiny --packs packs"
 MEASURE = "measure --preset tiny.py --compute bfloat16 --batch 1 --repeats 2 --calls 1 --size 64 --products 1"
 

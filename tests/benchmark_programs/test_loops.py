@@ -18,7 +18,7 @@ from sglpr_jax.sim.repeating import simulate_repeating
 from .programs import SENSOR, printed
 
 pytestmark = pytest.mark.slow
-SMALL = ("--scans", "100", "--azimuth-steps", "200", "--towns", "08:3")
+SMALL = ("--scans", "100", "--azimuth-steps", "120", "--towns", "08:3")
 
 
 def test_loops_are_scored_on_simulated_drives():
@@ -34,7 +34,7 @@ def test_loops_are_scored_on_images(tmp_path):
 
 
 def test_the_parts_of_a_loop_are_timed():
-    output = printed("quality.loops", "speed", "--frames", "300", "--repeats", "2", "--azimuth-steps", "90")
+    output = printed("quality.loops", "speed", "--frames", "100", "--repeats", "1", "--azimuth-steps", "60")
     assert [line.split(":")[0] for line in output.splitlines()][-7:] == [
         "image and descriptor",
         "query",

@@ -146,6 +146,7 @@ def test_a_list_without_an_ending_gets_a_folder_of_another_name(command, laps, t
     assert (tmp_path / "pairs-results" / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_data_and_weights_add_pictures(command, trained, town, tmp_path):
     np.save(tmp_path / "blind.npy", np.ones((40, 2)))  # every query is answered, mostly with another place
     options = ("--data", town, "--seq", "08", "--protocol", "top1-f1max")

@@ -33,6 +33,7 @@ def stress(command, tmp_path):
     return call
 
 
+@pytest.mark.slow
 def test_everything_on_the_network_and_a_baseline(stress, rings, trained):
     options = ("--data", rings, "--weights", trained.folder, "--method", "polar-fft", "solid")
     ended, out = stress(*options, "--protocol", "pairs-all-f1max", "ssc-recall")

@@ -85,6 +85,7 @@ def test_recordings_that_cannot_be_trained_on_are_refused_before_the_run(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_semantic_map_learnt_alone_leaves_descriptors_to_the_bit(labelled_images, random_params, preset, tmp_path):
     config = load_preset(str(preset))
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, segmentation_alone=True))

@@ -116,6 +116,7 @@ def test_loops_in_a_row_are_one_part_of_the_drive():
     assert stretches(same_match, poses) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "right"), [(4, 48), (10, 0)])
 def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_taken(wrong, right):
     """Loops 8 m off agree with the odometry of a long path and with each other, but not beside the true loops."""

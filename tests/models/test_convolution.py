@@ -71,6 +71,7 @@ def test_the_gradient_is_xlas(size, strides, circular, shape):
         np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channels", [3, 6])
 @pytest.mark.parametrize("size, strides, circular", CASES[:5])
 def test_derivatives_are_those_of_finite_differences(size, strides, circular, channels):

@@ -71,6 +71,7 @@ def test_quarter_turns_leave_the_descriptor(params):
         np.testing.assert_allclose(describe(params, jnp.rot90(BEV, quarters, axes=(1, 2))), straight, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_descriptors_and_logits_under_jit_vmap_and_grad(params):
     whole, logits = describe(params, BEV), segment(params, BEV)
     assert whole.shape == (3, 256) and logits.shape == (3, 32, 32, 20)

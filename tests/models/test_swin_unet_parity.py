@@ -16,8 +16,8 @@ from sglpr_jax.models.torch_import import from_torch_names, torch_name
 FILES = (
     "swinunet_w4_img64_odd_depths",
     "swinunet_full_formula",
-    "swinunet_w4_img128_c12_b2",
-    "swinunet_w7_img224_c12_in1_b1",
+    pytest.param("swinunet_w4_img128_c12_b2", marks=pytest.mark.slow),
+    pytest.param("swinunet_w7_img224_c12_in1_b1", marks=pytest.mark.slow),
 )
 
 

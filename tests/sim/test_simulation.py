@@ -11,6 +11,7 @@ from sglpr_jax.sim.simulation import default_dataset, default_sessions
 THIN = {"scans": 3, "azimuth_steps": 40, "sensor": "vlp16"}
 
 
+@pytest.mark.slow
 def test_towns_are_written_with_what_they_are_told_beforehand(tmp_path):
     told, done = [], []
     found = simulate(tmp_path / "town", routes=["08"], **THIN, on_start=lambda dataset: told.append(dataset.missing))

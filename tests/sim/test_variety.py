@@ -77,6 +77,7 @@ def test_a_scan_is_levelled_before_it_is_turned():
         np.testing.assert_allclose(turned[:, 2], points[labels, 2] - 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_images_are_those_of_varied_scans(tmp_path):
     options = {"routes": ["08"], "scans": 4, "azimuth_steps": 60, "seed": 1, "images": True}
     root = simulate(tmp_path / "varied", vary=True, **options).root

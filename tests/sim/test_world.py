@@ -129,6 +129,7 @@ def test_the_vehicle_drives_on_road(corners, seed):
     assert np.isin(label, (ROAD, LANE_MARKING)).all() and not is_raised(label).any()
 
 
+@pytest.mark.slow
 def test_the_outskirts_have_walls_to_their_length_and_hills_beside_the_road():
     """Some wall is longer there than any in town, and ground rises out of the plots, off the road."""
     longest, hills = {}, {}

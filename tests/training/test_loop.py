@@ -71,6 +71,7 @@ def fake_step(monkeypatch, from_params):
     return install
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_is_uninterrupted(config, make_batch, fast_step, tmp_path):
     folders = tmp_path / "whole", tmp_path / "resumed"
     whole = run_steps(config, Made(make_batch), folders[0], score=size_of_weights)
@@ -101,6 +102,7 @@ def test_a_run_resumed_past_a_damaged_checkpoint_is_uninterrupted(config, make_b
     assert logged(folders[1]) == logged(folders[0])
 
 
+@pytest.mark.slow
 def test_a_stop_between_two_lines_of_the_log_leaves_no_trace_in_it(config, make_batch, fake_step, tmp_path):
     fake_step()
     config = dataclasses.replace(config, steps=12, log_every=5, score_every=8)

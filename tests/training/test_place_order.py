@@ -56,6 +56,7 @@ def test_labelled_places_come_where_the_segmentation_head_looks_and_go_back(mixe
     np.testing.assert_array_equal(in_network_order(places, alone, every=every), places)
 
 
+@pytest.mark.slow
 def test_the_segmentation_learns_from_labelled_places_alone_and_the_triplet_loss_from_its_own(mixed, config, params):
     assert mixed.labelled.sum() == 3
     gradient, metrics = gradients_of(params, mixed, config)
@@ -86,6 +87,7 @@ def test_both_losses_reach_the_shared_features(mixed, config, params):
         assert np.abs(gradient["backbone"]["patch_embed"]["projection"]["kernel"]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_the_order_changes_nothing_but_who_is_segmented(mixed, config, params):
     every = dataclasses.replace(config, loss=dataclasses.replace(config.loss, segment_every=2))
     expected, found = gradients_of(params, mixed, config), gradients_of(params, mixed, every)
@@ -93,6 +95,7 @@ def test_the_order_changes_nothing_but_who_is_segmented(mixed, config, params):
     assert_same(gradients_of(params, mixed, dataclasses.replace(every, chunk=4)), expected)
 
 
+@pytest.mark.slow
 def test_images_with_scans_that_count_as_tuples_too(make_batch, config, params):
     images = half(make_batch(0, images=True), slice(0, 4), slice(0, 1))
     scans = half(make_batch(1), slice(4, 8), slice(1, 2))

@@ -81,6 +81,7 @@ def mapped(make_batch, config):
     return batch.replace(maps=maps, labelled=np.arange(config.images) % 3 != 0)
 
 
+@pytest.mark.slow
 def test_images_with_label_maps_teach_semantics_in_chunks_too(config, params, make_batch, mapped):
     gradient, metrics = gradients_of(params, mapped, config)
     assert metrics["cross_entropy"] > 0 and metrics["dice"] > 0
@@ -243,6 +244,7 @@ def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, ran
         gradients_of(params, batch.replace(classes=None), config)
 
 
+@pytest.mark.slow
 def test_both_passes_over_a_chunk_drop_the_same_branches(config, random_params, make_batch):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
     backbone = dataclasses.replace(config.model.backbone, depths=(2,), drop_path=0.5)
@@ -277,6 +279,7 @@ def test_the_share_of_violations_is_that_of_the_margin_for_the_smooth_loss_too(m
         assert triplet(apart, batch, config) > 0
 
 
+@pytest.mark.slow
 def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     chex.clear_trace_counter()
     traced = chex.assert_max_traces(train_step.__wrapped__, n=1)
@@ -303,6 +306,7 @@ def test_steps_lower_the_loss_and_compile_once(config, params, make_batch):
     assert run(steps=1, start=1)[1][0]["loss"] != losses[0]  # each step has its own rotations
 
 
+@pytest.mark.slow
 def test_the_step_of_the_preset_that_the_pages_train_is_whole():
     """Only traced, for it would be compiled for a minute."""
     config = dataclasses.replace(load_preset("sglpr"), tuples=4)
