@@ -246,8 +246,9 @@ def stop_on_signal() -> Iterator[StopRequest]:
 
 @contextlib.contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar on stderr. The context returns a function that sets the finished count. Without a terminal nothing is
-    shown."""
+    """Context manager that shows a progress bar on stderr, or nothing without a terminal.
+
+    It yields a function; call it with the number of items finished so far."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:

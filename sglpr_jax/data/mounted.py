@@ -37,7 +37,7 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
         return recording
     if height in ("auto", "estimate"):
         return _estimated(recording)
-    require(height, not isinstance(height, str), "metres over the ground, 'auto' or 'estimate'", "sensor_height")
+    require(height, not isinstance(height, str), "metres above the ground, 'auto' or 'estimate'", "sensor_height")
     mounting = Mounting(float(height))
     return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, f"sensor: {mounting}, as given"))
 

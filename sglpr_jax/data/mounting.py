@@ -53,7 +53,7 @@ class Mounting:
 
     def __post_init__(self):
         if not (math.isfinite(self.height_m) and -1 < self.height_m < 100):
-            raise ValueError(f"expected the sensor's height over the ground in metres, found {self.height_m}")
+            raise ValueError(f"expected the sensor's height above the ground in metres, found {self.height_m}")
 
     @property
     def tilt_deg(self) -> float:

@@ -137,7 +137,7 @@ class Motion:
         return np.abs(clock - clock[frame]) < seconds
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
-        """Whether each of `rows` has a known pose relative to `frame`."""
+        """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
 
     def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:

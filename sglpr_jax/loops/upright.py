@@ -31,7 +31,7 @@ def check_level(poses: Float[np.ndarray, "n 4 4"], mounting: Mounting | None, *,
 
 
 def upright_from_lidar(mounting: Mounting | None) -> Float[np.ndarray, "4 4"]:
-    """Transform of `Mounting.level`, from the LiDAR frame to the gravity-aligned frame. Identity for None."""
+    """Transform of `Mounting.level`, from the LiDAR frame to the gravity-aligned frame. None gives the identity."""
     found = np.eye(4)
     if mounting is not None:
         found[:3, :3] = mounting.upright_from_lidar

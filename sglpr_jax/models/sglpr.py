@@ -96,7 +96,7 @@ def describe(
       Descriptors of length 1. The shipped weights give 256 numbers.
 
     Raises:
-      TypeError: If the images are no array, for instance a list.
+      TypeError: If the images are not an array, for instance a list.
       ValueError: If the images have another size than `params.config.grid`, if a density image has another integer
         type, if labels are missing, or if the head does not read labels.
     """

@@ -107,12 +107,12 @@ class _Descriptors:
         self._computing: list[Num[Array | np.ndarray, "b d"]] = []
 
     def add(self, batch: Num[Array | np.ndarray, "b d"]) -> None:
-        """Adds a batch and waits for the previous one, so that at most two are in memory."""
+        """Add a batch and wait for the previous one, so that at most two are in memory."""
         self._done += [np.asarray(one, np.float32) for one in self._computing]
         self._computing = [batch]
 
     def all(self) -> list[Float32[np.ndarray, "b d"]]:
-        """Waits for the last batch. Returns all descriptors, at the end those of its padding."""
+        """Wait for the last batch and return all descriptors. The last rows are those of its padding."""
         return [*self._done, *(np.asarray(one, np.float32) for one in self._computing)]
 
 

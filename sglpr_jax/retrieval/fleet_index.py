@@ -1,7 +1,7 @@
 """An index for more places than fit into memory, with the interface of `Index`, based on LanceDB (extra `fleet`).
 
-A table is stored in a folder or in object storage, without a server. The answers are exact, too: LanceDB compares all
-rows in float32, and the distances of a few additional rows are recomputed in float64.
+A table is stored in a folder or in object storage, without a server. The answers are exact: LanceDB compares all rows
+in float32, and the distances of a few additional rows are recomputed in float64.
 """
 
 import json
@@ -41,7 +41,8 @@ SPARE = 16
 
 
 class FleetIndex:
-    """Places by their descriptors, in the order they were added: row i is the i-th place.
+    """Index of place descriptors in a folder or bucket that several processes share. Row i is the i-th place that was
+    added.
 
     Descriptors are compared by L2. Any number of processes may query while one adds. Each answer includes all places
     that existed at the time of the query.

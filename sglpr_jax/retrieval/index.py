@@ -48,7 +48,7 @@ BLOCK = 64
 
 @dataclasses.dataclass(eq=False)
 class Index:
-    """Places by their descriptors, in the order they were added: row i is the i-th place.
+    """Index of place descriptors in memory. Row i is the i-th place that was added.
 
     Example:
       index = sglpr_jax.Index.empty()

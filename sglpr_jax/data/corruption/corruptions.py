@@ -64,7 +64,7 @@ def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
 
 
 def offset(scan: Scan, metres: float) -> Cloud:
-    """Moves the sensor by the given distance, in metres, to a random side."""
+    """Moves the sensor by the given distance, in metres, to the left or to the right at random."""
     return moved_left(scan.points, scan.rng.choice((-1, 1)) * metres)
 
 
@@ -140,7 +140,9 @@ def chosen_corruptions(names: Sequence[str]) -> tuple[Corruption, ...]:
     for name in names:
         if name not in known and name not in kinds:
             nearest = difflib.get_close_matches(name, [*known, *kinds], n=1, cutoff=0)[0]
-            raise ValueError(f"no corruption {name!r}; did you mean {nearest!r}? There are {', '.join(known)}")
+            raise ValueError(
+                f"expected a corruption, found {name!r}; did you mean {nearest!r}? Available: {', '.join(known)}"
+            )
     return tuple(each for each in CORRUPTIONS if not names or each.name in names or each.kind in names)
 
 

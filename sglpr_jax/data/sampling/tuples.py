@@ -59,7 +59,7 @@ class TuplePool:
         self.neighbours = self._group(pairs[same_visit])
         self.revisits = self._group(pairs[~same_visit])
         if not len(pairs):
-            raise ValueError(f"no two frames lie within {config.positive_m} m of each other: nothing can be a positive")
+            raise ValueError(f"expected frames within {config.positive_m} m of each other as positives, found none")
 
     def __len__(self) -> int:
         return len(self.frame)
