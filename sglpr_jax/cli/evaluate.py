@@ -117,7 +117,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
 
 
 def _check_options(command: EvaluateCommand) -> None:
-    """Raises ValueError if options exclude each other."""
+    """Raise ValueError if options exclude each other."""
     from sglpr_jax.evaluation.protocols.choice import check_names
 
     if command.database is not None:

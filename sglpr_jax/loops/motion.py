@@ -132,7 +132,7 @@ class Motion:
         return inverse(poses) @ self.poses[frame], self.same(frame, rows)
 
     def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is less than `seconds` before or after a frame, without standing time."""
+        """Whether each frame is less than `seconds` before or after `frame`, without standing time."""
         clock = np.array(self.clock)
         return np.abs(clock - clock[frame]) < seconds
 

@@ -152,7 +152,7 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
 
 
 def check_installed() -> None:
-    """Raises ImportError if the extra `slam` is not installed, before any long work starts."""
+    """Raise ImportError if the extra `slam` is not installed, before any long work starts."""
     _library("small_gicp")
 
 

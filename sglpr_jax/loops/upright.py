@@ -18,7 +18,7 @@ STEEPEST = 0.7
 
 
 def check_level(poses: Float[np.ndarray, "n 4 4"], mounting: Mounting | None, *, name: str) -> None:
-    """Warns if the path goes mostly up or down. Such poses are probably in camera axes, with z forward."""
+    """Warn if the path goes mostly up or down. Such poses are probably in camera axes, with z forward."""
     steps = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     way = float(np.linalg.norm(steps, axis=1).sum())
     up = (0.0, 0.0, 1.0) if mounting is None else mounting.up

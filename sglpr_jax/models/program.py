@@ -94,7 +94,7 @@ def stablehlo(params: Params) -> bytes:
 
 @contextlib.contextmanager
 def _no_source_locations() -> Iterator[None]:
-    """Omits source file locations from programs, so that the same weights give the same bytes on every machine."""
+    """Omit source file locations from programs, so that the same weights give the same bytes on every machine."""
     limit = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, limit)
     jax.config.update(limit, 0)

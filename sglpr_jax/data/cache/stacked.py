@@ -42,7 +42,7 @@ class Stacked:
         return array
 
     def _announce(self, start: int, stop: int) -> None:
-        """Requests these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
+        """Request these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
         page = start - start % mmap.PAGESIZE
         self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
 
