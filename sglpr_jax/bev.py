@@ -126,9 +126,9 @@ def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order
 def even_cells(image: Num[Array | np.ndarray, "*b h w"]) -> Num[Array | np.ndarray, "*b h+h%2 w+w%2"]:
     """Convert a ready-made density image to the cells of equation 1, by halving its middle row and column.
 
-    The recipe of these images truncates coordinates, so the middle row and column are as wide as two others. They
-    become two rows and columns with half of the count each. Without this, they form a bright cross in the direction of
-    the vehicle, and the sensor is not at the centre of an even crop.
+    Ready-made images have truncated coordinates, so the middle row and the middle column are as wide as two others.
+    Each becomes two with half of the counts. Otherwise they would form a bright cross, and the sensor would not be at
+    the centre of an even crop.
 
     Labels (integers) are not halved. Images with an even number of cells are unchanged. A numpy image stays a numpy
     image: a JAX operation on each image of a recording would wait for the network that describes the previous batch.
@@ -161,7 +161,7 @@ def centre_crop(
 
 
 def uncropped(crop: Int[np.ndarray, "h w"], *, shape: tuple[int, ...]) -> Int[np.ndarray, "..."]:
-    """Return the labels of a whole image, with 0 around a crop of its `even_cells`.
+    """Return labels for a whole image from the labels of a crop of its `even_cells`. Pixels outside the crop are 0.
 
     If the two halves of a middle cell differ, the first half counts, unless it is 0.
 

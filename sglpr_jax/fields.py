@@ -126,7 +126,7 @@ def require(value: Any, fits: bool, expected: str, field: str) -> None:
 
 
 def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
-    """Checks that a member accepts the value. The message names the first member, or all configurations."""
+    """Check that a member accepts the value. The message names the first member, or all configurations."""
     if value is None and types.NoneType in members:
         return
     configs = [member for member in members if is_config(member)]
@@ -138,7 +138,7 @@ def _check_union(value: Any, members: tuple[Any, ...], field: str) -> None:
 
 
 def _read_union(value: Any, members: tuple[Any, ...], field: str) -> Any:
-    """Converts a value by the first member that accepts it. The message has what each member but None expects."""
+    """Convert a value by the first member that accepts it. The message has what each member but None expects."""
     if value is None and types.NoneType in members:
         return None
     *others, last = (member for member in members if member is not types.NoneType)

@@ -268,7 +268,7 @@ def _hidden(path: Path) -> Path:
 
 @functools.cache
 def _sweep(folder: Path) -> None:
-    """Removes the hidden paths that killed processes left in a folder, once in each process."""
+    """Remove the hidden paths that killed processes left in a folder, once in each process."""
     for left in folder.glob(".*.tmp"):
         with contextlib.suppress(OSError):  # another process may also remove it, or it may be unreadable
             if _HIDDEN.search(left.name) and time.time() - _newest(left) > ABANDONED_S:
@@ -282,7 +282,7 @@ def _newest(path: Path) -> float:
 
 
 def _put(new: Path, path: Path, *, keep: bool) -> None:
-    """Renames `new` to `path`, even if another process does the same."""
+    """Rename `new` to `path`, even if another process does the same."""
     while True:
         try:
             return os.replace(new, path)

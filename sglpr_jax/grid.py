@@ -11,7 +11,7 @@ ImageKind = Literal["points", "density"]
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Image plane of equation 1: cells of `resolution_m` metres, with the sensor at the corner of the middle four."""
+    """Image plane of equation 1: cells of `resolution_m` metres. The sensor is where the four middle cells meet."""
 
     resolution_m: Positive = 0.2
     height: Size = 224

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 MOST_BYTES = 120
-"""Maximum length of a file name made of a name. Suffixes and temporary files need the rest of the usual 255 bytes."""
+"""Maximum length of a file name from `file_name`, in bytes. Suffixes and temporary files need the rest of the usual
+255."""
 MOST_SHOWN = 100
 """Maximum number of printed characters of a name."""
 _UNSAFE = re.compile(r"[/\\\x00-\x1f\x7f]")
@@ -16,8 +17,8 @@ _UNSAFE = re.compile(r"[/\\\x00-\x1f\x7f]")
 def file_name(name: str) -> str:
     """Return the name of the file or folder for a recording or a scan with this name.
 
-    A name that is a safe file name stays unchanged. Of any other name (`../x`, one with control characters, a very long
-    one), unusual characters are replaced and a hash is appended. Different names have different file names.
+    A name that is a safe file name stays unchanged. In any other name, such as `../x` or a very long name, unusual
+    characters are replaced and a hash is appended. Different names have different file names.
     """
     try:
         size = len(os.fsencode(name))
@@ -32,7 +33,7 @@ def file_name(name: str) -> str:
 def path_inside(root: Path, listed: Any, *, source: Path) -> Path:
     """Return the path of a file that a table lists relative to the folder of its dataset.
 
-    Raises ValueError, which names the table `source`, if `listed` is no relative path or leads out of `root`.
+    Raises ValueError, which names the table `source`, if `listed` is not a relative path or leads out of `root`.
     """
     path = Path(listed) if isinstance(listed, str) and "\0" not in listed else Path("..")
     if path.anchor or ".." in path.parts or path == Path():

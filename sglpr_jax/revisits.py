@@ -46,7 +46,7 @@ def database_end(
     """
     clock, excluded = (np.arange(n, dtype=np.float64), excluded_frames) if times is None else (times, excluded_s)
     if not np.all(np.isfinite(clock)) or np.any(np.diff(clock) < 0):
-        raise ValueError("expected finite times that never decrease, found others")
+        raise ValueError("expected finite times that never decrease, found a decreasing or non-finite time")
     if n == 0:
         return np.zeros(0, dtype=np.int64)
     first_younger = np.searchsorted(clock, clock - excluded, side="right")

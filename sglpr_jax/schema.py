@@ -65,7 +65,7 @@ def check_columns(arrays: Mapping[str, np.ndarray], columns: Mapping[str, Column
 
 
 def check_texts(values: Any, *, name: str, count: int | None = None) -> None:
-    """Raise ValueError if values are not a list of strings, or with `count` not that many."""
+    """Raise ValueError if values are not a list of strings or, with `count`, if the list has another length."""
     if not isinstance(values, list) or not all(type(value) is str for value in values):
         raise ValueError(f"expected `{name}` as a list of strings, found {values!r:.60}")
     if count is not None and len(values) != count:

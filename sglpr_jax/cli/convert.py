@@ -11,7 +11,8 @@ from sglpr_jax.cli.runtime import parse_command, run
 
 @dataclasses.dataclass(frozen=True)
 class ConvertCommand:
-    """Write initial weights for `bin/train --weights`, taken from a published network. Other weights are random.
+    """Write initial weights for `bin/train --weights`, taken from a published network. Weights that the file does not
+    contain are random.
 
     Example:
       bin/convert swin_tiny_patch4_window7_224.safetensors --out start

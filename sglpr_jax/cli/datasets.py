@@ -101,8 +101,8 @@ def all_recordings(root: Path, **options: Any) -> list[Recording]:
 def without_bad_scans(
     recordings: Sequence[Recording], *, on_bad_scan: Callable[[str, Exception], None]
 ) -> list[Recording]:
-    """Read all scans and return the recordings without the unreadable ones. Each of these is passed to
-    `on_bad_scan`."""
+    """Read all scans and return the recordings without the unreadable ones. `on_bad_scan` is called for each unreadable
+    scan."""
     with progress_bar("read all scans", sum(map(len, recordings))) as show:
         found, done = [], 0
         for recording in recordings:

@@ -45,7 +45,7 @@ def default_command(
 
 
 def _early_flags(arguments: list[str] | None) -> tuple[Path | None, str | None]:
-    """Read --config and --preset before the other flags, because they set the defaults of these."""
+    """Read --config and --preset before the other flags, because they set the defaults of the other flags."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path)
     parser.add_argument("--preset")

@@ -18,7 +18,7 @@ class EvaluateCommand:
 
     FILE is a descriptor file of bin/embed, a .npy file of descriptors (one row per frame), or text. Text is a top-k
     list with lines `query: frame frame ...` or `query: frame=score ...`, or scored pairs with lines `i j score
-    [label]`. Frames are numbered from 0, and a higher score is closer.
+    [label]`. Frames are numbered from 0, and a higher score means more similar.
 
     Example:
       bin/evaluate 08.npz
@@ -53,8 +53,8 @@ class EvaluateCommand:
     """Files of other methods on the same frames, to compare with FILE. Without poses or times of their own, they use
     those of FILE."""
     data: Path | None = None
-    """Dataset with the scans or images of the frames; the page then shows them. --seq selects the sequence. It also
-    names the sequence if FILE does not; published splits depend on this name."""
+    """Dataset with the scans or images of the frames, which the page then shows. --seq selects the sequence. If FILE
+    does not name its sequence, --seq names it. Published splits depend on this name."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     weights: str | None = None
     """Name of shipped weights or folder of a training run. With --data, the page then shows semantic maps and feature
@@ -117,7 +117,7 @@ def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
 
 
 def _check_options(command: EvaluateCommand) -> None:
-    """Raises ValueError if options exclude each other."""
+    """Raise ValueError if options exclude each other."""
     from sglpr_jax.evaluation.protocols.choice import check_names
 
     if command.database is not None:

@@ -30,10 +30,10 @@ UNFINISHED = "unfinished"
 class LoopsCommand:
     """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
-    Writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons), index.html and
-    command.json (the flags). With odometry also trajectory.tum and trajectory.kitti, with --optimize also the corrected
-    trajectory.
-    Ctrl-C writes the loops found until then. The same command continues after that, and after a run that was killed.
+    The command writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons),
+    index.html and command.json (the flags). With odometry it also writes trajectory.tum and trajectory.kitti, and with
+    --optimize the corrected trajectory. Ctrl-C writes the loops found until then. The same command continues a run that
+    was interrupted or killed.
 
     Example:
       bin/loops my_scans --out found
@@ -48,10 +48,11 @@ class LoopsCommand:
     out: Path
     """Output folder."""
     odometry: Path | None = None
-    """A pose for each scan, or poses at other times (tum), which are interpolated, or the bag itself. Without odometry,
-    loops are found by the scans alone."""
+    """File with a pose for each scan, tum file with poses at other times, which are interpolated, or the bag itself.
+    Without odometry, loops are found by the scans alone."""
     odometry_format: OdometryFormat = "auto"
-    """Files with 12 numbers a line are kitti (camera axes) or lidar (z up), with 8 numbers tum; .g2o is recognised."""
+    """Format of --odometry. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
+    recognises tum and .g2o."""
     drift_percent: float = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
     more than four standard deviations are rejected."""
@@ -68,8 +69,8 @@ class LoopsCommand:
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a loop."""
     degenerate: Degenerate = "keep"
-    """Loops whose position has a standard deviation of more than 1 m along one direction, as between plain walls:
-    `keep` writes them with that information matrix, `drop` rejects them."""
+    """Loops whose position has a standard deviation of more than 1 m in one horizontal direction, for example between
+    plain walls: `keep` writes these loops with that information matrix, and `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
     near_m: float = DetectorConfig.near_m

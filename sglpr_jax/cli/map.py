@@ -24,7 +24,7 @@ UNFINISHED = ".unfinished"
 class MapCommand:
     """Store the places of a recording in one file. Each place has a descriptor, an image and a pose.
 
-    Ctrl-C writes the places found until then. The same command continues after that, and after a run that was killed.
+    Ctrl-C writes the places found until then. The same command continues a run that was interrupted or killed.
 
     Example:
       bin/map my_scans --poses poses.tum --out town.safetensors
@@ -34,12 +34,13 @@ class MapCommand:
     recording: Annotated[Path, tyro.conf.Positional]
     """A dataset, a bag or a folder of scans, in any supported layout."""
     poses: Path
-    """A pose in the world frame for each scan, or poses at other times (tum), which are interpolated, or the bag
-    itself. Use a corrected trajectory, not raw odometry."""
+    """File with a pose in the world frame for each scan, tum file with poses at other times, which are interpolated, or
+    the bag itself. Use a corrected trajectory, not raw odometry."""
     out: Path
     """Map to write (.safetensors)."""
     pose_format: OdometryFormat = "auto"
-    """Files with 12 numbers a line are kitti (camera axes) or lidar (z up), with 8 numbers tum; .g2o is recognised."""
+    """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
+    recognises tum and .g2o."""
     add_to: Path | None = None
     """Existing map in the same world frame, made with the same weights. The new map also contains its places."""
     spacing_m: NotNegative = SPACING_M

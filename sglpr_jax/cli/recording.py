@@ -47,8 +47,8 @@ class PosedRecordingOptions(RecordingOptions):
     """Selection of a recording in a folder, options for reading it, and the poses of a plain folder of scans."""
 
     poses: Path | None = None
-    """Pose file of a plain folder, if it is not beside the scans: one row per scan, or poses at other times. These are
-    interpolated if the scans have times."""
+    """Pose file of a plain folder, if it is not beside the scans: one row per scan, or poses at other times. Poses at
+    other times are interpolated if the scans have times."""
     pose_format: PoseFormat = "auto"
     """kitti: camera frame (KITTI, SemanticKITTI); lidar: 12 numbers, z up; tum; csv with a header (x, y, z, t)."""
     times: Path | None = None

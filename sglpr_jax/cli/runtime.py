@@ -114,7 +114,7 @@ def parse_command(
 
 
 def _check_numbers(command: Any) -> None:
-    """Raises ValueError, which begins with the flag, if a number is outside the bounds of its annotation."""
+    """Raise ValueError, which begins with the flag, if a number is outside the bounds of its annotation."""
     for name, annotation in field_types(type(command)).items():
         if has_bounds(annotation):
             check_value(getattr(command, name), annotation, f"--{name.replace('_', '-')}")
@@ -246,8 +246,10 @@ def stop_on_signal() -> Iterator[StopRequest]:
 
 @contextlib.contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar on stderr. The context returns a function that sets the finished count. Without a terminal nothing is
-    shown."""
+    """Context manager that shows a progress bar on stderr, or nothing without a terminal.
+
+    It yields a function; call it with the number of items finished so far.
+    """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:

@@ -37,8 +37,8 @@ class SimulateCommand:
     azimuth_steps: int | None = None
     """Firings per revolution. Fewer firings make smaller files. None: the number of the real sensor."""
     scenery: str = "town"
-    """Kind of town: `town`; `outskirts`, hilly, with long roads between walls, hedges and slopes; `lanes`, roads
-    between overgrown hedges; or `gardens`, streets with front gardens, low fences and old trees."""
+    """Surroundings of the drive: `town`; `outskirts`, hilly, with long roads between walls, hedges and slopes; `lanes`,
+    roads between overgrown hedges; or `gardens`, streets with front gardens, low fences and old trees."""
     images: bool = False
     """Write BEV density images with label images (NN/imgs, NN/labels, NN/pose.txt) instead of scans and labels."""
     vary: bool = False

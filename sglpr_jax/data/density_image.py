@@ -102,13 +102,13 @@ def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
 
 
 def _cell_of_point(points: Float[np.ndarray, "_ n"]) -> Int[np.ndarray, " n"]:
-    """Returns the flat cell index of each point. Truncation makes the central row and column two cells wide."""
+    """Return the flat cell index of each point. Truncation makes the central row and column two cells wide."""
     row, column = SIZE // 2 - np.trunc(points[:2] / RESOLUTION_M).astype(np.int64)
     return row * SIZE + column
 
 
 def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2 v"]:
-    """Returns the mean x and y of the points in each voxel."""
+    """Return the mean x and y of the points in each voxel."""
     voxels = _fewest_voxels(points)
     if not len(voxels):
         return np.zeros((2, 0))
@@ -117,7 +117,7 @@ def _voxel_centroids(points: Float32[np.ndarray, "3 n"]) -> Float[np.ndarray, "2
 
 
 def _fewest_voxels(points: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarray, " n"]:
-    """Returns the voxel number of each point, for the smallest edge with at most `MAX_VOXELS` voxels.
+    """Return the voxel number of each point, for the smallest edge with at most `MAX_VOXELS` voxels.
 
     The quick count rules out most edges. It never exceeds the true number of voxels.
     """
@@ -136,7 +136,7 @@ def _too_many(voxels: Int32[np.ndarray, " n"]) -> bool:
 
 
 def _numbered(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Renumbers voxels in ascending order without gaps."""
+    """Renumber voxels in ascending order without gaps."""
     found = _found(voxels)
     if found is None:
         return np.unique(voxels, return_inverse=True)[1]
@@ -144,7 +144,7 @@ def _numbered(voxels: Int32[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 
 
 def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
-    """Marks the numbers between the smallest and the largest that occur. This is faster than sorting with np.unique.
+    """Mark the numbers between the smallest and the largest that occur. This is faster than sorting with np.unique.
 
     Returns None if the range exceeds `MOST_SPREAD`, for example because of a point high in the air.
     """
@@ -160,7 +160,7 @@ def _found(numbers: Int32[np.ndarray, " n"]) -> Bool[np.ndarray, " m"] | None:
 
 
 def _voxel_of_point(points: Float32[np.ndarray, "3 n"], edge_m: float) -> Int32[np.ndarray, " n"]:
-    """Returns the voxel of each point as one number. Voxel corners are at multiples of `edge_m`."""
+    """Return the voxel of each point as one number. Voxel corners are at multiples of `edge_m`."""
     x, y, z = np.floor(points * np.float32(1 / edge_m)).astype(np.int32)
     side = 2 * int(REACH_M / edge_m) + 4  # The margin allows for rounding.
     return (z * side + y) * side + x

@@ -37,7 +37,7 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
         return recording
     if height in ("auto", "estimate"):
         return _estimated(recording)
-    require(height, not isinstance(height, str), "metres over the ground, 'auto' or 'estimate'", "sensor_height")
+    require(height, not isinstance(height, str), "metres above the ground, 'auto' or 'estimate'", "sensor_height")
     mounting = Mounting(float(height))
     return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, f"sensor: {mounting}, as given"))
 
@@ -57,7 +57,7 @@ def _estimated(recording: Recording) -> Recording:
 
 
 def _unclear(hanging: list[bool], scans: int) -> str:
-    """Explains why the scans show no mounting. `hanging` states for each scan with ground whether the sensor is upside
+    """Explain why the scans show no mounting. `hanging` states for each scan with ground whether the sensor is upside
     down."""
     if 2 * len(hanging) < scans:
         return f"ground found in {len(hanging)} of {scans} scans (is z up in these files?)"
@@ -68,7 +68,7 @@ def _unclear(hanging: list[bool], scans: int) -> str:
 
 
 def _check_layout(recording: Recording) -> None:
-    """Warns if the scans contradict the mounting of the layout, as scans of other sensors in KITTI's layout do."""
+    """Warn if the scans contradict the mounting of the layout, as scans of other sensors in KITTI's layout do."""
     believed = recording.mounting or Mounting(MODEL_HEIGHT_M)
     found = common_mounting(_of_scans(recording, SCANS_CHECKED))
     if found is None:
@@ -81,13 +81,13 @@ def _check_layout(recording: Recording) -> None:
 
 
 def _of_scans(recording: Recording, scans: int) -> list[Mounting | None]:
-    """Estimates the mounting from each of a number of scans, spread over the recording."""
+    """Estimate the mounting from each of a number of scans, spread over the recording."""
     rows = np.unique(np.linspace(0, len(recording) - 1, scans).astype(int))
     return [_of_scan(recording, int(row)) for row in rows]
 
 
 def _of_scan(recording: Recording, row: int) -> Mounting | None:
-    """Estimates the mounting from one scan, or returns None if the scan cannot be read."""
+    """Estimate the mounting from one scan, or return None if the scan cannot be read."""
     try:
         return estimate_mounting(recording.points(row))
     except (ValueError, OSError):

@@ -53,7 +53,7 @@ class Mounting:
 
     def __post_init__(self):
         if not (math.isfinite(self.height_m) and -1 < self.height_m < 100):
-            raise ValueError(f"expected the sensor's height over the ground in metres, found {self.height_m}")
+            raise ValueError(f"expected the sensor's height above the ground in metres, found {self.height_m}")
 
     @property
     def tilt_deg(self) -> float:
@@ -144,15 +144,15 @@ def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
 
 
 def _on_one_side(seen: Sequence[Mounting]) -> Sequence[Mounting]:
-    """Returns the upright or the upside-down mountings, whichever are more, because opposite directions have no
-    median."""
+    """Return the mountings of the upright or of the upside-down sensors, whichever are more. Opposite directions have
+    no median."""
     hanging = [mounting for mounting in seen if mounting.up[2] < 0]
     upright = [mounting for mounting in seen if mounting.up[2] >= 0]
     return [] if len(hanging) == len(upright) else max(hanging, upright, key=len)
 
 
 def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Returns the first point of each voxel near the sensor."""
+    """Return the first point of each voxel near the sensor."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = points.T.astype(np.float64)
         distance = np.sqrt(x * x + y * y + z * z)  # NaN and infinity fail the next test.
@@ -165,7 +165,7 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def _planes(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
-    """Samples planes that may be the ground. Returns normals that point up, and heights of the sensor above the
+    """Sample planes that may be the ground. Returns normals that point up, and heights of the sensor above the
     planes."""
     rng = np.random.default_rng(0)
     first = rng.integers(len(points), size=TRIALS)
@@ -187,7 +187,7 @@ def _planes(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "t 3"],
 def _fitted(
     points: Float[np.ndarray, "n 3"], ground: Bool[np.ndarray, " n"], up: Float[np.ndarray, "3"]
 ) -> Mounting | None:
-    """Fits a plane to the ground points by least squares and selects the ground points again, four times."""
+    """Fit a plane to the ground points by least squares and select the ground points again, four times."""
     normal, centre = up, np.zeros(3)
     for _ in range(4):
         if ground.sum() < LEAST_POINTS or ground.mean() < LEAST_SHARE:

@@ -51,7 +51,7 @@ class Recording:
     """Row of each scan in the whole recording, if scans are left out. None means that no scan is left out."""
 
     def __post_init__(self):
-        """Raises ValueError if two scans have the same id, or if a field does not have one entry per scan."""
+        """Raise ValueError if two scans have the same id, or if a field does not have one entry per scan."""
         if len(set(self.ids)) < len(self.ids):
             twice = next(name for name in self.ids if self.ids.count(name) > 1)
             raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {twice!r} twice")

@@ -60,7 +60,7 @@ def scan_stream(
 
 
 def check_readable(recording: Recording, readable: int) -> None:
-    """Raises ValueError if the number of readable scans of a recording is 0."""
+    """Raise ValueError if the number of readable scans of a recording is 0."""
     if not readable:
         raise ValueError(f"sequence {recording.name}: expected at least one readable scan, found none")
 
@@ -68,7 +68,7 @@ def check_readable(recording: Recording, readable: int) -> None:
 def _results(
     recording: Recording, look: Look[T], rows: Iterable[int], *, labels: bool, ahead: int
 ) -> Iterator[tuple[int, Callable[[], T]]]:
-    """Yields each row and a function that returns the result for it or raises its error.
+    """Yield each row and a function that returns the result for it or raises its error.
 
     This thread reads the files, because not every file can be read in parallel. Other threads call `look`.
     """

@@ -54,7 +54,8 @@ def times_of(
 
 
 def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
-    """Describes why times cannot be seconds of scans or poses. Empty if they can, or if they are too few to judge.
+    """Describe why times cannot be seconds of scans or poses. The description is empty if they can, or if they are too
+    few to judge.
 
     With `numbers`, whole numbers count as numbers of frames. Headers of bags have a unit and may have whole seconds.
     """

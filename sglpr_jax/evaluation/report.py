@@ -158,7 +158,9 @@ def _at_f1max(result: Result) -> dict[str, float] | None:
 
 
 def _at_precisions(result: Result, name: str) -> dict[str, dict[str, float] | None]:
-    """Return the same for each of `PRECISIONS`, None for a precision that no threshold reaches."""
+    """Return precision, recall and distance for each of `PRECISIONS`, or None if no threshold reaches this
+    precision.
+    """
     curve = result.curve
     if curve is None:
         return {}

@@ -135,7 +135,7 @@ class _Places:
         return self.apart(frame) > NEGATIVE_M + drift.max_deviation * drifted
 
     def nearest(self, descriptor: Float32[np.ndarray, " d"], among: Bool[np.ndarray, " n"]) -> np.ndarray:
-        """The frame among these with the nearest descriptor, or an empty array."""
+        """Return the frame with the nearest descriptor among those flagged in `among`, in an array of at most one."""
         rows = self.finder.index.query(descriptor, exclude=~among).rows
         return rows[rows >= 0]
 

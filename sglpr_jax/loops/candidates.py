@@ -192,7 +192,9 @@ class CandidateFinder:
         return Compared([self._candidate(seen, spectra, rows, peaks.some(slice(len(rows))), best)], link)
 
     def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
-        """Frames with the nearest descriptors, and those with the nearest ones at other times than the first."""
+        """Frames with the nearest descriptors, and frames with the nearest descriptors at other times than the
+        first.
+        """
         rows = self.nearest(descriptor, self.config.candidates, excluded)
         if not len(rows):
             return rows

@@ -9,8 +9,8 @@ OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """Format of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum" has time,
 position and quaternion. "g2o" has the vertices of a graph."""
 Degenerate = Literal["keep", "drop"]
-"""Whether degenerate loops are kept or rejected. The position of a degenerate loop is uncertain by more than 1 m along
-one direction, as between walls."""
+"""Whether degenerate loops are kept or rejected. The position of a degenerate loop is uncertain by more than 1 m in one
+horizontal direction, for example between plain walls."""
 MIN_PROBABILITY = 0.99
 """Minimum probability of a returned loop."""
 SPACING_M = 1.0

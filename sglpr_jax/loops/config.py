@@ -25,7 +25,7 @@ class DriftModel:
     """Position drift across the direction of travel, as a fraction of the drift along it."""
     position_m: float = 0.5
     yaw_deg: float = 1.5
-    """Standard deviations of the comparison itself, whatever the distance, in metres and degrees."""
+    """Standard deviations of the comparison itself, independent of the distance, in metres and degrees."""
     max_deviation: float = 4.0
     """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
 

@@ -32,8 +32,8 @@ def deviations(
     by the odometry. S is the sum of the drift along the path, the loop's covariance and the constants of the model.
 
     If the loop has no errors, the distance is the smallest RMS drift along the path that explains the loop, as a
-    multiple of the model's drift. Drift of constant rate, f and g times that of the model, gives at most
-    `sqrt(f^2 + g^2)`.
+    multiple of the model's drift. If position and heading drift at constant rates, f and g times those of the model,
+    the distance is at most `sqrt(f^2 + g^2)`.
 
     Arguments:
       loops: Loops between frames of the odometry.

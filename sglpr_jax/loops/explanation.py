@@ -33,7 +33,7 @@ def why_none(found: FoundLoops) -> list[str]:
 
 
 def why_few_queries(recording: Recording, rules: CandidateConfig, *, frames: int | None = None) -> str | None:
-    """Why fewer than half of the frames have an earlier frame that is old enough to be a match. None if more have.
+    """Why fewer than half of the frames have an earlier frame that is old enough to be a match. Otherwise None.
 
     Arguments:
       recording: The scans. Only number and times are used.

@@ -72,7 +72,9 @@ class FoundLoops:
         return f"{found}, {len(self.rejected)} rejected{why}{left}{skipped}"
 
     def without_degenerate(self) -> "FoundLoops":
-        """Rejects the loops whose position is uncertain by more than 1 m along one direction (`is_degenerate`)."""
+        """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
+        (`is_degenerate`).
+        """
         kept = tuple(loop for loop in self.loops if not loop.is_degenerate)
         others = [Rejected(loop, "degenerate") for loop in self.loops if loop.is_degenerate]
         return dataclasses.replace(self, loops=kept, rejected=_in_order([*self.rejected, *others]))
@@ -187,7 +189,7 @@ def _add(
 
 
 def _check_scans(finder: CandidateFinder, recording: Recording) -> None:
-    """Raises ValueError if all scans of a recording are unreadable or almost empty."""
+    """Raise ValueError if all scans of a recording are unreadable or almost empty."""
     check_readable(recording, len(recording) - len(finder.missing))
     if all(finder.empty) and len(finder.index) == len(recording):
         raise ValueError(

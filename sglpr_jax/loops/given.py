@@ -22,7 +22,7 @@ DATES = (datetime.datetime, datetime.timedelta, np.datetime64, np.timedelta64)
 
 
 def check_is(value: Any, kind: type, *, by: str) -> None:
-    """Raises TypeError if `value` is not of type `kind`. The message names `by`, the function that returns one."""
+    """Raise TypeError if `value` is not of type `kind`. The message names `by`, the function that returns one."""
     if not isinstance(value, kind):
         raise TypeError(f"expected a {kind.__name__}, found {_said(value)}; sglpr_jax.{by} returns one")
 

@@ -210,7 +210,7 @@ def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
 
 
 def _check_loop(query: int, match: int, shares: Sequence[float], where: str) -> None:
-    """Raises ValueError if the match is not the earlier frame, or if a share is outside [0, 1]."""
+    """Raise ValueError if the match is not the earlier frame, or if a share is outside [0, 1]."""
     if not match < query:
         raise ValueError(f"{where}: expected a match before the query, found {match} and {query}")
     if not all(0 <= share <= 1 for share in shares):

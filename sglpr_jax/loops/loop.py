@@ -24,8 +24,9 @@ Reason = Literal[
 """Why a pair that looked like a loop closure was rejected."""
 UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M = 0.03, 0.018
 UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M = 1.2, 0.07
-"""Standard deviations of height, and of pitch and roll, which images do not show: of two scans at one position, and per
-metre between them. They hold for vehicles, in simulated towns and outskirts and on KITTI."""
+"""Standard deviations of height, and of pitch and roll, which images do not show. Each has a value for two scans at one
+position, and an increase per metre between them. They hold for vehicles, in simulated towns and outskirts and on
+KITTI."""
 DEGENERATE_M = 1.0
 """Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
 
@@ -38,8 +39,8 @@ class Loop:
     match: int
     """Frame numbers, counted from 0. The match is the earlier frame."""
     match_from_query: Float[np.ndarray, "4 4"]
-    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. These are the frames of the points; they
-    are tilted if the sensor is."""
+    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. The points of the scans are in these
+    frames, which are tilted if the sensor is tilted."""
     covariance: Float[np.ndarray, "6 6"]
     """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
     radians."""
@@ -60,7 +61,7 @@ class Loop:
 
     @property
     def is_degenerate(self) -> bool:
-        """Whether the position in the plane has a standard deviation of more than `DEGENERATE_M`."""
+        """Whether the position has a standard deviation of more than `DEGENERATE_M` in some horizontal direction."""
         return is_degenerate(self.covariance)
 
 
@@ -87,7 +88,7 @@ def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
 
 
 def is_degenerate(covariance: Float[np.ndarray | Array, "n n"], *, threshold_m: float = DEGENERATE_M) -> bool:
-    """Whether the position of a pose is uncertain along some direction of the plane, as along a plain wall.
+    """Whether a position is uncertain in some horizontal direction, for example parallel to a long featureless wall.
 
     Arguments:
       covariance: See `position_deviation`.

@@ -132,12 +132,12 @@ class Motion:
         return inverse(poses) @ self.poses[frame], self.same(frame, rows)
 
     def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is less than `seconds` before or after a frame, without standing time."""
+        """Whether each frame is less than `seconds` before or after `frame`, without standing time."""
         clock = np.array(self.clock)
         return np.abs(clock - clock[frame]) < seconds
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
-        """Whether each of `rows` has a known pose relative to `frame`."""
+        """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
 
     def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:

@@ -41,7 +41,7 @@ def read_places(path: Path | str, *, weights_hash: str | None) -> tuple[Index, d
 
 
 def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises ValueError if the content of a file is not that of a map."""
+    """Raise ValueError if the content of a file is not that of a map."""
     if index.distance != "l2":
         raise ValueError(f"expected descriptors compared by l2, found {index.distance}")
     check_columns(arrays, ARRAYS, n=len(index))

@@ -9,7 +9,7 @@ from sglpr_jax.loops.candidates import CandidateFinder
 
 
 class PlaceScans:
-    """Scans at least `spacing_m` from the last place. Those that are bad or almost empty become no places."""
+    """Scans at least `spacing_m` from the last place. Bad and almost empty scans do not become places."""
 
     def __init__(self, finder: CandidateFinder, positions: Float[np.ndarray, "n 3"], spacing_m: float):
         self._finder, self._positions, self._spacing_m = finder, positions, spacing_m

@@ -51,7 +51,7 @@ def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndar
 
 
 def compose(a: Planar, b: Planar) -> Planar:
-    """Returns a_from_c of a_from_b and b_from_c."""
+    """Return a_from_c of a_from_b and b_from_c."""
     a, b = np.broadcast_arrays(a, b)
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
@@ -60,13 +60,13 @@ def compose(a: Planar, b: Planar) -> Planar:
 
 
 def inverted(a: Planar) -> Planar:
-    """Returns b_from_a of a_from_b."""
+    """Return b_from_a of a_from_b."""
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack([-cos * a[..., 0] - sin * a[..., 1], sin * a[..., 0] - cos * a[..., 1], -a[..., 2]], axis=-1)
 
 
 def relative(a: Planar, b: Planar) -> Planar:
-    """Returns the pose of b in the frame of a (`a_from_b`), from the poses of both in one common frame."""
+    """Return the pose of b in the frame of a (`a_from_b`), from the poses of both in one common frame."""
     return compose(inverted(a), b)
 
 

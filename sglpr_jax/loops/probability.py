@@ -185,7 +185,9 @@ def fit(
 
 
 def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """Progress of each number between each two knots, from 0 at its worst end to 1."""
+    """For each value and each interval of knots, how far the value is from the worse end of the interval, from 0 to
+    1.
+    """
     knots = np.array(KNOTS[name])
     made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
     return np.nan_to_num(made if name in RISING else 1 - made, nan=0.0)

@@ -1,7 +1,7 @@
 """Registration of two scans in 6 degrees of freedom: KISS-Matcher and then GICP (extra `slam`).
 
-Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, it converges 3 m off. The
-overlap shows it: the share of the space of one scan that the other scan fills, too.
+Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, its result is 3 m off,
+too. The overlap shows such errors. It is the share of the space of one scan that the other scan fills, too.
 """
 
 import importlib
@@ -152,7 +152,7 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
 
 
 def check_installed() -> None:
-    """Raises ImportError if the extra `slam` is not installed, before any long work starts."""
+    """Raise ImportError if the extra `slam` is not installed, before any long work starts."""
     _library("small_gicp")
 
 

@@ -1,9 +1,9 @@
 """Rivals of a match: scans of the same surroundings that certainly show other places.
 
 Frames of the last half minute are never matches, and they show the surroundings of the query. The frames around the
-match do so, too. If the query fits one of these rivals about as well as the match, the place repeats, and the fit
-proves nothing. A rival that overlaps the query or the match fits it correctly at the pose given by the motion. At that
-pose, only the second-best fit counts.
+match show the surroundings of the match. If the query fits one of these rivals about as well as the match, the place
+repeats, and the fit proves nothing. A rival that overlaps the query or the match fits it correctly at the pose given by
+the motion. At that pose, only the second-best fit counts.
 """
 
 import itertools

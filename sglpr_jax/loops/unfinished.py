@@ -160,7 +160,7 @@ class Unfinished:
         self.kept = end
 
     def _check(self, frames: Index, more: dict[str, np.ndarray], *, width: int) -> None:
-        """Raises ValueError if the content of the next file is invalid or was made from something else."""
+        """Raise ValueError if the content of the next file is invalid or was made from something else."""
         check_columns(more, COLUMNS, n=len(frames))
         if not len(frames) or frames.width != width or not np.array_equal(more["made_from"], self._made_from):
             raise ValueError("expected frames of this recording and these settings, found others")
@@ -230,7 +230,7 @@ def _other_settings(folder: Path, wanted: dict[str, Any]) -> list[str]:
 
 
 def _check_own(folder: Path) -> None:
-    """Raises FileExistsError if a folder holds anything but files of frames and temporary files."""
+    """Raise FileExistsError if a folder holds anything but files of frames and temporary files."""
     others = sorted(path.name for path in folder.iterdir() if not _is_own(path))
     if others:
         raise FileExistsError(

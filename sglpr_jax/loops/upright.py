@@ -18,7 +18,7 @@ STEEPEST = 0.7
 
 
 def check_level(poses: Float[np.ndarray, "n 4 4"], mounting: Mounting | None, *, name: str) -> None:
-    """Warns if the path goes mostly up or down. Such poses are probably in camera axes, with z forward."""
+    """Warn if the path goes mostly up or down. Such poses are probably in camera axes, with z forward."""
     steps = (inverse(poses[:-1]) @ poses[1:])[:, :3, 3]
     way = float(np.linalg.norm(steps, axis=1).sum())
     up = (0.0, 0.0, 1.0) if mounting is None else mounting.up
@@ -31,7 +31,7 @@ def check_level(poses: Float[np.ndarray, "n 4 4"], mounting: Mounting | None, *,
 
 
 def upright_from_lidar(mounting: Mounting | None) -> Float[np.ndarray, "4 4"]:
-    """Transform of `Mounting.level`, from the LiDAR frame to the gravity-aligned frame. Identity for None."""
+    """Transform of `Mounting.level`, from the LiDAR frame to the gravity-aligned frame. None gives the identity."""
     found = np.eye(4)
     if mounting is not None:
         found[:3, :3] = mounting.upright_from_lidar

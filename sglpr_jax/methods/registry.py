@@ -73,7 +73,7 @@ def handcrafted(name: str, recording: Recording, grid: Grid) -> Method:
     Raises ValueError if the name is not in `HANDCRAFTED`.
     """
     if name not in HANDCRAFTED:
-        raise ValueError(f"no handcrafted method {name!r}; there are {', '.join(HANDCRAFTED)}")
+        raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
     method = HANDCRAFTED[name]
     return _on_images(method, recording, grid) if method.takes == "images" else _on_points(method)
 

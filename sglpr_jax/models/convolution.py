@@ -26,7 +26,8 @@ AT_ONCE = 4
 class Convolution(nn.Module):
     """Square convolution with He initialisation. With `circular=True` the columns wrap around.
 
-    The border is kernel // 2 pixels wide, as in PyTorch. If the stride equals the kernel size, there is no border.
+    Images are padded by kernel // 2 pixels on each side, as in PyTorch. If the stride equals the kernel size, they are
+    not padded.
     """
 
     features: int
@@ -39,7 +40,7 @@ class Convolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.features}"]:
-        """Convolves images. With a border, an odd kernel gives ceil(size / stride) rows and columns."""
+        """Convolve images. With padding, an odd kernel gives ceil(size / stride) rows and columns."""
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = jnp.asarray(weight(self, "kernel", self.kernel_init, shape), x.dtype)
         bias = weight(self, "bias", initial.zeros, (self.features,)).astype(x.dtype)
@@ -51,7 +52,7 @@ class Convolution(nn.Module):
 def convolve(
     x: Float[Array, "b h w c"], kernel: Float[Array, "k k c f"], strides: tuple[int, int], circular: bool
 ) -> Float[Array, "b _ _ f"]:
-    """Convolve images that are extended by a border, with the derivative of matrix products.
+    """Convolve padded images. The derivative is computed by matrix products.
 
     Convolutions with few input channels are computed by `as_product`, all others by XLA.
     """
@@ -101,32 +102,32 @@ def _few_inputs(kernel: Float[Array, "k k c f"]) -> bool:
 
 
 def _side_by_side_kernels(kernel: Float[Array, "k k c f"], n: int, stride: int) -> Float[Array, "k _ c _"]:
-    """Kernel for the results of n columns. Each result uses its own part of a wider patch."""
+    """Return a kernel that gives the results of n columns. Each result uses its own part of a wider patch."""
     beyond = (n - 1) * stride
     parts = [jnp.pad(kernel, ((0, 0), (j, beyond - j), (0, 0), (0, 0))) for j in range(0, beyond + 1, stride)]
     return jnp.concatenate(parts, axis=-1)
 
 
 def _border(kernel: Float[Array, "k k c f"], strides: tuple[int, int]) -> int:
-    """Width of the border. Adjacent patches without overlap have no border."""
+    """Return the padding on each side, in pixels: 0 if the stride equals the kernel size."""
     size = len(kernel)
     return 0 if strides == (size, size) else size // 2
 
 
 def _columns_around(x: Float[Array, "b h w c"], border: int, circular: bool) -> Float[Array, "b h _ c"]:
-    """Adds columns on the left and on the right: those of the opposite side, or zeros."""
+    """Add columns on the left and on the right: those of the opposite side, or zeros."""
     sides = ((0, 0), (0, 0), (border, border), (0, 0))
     return jnp.pad(x, sides, mode="wrap") if circular else jnp.pad(x, sides)
 
 
 def _side_by_side(x: Float[Array, "b h w c"], axis: int, size: int, stride: int) -> Float[Array, "b _ _ _"]:
-    """Stacks the pixels along the axis that the kernel covers at each position, as channels."""
+    """Stack the pixels along the axis that the kernel covers at each position, as channels."""
     met = (x.shape[axis] - size) // stride * stride + 1
     return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + met, stride, axis) for i in range(size)], axis=-1)
 
 
 def _moved(x: Float[Array, "b h w c"], by: int, circular: bool) -> Float[Array, "b h w c"]:
-    """Shifts the columns to the right. Columns that leave the image enter on the other side, or zeros enter."""
+    """Shift the columns to the right. Columns that leave the image enter on the other side, or zeros enter."""
     if circular:
         return jnp.roll(x, by, axis=2)
     as_it_is = (0, 0, 0)

@@ -49,7 +49,7 @@ class Linear(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b {self.features}"]:
-        """Applies the same linear map to every vector of `c` channels."""
+        """Apply the same linear map to every vector of `c` channels."""
         c = x.shape[-1]
         kernel = weight(self, "kernel", self.kernel_init, (c, self.features)).astype(x.dtype)
         y = product(x.reshape(-1, c), jnp.asarray(kernel))

@@ -39,7 +39,7 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 INPUT_FILE = "input.json"
 NEEDS = "pip install 'sglpr-jax[export]'"
 NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
-"""jax2onnx is installed without its requirements. They include an Orbax that is older than this package's and that the
+"""jax2onnx is installed without its dependencies. They include an Orbax that is older than this package's and that the
 conversion does not use."""
 
 
@@ -94,7 +94,7 @@ def stablehlo(params: Params) -> bytes:
 
 @contextlib.contextmanager
 def _no_source_locations() -> Iterator[None]:
-    """Omits source file locations from programs, so that the same weights give the same bytes on every machine."""
+    """Omit source file locations from programs, so that the same weights give the same bytes on every machine."""
     limit = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, limit)
     jax.config.update(limit, 0)

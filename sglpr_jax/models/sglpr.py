@@ -45,7 +45,7 @@ class SGLPR(nn.Module):
         segment: int = 1,
         train: bool = False,
     ) -> Outputs:
-        """Computes descriptors and semantic logits.
+        """Compute descriptors and semantic logits.
 
         Logits are computed for every `segment`-th image, or for no image if it is 0 or if there is no segmentation
         head. `labels` are for a place head that reads labels. This head has no backbone (table 6).
@@ -96,7 +96,7 @@ def describe(
       Descriptors of length 1. The shipped weights give 256 numbers.
 
     Raises:
-      TypeError: If the images are no array, for instance a list.
+      TypeError: If the images are not an array, for instance a list.
       ValueError: If the images have another size than `params.config.grid`, if a density image has another integer
         type, if labels are missing, or if the head does not read labels.
     """
@@ -174,13 +174,13 @@ def forward(
 
 
 def _check_array(bev: Any) -> None:
-    """Raises TypeError for a list. JAX would treat each of its numbers as an argument."""
+    """Raise TypeError for a list. JAX would treat each of its numbers as an argument."""
     if not hasattr(bev, "shape"):
         raise TypeError(f"expected images as an array of numpy or JAX, found a {type(bev).__name__}; use np.asarray")
 
 
 def _check_labels(labels: Array | None, shape: tuple[Any, ...], config: ModelConfig) -> None:
-    """Raises ValueError if the head reads labels and they are missing, or if it reads no labels and they are given."""
+    """Raise ValueError if the head reads labels and they are missing, or if it reads no labels and they are given."""
     found = "none" if labels is None else f"shape {labels.shape}"
     if config.head.reads_labels and (labels is None or labels.shape != shape):
         raise ValueError(

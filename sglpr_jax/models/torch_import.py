@@ -196,7 +196,7 @@ def _swin(config: ModelConfig) -> SwinConfig:
 
 
 def _flax_layout(name: str, weight: np.ndarray, input_channels: int) -> np.ndarray:
-    """Converts PyTorch's (out, in, ...) to Flax's (..., in, out). The bias tables are (rows, heads) in both."""
+    """Convert PyTorch's (out, in, ...) to Flax's (..., in, out). The bias tables are (rows, heads) in both."""
     if name == "backbone/patch_embed/projection/kernel" and input_channels == 1:
         weight = weight.sum(1, keepdims=True)
     if name == "segmentation_head/kernel":

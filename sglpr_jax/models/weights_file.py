@@ -93,7 +93,7 @@ def load(weights: Path | str) -> Params:
 
 
 def _read_tensors(path: Path, config: ModelConfig, known: Collection[str]) -> dict[str, np.ndarray]:
-    """Reads the stored weights and checks their names, shapes, types, values and checksums.
+    """Read the stored weights and check their names, shapes, types, values and checksums.
 
     `known` are the checksums of the configuration.
     """
@@ -126,7 +126,7 @@ def _hash_of(config: dict[str, Any]) -> str:
 
 
 def _check_shapes(found: Mapping[str, tuple[int, ...]], config: ModelConfig, *, source: Path) -> None:
-    """Raises ValueError if names or shapes differ from the configuration. The message names one such weight."""
+    """Raise ValueError if names or shapes differ from the configuration. The message names one such weight."""
     expected = weight_shapes(config)
     if expected != found:
         name = min(set(expected.items()) ^ set(found.items()))[0]

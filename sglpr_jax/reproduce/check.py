@@ -69,7 +69,7 @@ def _check_labels(runs: Runs, name: str) -> None:
 def _check_methods(runs: Runs, seqs: Sequence[str], methods: Sequence[str]) -> None:
     for name in methods:
         if name not in HANDCRAFTED:
-            raise ValueError(f"no handcrafted method {name!r}; there are {', '.join(HANDCRAFTED)}")
+            raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
         needs = HANDCRAFTED[name].takes
         for seq in seqs:
             recording = runs.recording(seq)

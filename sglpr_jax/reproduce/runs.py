@@ -38,7 +38,7 @@ def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
 
 
 def _begun(folder: Path) -> bool:
-    """Whether there is a run to resume. A process that was killed early may leave a folder without one."""
+    """Whether the folder has a run to resume. A process that was killed early may leave a folder without a run."""
     return (folder / CONFIG_FILE).is_file()
 
 

@@ -155,7 +155,7 @@ def _made_by(file: DescriptorFile) -> dict[str, Any]:
 
 
 def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
-    """Returns the JSON part of the file. Raises ValueError if another program or version wrote it."""
+    """Return the JSON part of the file. Raises ValueError if another program or version wrote it."""
     if text.ndim != 0 or text.dtype.kind != "U":
         raise ValueError(f"{path}: expected JSON in `about`, found an array {text.dtype} {text.shape}")
     about = parse_json(str(text), source=f"{path}, `about`")
@@ -170,7 +170,7 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
 
 
 def _ids(names: np.ndarray) -> tuple[str, ...]:
-    """Returns the ids of an archive. Raises ValueError if they are not an array (n,) of strings."""
+    """Return the ids of an archive. Raises ValueError if they are not an array (n,) of strings."""
     if names.ndim != 1 or names.dtype.kind != "U":
         raise ValueError(f"expected ids as an array (n,) of strings, found {names.dtype} {names.shape}")
     return tuple(names.tolist())

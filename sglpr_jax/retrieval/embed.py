@@ -107,12 +107,12 @@ class _Descriptors:
         self._computing: list[Num[Array | np.ndarray, "b d"]] = []
 
     def add(self, batch: Num[Array | np.ndarray, "b d"]) -> None:
-        """Adds a batch and waits for the previous one, so that at most two are in memory."""
+        """Add a batch and wait for the previous one, so that at most two are in memory."""
         self._done += [np.asarray(one, np.float32) for one in self._computing]
         self._computing = [batch]
 
     def all(self) -> list[Float32[np.ndarray, "b d"]]:
-        """Waits for the last batch. Returns all descriptors, at the end those of its padding."""
+        """Wait for the last batch and return all descriptors. The last rows are those of its padding."""
         return [*self._done, *(np.asarray(one, np.float32) for one in self._computing)]
 
 
@@ -166,7 +166,7 @@ def scan_image(
 
 
 def _check_view(image: Float[np.ndarray, "h w"], field: Bool[np.ndarray, "h w"] | None, *, name: str) -> None:
-    """Raises ValueError if too few cells of an image within `field` (None: everywhere) are occupied."""
+    """Raise ValueError if too few cells of an image within `field` (None: everywhere) are occupied."""
     cells = np.count_nonzero(image if field is None else image * field)
     if cells < FEWEST_CELLS:
         raise ValueError(
@@ -176,7 +176,7 @@ def _check_view(image: Float[np.ndarray, "h w"], field: Bool[np.ndarray, "h w"] 
 
 
 def _check(method: Method, recording: Recording) -> None:
-    """Raises ValueError if the recording lacks points or labels that the method needs."""
+    """Raise ValueError if the recording lacks points or labels that the method needs."""
     name, beside = method.about["method"], f"labels beside the scans, found none in sequence {recording.name}"
     if isinstance(method, ImageMethod):
         if method.categories and not recording.has_labels:
@@ -196,7 +196,7 @@ def _angles(n: int, seed: int | None) -> Float[np.ndarray, " n"] | None:
 def _file(
     method: Method, recording: Recording, rows: list[int], descriptors: list[np.ndarray], *, rotation_seed: int | None
 ) -> DescriptorFile:
-    """Returns the descriptor file of the given rows. Raises ValueError if there are no rows.
+    """Return the descriptor file of the given rows. Raises ValueError if there are no rows.
 
     `descriptors` may contain additional rows at the end, the padding of the last batch.
     """
@@ -220,20 +220,20 @@ def _file(
 def _finite_points(
     record: Record, *, labels: bool
 ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """Returns the finite points of one scan and, with `labels`, their classes."""
+    """Return the finite points of one scan and, with `labels`, their classes."""
     assert record.points is not None
     finite = np.isfinite(record.points).all(axis=1)
     return record.upright_points[finite], classes_of(record, 20)[finite] if labels else None
 
 
 def _batch_for(scans: int, batch: int) -> int:
-    """Reduces `batch` for few scans to the next power of two: few sizes are compiled, and little padding is
+    """Return `batch` or, for fewer scans, the next power of two: few sizes are compiled, and little padding is
     described."""
     return min(batch, 2 ** max(scans - 1, 0).bit_length())
 
 
 def _describe_padded(describe: DescribeFn, views: list[View], batch: int) -> Num[Array | np.ndarray, "b d"]:
-    """Describes up to `batch` images in a call of constant shape, so that it compiles once. Does not wait for the
+    """Describe up to `batch` images in a call of constant shape, so that it compiles once. Does not wait for the
     result."""
     padded = views + [views[-1]] * (batch - len(views))
     stacked = jax.tree.map(lambda *each: np.stack(each), *padded)

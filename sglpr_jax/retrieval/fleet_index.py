@@ -1,7 +1,7 @@
 """An index for more places than fit into memory, with the interface of `Index`, based on LanceDB (extra `fleet`).
 
-A table is stored in a folder or in object storage, without a server. The answers are exact, too: LanceDB compares all
-rows in float32, and the distances of a few additional rows are recomputed in float64.
+A table is stored in a folder or in object storage, without a server. The answers are exact: LanceDB compares all rows
+in float32, and the distances of a few additional rows are recomputed in float64.
 """
 
 import json
@@ -41,7 +41,8 @@ SPARE = 16
 
 
 class FleetIndex:
-    """Places by their descriptors, in the order they were added: row i is the i-th place.
+    """Index of place descriptors in a folder or bucket that several processes share. Row i is the i-th place that was
+    added.
 
     Descriptors are compared by L2. Any number of processes may query while one adds. Each answer includes all places
     that existed at the time of the query.
@@ -155,7 +156,7 @@ class FleetIndex:
         return are_recent(len(self), None if now is None else self.times, now, seconds=seconds, frames=frames)
 
     def _candidates(self, query: Float[np.ndarray, " d"], k: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rows and descriptors of the nearest k places by LanceDB, without its approximate index."""
+        """Return the rows and descriptors of the nearest k places by LanceDB, without its approximate index."""
         search = self.table.search(query).distance_type("l2").bypass_vector_index()
         search = search.where(where, prefilter=True) if where else search
         found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
@@ -163,7 +164,7 @@ class FleetIndex:
         return found["row"].to_numpy(), vectors.reshape(-1, self.width)
 
     def _arrow(self, first: int, ids: list[str], columns: dict[str, np.ndarray]) -> Any:
-        """Returns rows as an Arrow table for LanceDB. The schema contains the metadata of the index."""
+        """Return rows as an Arrow table for LanceDB. The schema contains the metadata of the index."""
         import pyarrow
 
         def vectors(values: np.ndarray) -> Any:
@@ -178,7 +179,7 @@ class FleetIndex:
         return pyarrow.table({**rows, **stored}).replace_schema_metadata({"about": json.dumps(about)})
 
     def _check_about(self, weights_hash: str | None) -> None:
-        """Reads the metadata and columns of the table. Raises ValueError if they are invalid or contradict the
+        """Read the metadata and columns of the table. Raises ValueError if they are invalid or contradict the
         arguments."""
         text = (self.table.schema.metadata or {}).get(b"about", b"null")
         about = parse_json(text, source=f"{self.place}, `about`")
@@ -207,7 +208,7 @@ _STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"
 
 
 def _check_types(found: dict[str, str], width: int) -> None:
-    """Raises ValueError if a column is missing or has another type. Columns of other names are ignored."""
+    """Raise ValueError if a column is missing or has another type. Columns of other names are ignored."""
     needed = {"row": ("int64",), "id": ("string",), "descriptor": _vector_types("float", width)}
     known = needed | {"time": ("double",), "position": _vector_types("double", 3)}
     for name, types in known.items():
@@ -240,7 +241,7 @@ def _connect(place: str) -> Any:
 
 
 def _open(connection: Any, place: str) -> Any:
-    """Returns the table, or None if it does not exist yet."""
+    """Return the table, or None if it does not exist yet."""
     if TABLE not in connection.list_tables().tables:
         return None
     try:

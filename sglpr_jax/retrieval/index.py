@@ -48,7 +48,7 @@ BLOCK = 64
 
 @dataclasses.dataclass(eq=False)
 class Index:
-    """Places by their descriptors, in the order they were added: row i is the i-th place.
+    """Index of place descriptors in memory. Row i is the i-th place that was added.
 
     Example:
       index = sglpr_jax.Index.empty()
@@ -225,7 +225,7 @@ class Index:
     def _nearest(
         self, queries: Float[np.ndarray, "q d"], allowed: Bool[np.ndarray, " n"], k: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed."""
+        """Return the rows and distances (q, k) of the nearest k allowed places. At least k places must be allowed."""
         if self.distance != "l2":
             rows = np.flatnonzero(allowed)
             every = distance_function(self.distance)(queries, self.descriptors[rows])
@@ -239,7 +239,7 @@ class Index:
         return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
 
     def _squares(self) -> Float[np.ndarray, " n"]:
-        """Returns the squared lengths of all descriptors, after computing those of new places."""
+        """Return the squared lengths of all descriptors, after computing those of new places."""
         new = self.descriptors[len(self._lengths) :]
         if len(new):
             self._lengths = np.concatenate([self._lengths, np.einsum("nd,nd->n", new, new)])
@@ -247,7 +247,7 @@ class Index:
 
 
 def _appended(old: np.ndarray | None, new: np.ndarray, n: int) -> np.ndarray:
-    """Returns a column with spare capacity, with the new rows from row `n` on."""
+    """Return a column with spare capacity, with the new rows from row `n` on."""
     room = FIRST_ROOM if old is None else max(len(old), FIRST_ROOM)
     while room < n + len(new):
         room *= 2
@@ -268,7 +268,7 @@ def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Returns the JSON part and the arrays of an index. Raises ValueError if the file is damaged or no index."""
+    """Return the JSON part and the arrays of an index. Raises ValueError if the file is damaged or no index."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected an index, found {'a folder' if path.is_dir() else 'none'}")
     try:
@@ -291,7 +291,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _check_index(about: Any, arrays: dict[str, np.ndarray]) -> None:
-    """Raises ValueError if the content is not that of an index."""
+    """Raise ValueError if the content is not that of an index."""
     check_about(about, ABOUT, format=FORMAT)
     check_texts(about["ids"], name="ids")
     distance_function(about["distance"])

@@ -136,5 +136,5 @@ def _finite(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     if values.shape != shape:
         raise ValueError(f"expected {name} of shape {shape}, found {values.shape}")
     if not np.isfinite(values).all():
-        raise ValueError(f"expected finite {name}, found others")
+        raise ValueError(f"expected finite {name}, found NaN or infinity")
     return values

@@ -34,7 +34,7 @@ class Nearest:
         return tuple(self.database.ids[row] for row in self.rows[query] if row >= 0)
 
     def __str__(self) -> str:
-        """Lists the queries with the smallest distances, and their nearest places."""
+        """List the queries with the smallest distances, and their nearest places."""
         found = int((self.rows[:, 0] >= 0).sum())
         best = np.argsort(self.distances[:, 0], kind="stable")[: min(SHOWN, found)]
         lines = (f"{self.queries.ids[q]} -> {self.ids(q)[0]}  {self.distances[q, 0]:.4f}" for q in best)

@@ -105,7 +105,7 @@ def _maps(
 
 
 def _class_probabilities(params: Params, counts: Float[Array, "h w"]) -> Float[Array, "h w known"]:
-    """Returns the mean probabilities over the image and its mirror image, of all classes except unlabelled.
+    """Return the mean probabilities over the image and its mirror image, of all classes except unlabelled.
 
     The network is equivariant to rotations of the scan but not to reflections, so only the mirror image adds
     information.

@@ -4,9 +4,9 @@ Along a ray, a parabola approximates the ground, so the intersection is the solu
 parabolas are used, both with the height and slope of the ground below the sensor. The first one also has the curvature
 there and gives the approximate distance. The second one passes through the true height at that distance.
 
-The approximation is made for the gentle hills of towns. Its error is at most 0.04 m at distances of 30 to 40 m, and
-0.21 m at 40 to 60 m. In the outskirts, errors are up to 0.04 m within 20 m. At 30 to 40 m, 6 % of the errors exceed 0.2 m
-(maximum 0.85 m). At 40 to 60 m, 14 % exceed 0.2 m. Shapes stand on the true height.
+The approximation is made for the gentle hills of towns. Its error in height is at most 0.04 m at distances of 30 to
+40 m, and 0.21 m at 40 to 60 m. In the outskirts, errors are up to 0.04 m within 20 m. At 30 to 40 m, 6 % of the errors
+exceed 0.2 m (maximum 0.85 m). At 40 to 60 m, 14 % exceed 0.2 m. Shapes stand on the true height.
 """
 
 from typing import NamedTuple

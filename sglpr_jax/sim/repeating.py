@@ -1,4 +1,4 @@
-"""Simulated drives through sceneries where places repeat, with and without revisits."""
+"""Simulated drives through surroundings where places repeat, with and without revisits."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def simulate_repeating(
     revisit: Revisit = "none",
     rate_hz: float | None = None,
 ) -> SimulatedRecording:
-    """Returns the recording of a drive through a scenery where places repeat.
+    """Returns the recording of a drive through surroundings where places repeat.
 
     Arguments:
       name: Scenery, from `REPEATING`.

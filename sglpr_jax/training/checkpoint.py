@@ -166,7 +166,7 @@ class Checkpoints:
         shutil.rmtree(self._folder / _OUTDATED, ignore_errors=True)
 
     def _require_room(self, state: TrainState) -> None:
-        """Raises OSError before writing if the disk has too little space for a checkpoint."""
+        """Raise OSError before writing if the disk has too little space for a checkpoint."""
         needed = sum(leaf.nbytes for leaf in jax.tree.leaves((state.params.weights, state.optimizer)))
         free = shutil.disk_usage(self._folder).free
         if free < needed:

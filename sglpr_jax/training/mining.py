@@ -68,7 +68,7 @@ class Mining:
         return DescriptorCache(places, self._describe(params, places))
 
     def _drop_unneeded(self) -> None:
-        """Delete the caches that no kept checkpoint needs, including an old best one.
+        """Delete the caches that no kept checkpoint needs. An old best checkpoint may still need one.
 
         A run resumed from a checkpoint reads the cache of its next step and recomputes the later ones. A newer
         checkpoint may still be in the process of being written, so caches from the newest needed one on are kept.

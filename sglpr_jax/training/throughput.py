@@ -18,10 +18,10 @@ class Throughput:
 
 
 def throughput(lines: Sequence[dict[str, Any]]) -> Throughput | None:
-    """Return the mean throughput over all lines of the log that state a speed, or None if none does.
+    """Return the mean throughput over all lines of the log that state a speed, or None if no line states one.
 
-    The first line after a start or a resume states none, because the step is compiled then. Logs of earlier versions
-    state one on these lines: the very first line is skipped, but the first line after each resume is counted.
+    The first line after a start or a resume has no speed, because the step is compiled then. Logs of earlier versions
+    have a speed on these lines: the very first line is skipped, but the first line after each resume is counted.
     """
     timed = [(line["step"] - before["step"], line) for before, line in pairwise(lines) if "steps_per_second" in line]
     if not timed:

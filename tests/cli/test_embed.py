@@ -292,7 +292,7 @@ def test_the_height_of_the_sensor_can_be_said(embed, scans):
     assert "sensor: 0.60 m above the ground, as given" in ended.error
     assert load(out).config["sensor"] == "0.60 m above the ground"
     ended, _ = embed("--method", "thumbnail", "--data", scans, "--sensor-height", "1730")
-    assert_one_line_error(ended, "expected the sensor's height over the ground in metres, found 1730")
+    assert_one_line_error(ended, "expected the sensor's height above the ground in metres, found 1730")
 
 
 def test_consecutive_poses_far_apart_are_told(embed, scans):

@@ -117,7 +117,10 @@ def test_all_protocols(score, laps):
     [
         (("mine.npy",), ("mine.npy", "--poses", "found none")),
         (("mine.npy", "--poses", "lidar.txt"), ("lidar.txt", "--pose-format kitti", "or lidar")),
-        (("mine.npy", "--poses", "tum.txt", "--protocol", "top1"), ("no protocol 'top1'", "'top1-f1max'")),
+        (
+            ("mine.npy", "--poses", "tum.txt", "--protocol", "top1"),
+            ("expected a protocol, found 'top1'", "'top1-f1max'"),
+        ),
         (("mine.npy", "--poses", "tum.txt", "--distance", "cos"), ("expected a distance among l2, cosine", "'cos'")),
         (("mine.npy", "--poses", "pairs.txt"), ("pairs.txt", "found 4")),
         (("mine.npy", "--times", "times.txt"), ("times.txt", "expected --poses with --times")),

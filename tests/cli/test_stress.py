@@ -128,9 +128,11 @@ def test_a_drive_that_never_comes_back_has_nothing_to_lose(stress, images):
 def test_wrong_names_are_refused_before_any_work(stress, rings, tmp_path):
     options = ("--data", rings, "--method", "solid")
     assert_one_line_error(
-        stress(*options, "--corruption", "beams-61")[0], "no corruption 'beams-61'", "mean 'beams-16'"
+        stress(*options, "--corruption", "beams-61")[0], "expected a corruption, found 'beams-61'", "mean 'beams-16'"
     )
-    assert_one_line_error(stress(*options, "--protocol", "top1")[0], "no protocol 'top1'", "mean 'top1-f1max'")
+    assert_one_line_error(
+        stress(*options, "--protocol", "top1")[0], "expected a protocol, found 'top1'", "mean 'top1-f1max'"
+    )
     assert_one_line_error(stress("--data", rings, "--weights", "sglprr")[0], "sglprr: expected a folder")
     assert not (tmp_path / "out").exists()
 

@@ -255,6 +255,6 @@ def test_what_cannot_be_trained_on_leaves_no_run(command, town, preset, tmp_path
         words = (root, "sequence 00 has no poses")
     else:
         flags = (*flags, "--sampling.positive-m", "0.001")
-        words = ("0.001 m", "nothing can be a positive")
+        words = ("0.001 m", "as positives, found none")
     assert_one_line_error(command("train", "--data", root, "--preset", preset, "--out", out, *flags), *words)
     assert not out.exists()

@@ -96,4 +96,4 @@ def test_the_best_weights_can_only_be_chosen_by_places_held_out(command, images,
     options = ("--seq", "06", "--data", images, "--preset", preset, "--out", tmp_path / "run")
     assert_one_line_error(command("train", *options, "--select", "best"), "validation.share", "found 0")
     nothing_left = command("train", *options, "--validation.share", 0.5, "--sampling.negative-m", 1000)
-    assert_one_line_error(nothing_left, "nothing can be a positive")
+    assert_one_line_error(nothing_left, "as positives, found none")

@@ -121,7 +121,7 @@ def test_the_topic_with_most_scans_is_taken_and_a_goal_is_none(tmp_path):
     (tmp_path / "named").mkdir()
     chosen = opened(tmp_path / "named", "ros1", scans("ros1", times) + half + all_of_them, pose_topic="/a_half")
     assert len(chosen) == 12 and not chosen.positions.any() and chosen.pose_source.startswith("/a_half (11 poses of ")
-    for topic, words in (("/goal", "poses of most scans on /goal, found 0% of them"), ("/no", "/goal, /odom")):
+    for topic, words in (("/goal", "poses for at least half of the scans on /goal, found 0%"), ("/no", "/goal, /odom")):
         with pytest.raises(ValueError, match=rf"drive\.bag: expected .*{words}"):
             open_recording(tmp_path / FILES["ros1"], pose_topic=topic)
     (tmp_path / FILES["ros1"]).unlink()

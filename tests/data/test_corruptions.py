@@ -173,5 +173,7 @@ def test_a_strength_that_cannot_be_is_refused(kind, strength):
 
 @pytest.mark.parametrize(("name", "nearest"), [("beams-64", "beams-16"), ("rotatoin", "rotation"), ("noize", "noise")])
 def test_an_unknown_name_gets_the_nearest(name, nearest):
-    with pytest.raises(ValueError, match=f"no corruption '{name}'; did you mean '{nearest}.*There are rotation, occ"):
+    with pytest.raises(
+        ValueError, match=f"expected a corruption, found '{name}'; did you mean '{nearest}.*Available: rotation, occ"
+    ):
         chosen_corruptions((name,))

@@ -139,7 +139,7 @@ def test_levelling_is_rigid_and_turns_up_to_z(up, height):
 
 def test_a_strange_height_is_refused():
     for height in (np.nan, np.inf, 1730.0, -5.0):
-        with pytest.raises(ValueError, match="expected the sensor's height over the ground in metres, found"):
+        with pytest.raises(ValueError, match="expected the sensor's height above the ground in metres, found"):
             Mounting(height)
 
 

@@ -220,5 +220,5 @@ def test_protocols_fit_the_input(read):
 
 def test_an_unknown_name_is_answered_with_the_nearest():
     check_names(["all", "ssc-recall", "listed-pairs-f1max"])
-    with pytest.raises(ValueError, match="no protocol 'top1'; did you mean 'top1-f1max'"):
+    with pytest.raises(ValueError, match="expected a protocol, found 'top1'; did you mean 'top1-f1max'"):
         check_names(["top1"])

@@ -158,7 +158,7 @@ def test_as_many_descriptors_as_poses_are_needed(make_file, two_laps):
 )
 def test_an_unknown_protocol_names_the_nearest(name, nearest):
     with pytest.raises(
-        ValueError, match=f"no protocol '{name}'; did you mean '{nearest}.*There are .*sgpr-pairs-f1max"
+        ValueError, match=f"expected a protocol, found '{name}'; did you mean '{nearest}.*Available: .*sgpr-pairs-f1max"
     ):
         protocol_named(name)
 

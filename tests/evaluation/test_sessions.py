@@ -42,7 +42,7 @@ def test_protocols_can_be_chosen(session):
     files = session(MAP), [session(NCLT[0])]
     assert list(evaluate_sessions(*files, ["pointnetvlad-recall"]).protocols) == ["pointnetvlad-recall"]
     assert list(evaluate_sessions(*files, ["all"]).protocols) == ["bevplace-nclt-recall", "pointnetvlad-recall"]
-    with pytest.raises(ValueError, match="no protocol 'nclt'; did you mean 'bevplace-nclt-recall'"):
+    with pytest.raises(ValueError, match="expected a protocol, found 'nclt'; did you mean 'bevplace-nclt-recall'"):
         evaluate_sessions(*files, ["nclt"])
 
 

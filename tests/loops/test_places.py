@@ -237,7 +237,7 @@ LEVEL = np.tile([1.73, 0, 0, 1], (3, 1))
         ({"images": np.zeros((3, 7, 7), np.uint8)}, "expected images of an even number of cells"),
         ({"images": np.zeros((2, 8, 8), np.uint8)}, "expected images as uint8"),
         ({"images": np.zeros((3, 8, 8))}, "expected images as uint8"),
-        ({"mountings": changed(LEVEL, (0, 0), 1000)}, "expected the sensor's height over the ground"),
+        ({"mountings": changed(LEVEL, (0, 0), 1000)}, "expected the sensor's height above the ground"),
         ({"mountings": changed(LEVEL, (0, 3), 2)}, "expected up directions of length 1"),
         ({"mountings": LEVEL[:, :3]}, "expected mountings as float64"),
         ({"distance": "cosine"}, "expected descriptors compared by l2, found cosine"),

@@ -64,7 +64,7 @@ def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], N
 
 
 def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
-    """Returns a function that reads from the arrays of a pack, and everything else from the recording's files."""
+    """Return a function that reads from the arrays of a pack, and everything else from the recording's files."""
     row_of = {path: row for row, path in enumerate(recording.paths)}
     points, raw = arrays.get("points"), arrays.get("labels")
 
@@ -83,7 +83,7 @@ def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
 
 
 def _source(recording: Recording) -> dict[str, Any]:
-    """Identifies the pack of a recording: its files and their read options.
+    """Identify the pack of a recording: its files and their read options.
 
     Only options that are strings count. A reader whose points depend on other files adds a hash of these files as an
     option.
@@ -98,7 +98,7 @@ def _source(recording: Recording) -> dict[str, Any]:
 
 
 def _make(target: Path, recording: Recording, source: dict[str, Any], on_progress: Callable[[int], None]) -> None:
-    """Writes a pack atomically."""
+    """Write a pack atomically."""
     with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
         temporary.mkdir()
         arrays = _write_arrays(temporary, recording, on_progress)
@@ -108,7 +108,7 @@ def _make(target: Path, recording: Recording, source: dict[str, Any], on_progres
 
 
 def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
-    """Writes the arrays of all scans or images, and returns their layout."""
+    """Write the arrays of all scans or images, and return their layout."""
     with contextlib.ExitStack() as opened:
         files: dict[str, StackWriter] = {}
         for i in range(len(recording)):
@@ -151,7 +151,7 @@ def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
 
 
 def _check_layout(name: str, about: dict[str, Any], scans: int | None) -> None:
-    """Raises ValueError if a pack has no array of this name, type and shape of its rows."""
+    """Raise ValueError if a pack has no array of this name, type and shape of its rows."""
     dtype, row = LAYOUT.get(name, (None, None))
     if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
         raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")

@@ -42,7 +42,7 @@ class Stacked:
         return array
 
     def _announce(self, start: int, stop: int) -> None:
-        """Requests these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
+        """Request these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
         page = start - start % mmap.PAGESIZE
         self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
 
@@ -58,7 +58,9 @@ class StackWriter:
             self._stream = path.open("xb")
 
     def append(self, array: np.ndarray, *, of: str) -> None:
-        """Append an array. Raises ValueError, with `of`, if its rows do not fit, and OSError if the disk is full."""
+        """Append an array. Raises ValueError, whose message names `of`, if the rows do not fit, and OSError if the disk
+        is full.
+        """
         if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
             raise ValueError(
                 f"{of}: expected {self._dtype} with rows of shape {self._row}, like the first array of the pack, "

@@ -44,37 +44,37 @@ class Kind:
 
 
 def occlude(scan: Scan, degrees: float) -> Bool[np.ndarray, " n"]:
-    """Removes the points in a sector of the given width, in degrees, about a random heading."""
+    """Remove the points in a sector of the given width, in degrees, about a random heading."""
     return outside_sector(scan.points, heading=scan.rng.uniform(-np.pi, np.pi), width=np.radians(degrees))
 
 
 def fewer_beams(scan: Scan, beams: float) -> Bool[np.ndarray, " n"]:
-    """Keeps the given number of lasers (`laser_rings.keep_rings`). Raises ValueError if the rings are unknown."""
+    """Keep the given number of lasers (`laser_rings.keep_rings`). Raises ValueError if the rings are unknown."""
     return keep_rings(ring_numbers(scan.points, lasers=scan.lasers), int(beams))
 
 
 def add_noise(scan: Scan, metres: float) -> Cloud:
-    """Adds Gaussian noise along each ray, with the given standard deviation in metres."""
+    """Add Gaussian noise along each ray, with the given standard deviation in metres."""
     return add_to_range(scan.points, metres * scan.rng.standard_normal(len(scan.points)))
 
 
 def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
-    """Removes each point with the given probability."""
+    """Remove each point with the given probability."""
     return scan.rng.random(len(scan.points)) >= share
 
 
 def offset(scan: Scan, metres: float) -> Cloud:
-    """Moves the sensor by the given distance, in metres, to a random side."""
+    """Move the sensor by the given distance, in metres, to the left or to the right at random."""
     return moved_left(scan.points, scan.rng.choice((-1, 1)) * metres)
 
 
 def leave(scan: Scan, strength: float) -> Cloud:
-    """Returns the points unchanged."""
+    """Return the points unchanged."""
     return scan.points
 
 
 def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
-    """Raises ValueError. Embedding rotates the scans, because it can rotate images, too."""
+    """Raise ValueError. Embedding rotates the scans, because it can rotate images, too."""
     raise ValueError("expected a corruption other than rotation; for rotation use the rotation_seed of embed")
 
 
@@ -140,7 +140,9 @@ def chosen_corruptions(names: Sequence[str]) -> tuple[Corruption, ...]:
     for name in names:
         if name not in known and name not in kinds:
             nearest = difflib.get_close_matches(name, [*known, *kinds], n=1, cutoff=0)[0]
-            raise ValueError(f"no corruption {name!r}; did you mean {nearest!r}? There are {', '.join(known)}")
+            raise ValueError(
+                f"expected a corruption, found {name!r}; did you mean {nearest!r}? Available: {', '.join(known)}"
+            )
     return tuple(each for each in CORRUPTIONS if not names or each.name in names or each.kind in names)
 
 

@@ -17,7 +17,8 @@ NCLT_UNIT_M = 0.005
 NCLT_OFFSET_M = -100.0
 """Scale and offset of NCLT's integers: metres = value * unit + offset."""
 Z_UP_FROM_Z_DOWN = np.array([1.0, -1.0, -1.0])
-"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror."""
+"""Rotation by 180 degrees about x: from forward, right, down to forward, left, up. Negating only z would mirror
+scans."""
 
 
 class Records(NamedTuple):

@@ -16,7 +16,7 @@ _NOT_A_NUMBER = re.compile(rb"[-+]?(?:nan\([^\s()]*\)|1\.#(?:ind|[qs]?nan)\w*)",
 
 
 def whole_number(word: str, *, of: str) -> int:
-    """Return a number of at most 18 decimal digits. Raises ValueError, which names `of`, for other words."""
+    """Return a number of at most 18 decimal digits. Raises ValueError for other words. The message names `of`."""
     if not re.fullmatch("[0-9]{1,18}", word):
         raise ValueError(f"expected a whole number as {of}, found {word[:40]!r}")
     return int(word)

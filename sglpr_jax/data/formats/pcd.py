@@ -33,7 +33,7 @@ class _Field:
     size: int
     """Size of a number in bytes."""
     count: int
-    """Number of numbers. Some programs write fields without numbers."""
+    """Number of values of this field in a point. Some programs write fields without values."""
 
     @property
     def width(self) -> int:
@@ -115,7 +115,7 @@ def _parse_fields(words: dict[str, list[str]]) -> tuple[_Field, ...]:
     names = words["FIELDS"]
     counts = words.get("COUNT", ["1"] * len(names))
     if not len(names) == len(words["SIZE"]) == len(words["TYPE"]) == len(counts):
-        raise ValueError(f"expected one SIZE, TYPE and COUNT for each of {len(names)} FIELDS, found others")
+        raise ValueError(f"expected one SIZE, TYPE and COUNT for each of {len(names)} FIELDS, found another number")
     fields = tuple(
         _Field(name, kind.upper(), whole_number(size, of="SIZE"), whole_number(count, of="COUNT"))
         for name, kind, size, count in zip(names, words["TYPE"], words["SIZE"], counts, strict=True)

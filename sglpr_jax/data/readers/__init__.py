@@ -63,7 +63,7 @@ def open_recording(
       pose_format: Format of the pose file of a plain folder.
       times: File of timestamps of a plain folder, if it is not beside the scans.
       time_unit: Unit of the times in text files of a plain folder or of KITTI's layout. "auto" expects seconds.
-      pose_topic: Pose topic of a bag. By default, the topic that covers most scans is used.
+      pose_topic: Pose topic of a bag. By default, the topic that covers the largest number of scans is used.
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.

@@ -2,10 +2,11 @@
 
 Each point cloud topic is a recording. A single recording has the name of the bag. If the bag has several topics, each
 recording has the name of its topic, with _ instead of /. Bags of a folder that follow each other are parts of a drive.
-After a pause another drive begins, with recordings of its own, whose names begin with the name of its first bag.
+After a pause another drive begins. The names of its recordings begin with the name of its first bag.
 
-The poses come from the pose topic that covers most scans. They are interpolated at the times of the scans and
-transformed to the LiDAR frame by tf. If tf does not contain the mounting of the LiDAR, the poses are not transformed.
+The poses come from the pose topic that covers the largest number of scans, at least half of them. They are interpolated
+at the times of the scans and transformed to the LiDAR frame by tf. If tf does not contain the mounting of the LiDAR,
+the poses are not transformed.
 """
 
 import dataclasses
@@ -54,10 +55,10 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
     Arguments:
       root: File or folder of the bag.
       name: Name of the recording, from `recording_names`.
-      pose_topic: Pose topic. By default, the topic that covers most scans is used.
+      pose_topic: Pose topic. By default, the topic that covers the largest number of scans is used.
 
     Raises:
-      ValueError: If the bag is broken, the topic has no messages, or `pose_topic` does not cover most scans.
+      ValueError: If the bag is broken, the topic has no messages, or `pose_topic` covers less than half of the scans.
       ImportError: If the extra `ros` is not installed.
     """
     bag, topic = _recordings(root)[name]
@@ -152,7 +153,7 @@ class _Placed(NamedTuple):
 
 
 def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | None, lidar: str) -> Recording:
-    """Add the poses of `topic`, or else of the topic that covers most scans, to the recording.
+    """Add the poses of `topic`, or else of the topic that covers the largest number of scans, to the recording.
 
     `lidar` is the frame of the scans. The unused topics are listed in `found`.
     """
@@ -184,7 +185,8 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
 
 
 def _chosen(placed: dict[str, _Placed], topic: str | None, bag: Path) -> str:
-    """Return `topic`, or else the topic that covers most scans; "" if no topic covers enough scans.
+    """Return `topic`, or else the topic that covers the largest number of scans; "" if it covers less than half of
+    them.
 
     Raises ValueError if `topic` does not exist or does not cover enough scans.
     """
@@ -194,12 +196,14 @@ def _chosen(placed: dict[str, _Placed], topic: str | None, bag: Path) -> str:
     if topic not in placed:
         raise ValueError(f"{bag}: expected the pose topic {topic}, found {', '.join(placed) or 'none'}")
     if placed[topic].share < LEAST_SHARE:
-        raise ValueError(f"{bag}: expected poses of most scans on {topic}, found {placed[topic].share:.0%} of them")
+        raise ValueError(
+            f"{bag}: expected poses for at least half of the scans on {topic}, found {placed[topic].share:.0%}"
+        )
     return topic
 
 
 def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
-    """The tf transforms that move the LiDAR frame, named like topics."""
+    """Return the tf transforms in which the LiDAR moves, with names like those of topics."""
     moving = (track for track in transforms if track.moves)
     return {
         f"/tf/{track.frame}/{track.child}": track

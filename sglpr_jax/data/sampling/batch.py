@@ -161,13 +161,13 @@ def _require_one_size(places: list[tuple[Recording, int]], pictures: list[Place]
 
 
 def _stacked(pictures: list[Place]) -> tuple[np.ndarray, np.ndarray]:
-    """Stacks images and maps of classes. Missing maps are filled with UNLABELLED."""
+    """Stack images and maps of classes. Missing maps are filled with UNLABELLED."""
     maps = [np.full(image.shape, UNLABELLED, np.int32) if classes is None else classes for image, classes in pictures]
     return np.stack([image for image, _ in pictures]), np.stack(maps)
 
 
 def _padded(scans: list[Place], max_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pads clouds to one size. Returns points, numbers of valid points, and classes (0 without labels)."""
+    """Pad clouds to one size. Returns points, numbers of valid points, and classes (0 without labels)."""
     points = np.zeros((len(scans), max_points, 3), np.float32)
     classes = np.zeros((len(scans), max_points), np.int32)
     count = np.zeros(len(scans), np.int32)

@@ -42,7 +42,7 @@ def hold_out(positions: Float[np.ndarray, "n 3"], config: ValidationConfig, samp
 
 
 def _revisiting(places: Float[np.ndarray, "n 2"], sampling: TupleConfig) -> Bool[np.ndarray, "n"]:
-    """Marks the frames that have a positive in another visit."""
+    """Mark the frames that have a positive in another visit."""
     pairs = close_pairs(places, closer_than_m=sampling.positive_m)
     revisits = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > sampling.revisit_gap]
     return np.isin(np.arange(len(places)), revisits)

@@ -59,7 +59,7 @@ class TuplePool:
         self.neighbours = self._group(pairs[same_visit])
         self.revisits = self._group(pairs[~same_visit])
         if not len(pairs):
-            raise ValueError(f"no two frames lie within {config.positive_m} m of each other: nothing can be a positive")
+            raise ValueError(f"expected frames within {config.positive_m} m of each other as positives, found none")
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -89,7 +89,7 @@ class TuplePool:
         return rng.choice(len(self), shape, replace=bool(np.prod(shape) > len(self)))
 
     def _draw_anchored(self, rng: np.random.Generator, cluster: list[int], cache: DescriptorCache | None) -> list[int]:
-        """Draws an anchor and its positives. `cluster` contains the earlier anchors of the same cluster."""
+        """Draw an anchor and its positives. `cluster` contains the earlier anchors of the same cluster."""
         other_visit = rng.random() < self.config.revisit_fraction and len(self.revisits.anchors) > 0
         source = self.revisits if other_visit or not len(self.neighbours.anchors) else self.neighbours
         anchors = source.anchors
@@ -103,7 +103,7 @@ class TuplePool:
     def _alike_or_near(
         self, cluster: list[int], anchors: Int[np.ndarray, "_"], cache: DescriptorCache | None
     ) -> Int[np.ndarray, "_"]:
-        """Selects anchors that fit a cluster: near its first anchor or, with a cache, similar to it and far from all
+        """Select anchors that fit a cluster: near its first anchor or, with a cache, similar to it and far from all
         anchors."""
         if cache is None:
             return anchors[self._within(cluster[0], anchors, self.config.cluster_m)]

@@ -57,7 +57,9 @@ def protocol_named(name: str, among: Mapping[str, Protocol] = PROTOCOLS) -> Prot
     """Return a protocol by name. Raises ValueError with the nearest name if the protocol does not exist."""
     if name not in among:
         nearest = difflib.get_close_matches(name, among, n=1, cutoff=0)
-        raise ValueError(f"no protocol {name!r}; did you mean {nearest[0]!r}? There are {', '.join(among)}")
+        raise ValueError(
+            f"expected a protocol, found {name!r}; did you mean {nearest[0]!r}? Available: {', '.join(among)}"
+        )
     return among[name]
 
 

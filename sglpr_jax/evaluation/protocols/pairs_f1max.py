@@ -21,10 +21,10 @@ def pairs_f1max(file: DescriptorFile, *, negatives_per_positive: int | None = 10
 
     Positive pairs are all pairs less than 3 m and more than 50 frames apart. Negative pairs are more than 20 m apart
     and drawn without replacement. All negative pairs are used if there are too few, or with
-    `negatives_per_positive=None`. The seed of the published lists is unknown; another seed changes the score by 0.001 to
-    0.004. Published on KITTI's own poses (lilin-hitcrt/SSC, script/gen_pairs.py). The published lists have 1, 10, 20, 50
-    and 100 negatives; the tables use 100. The interval resamples the later frames of the pairs and does not redraw the
-    negatives.
+    `negatives_per_positive=None`. The seed of the published lists is unknown. Another seed changes the score by 0.001
+    to 0.004. Published on KITTI's own poses (lilin-hitcrt/SSC, script/gen_pairs.py). The published lists have 1, 10,
+    20, 50 and 100 negatives for each positive, and the tables use 100. The interval resamples the later frames of the
+    pairs and does not redraw the negatives.
     """
     positions = positions_of(file, 2)
     positive = positive_pairs(positions)

@@ -17,9 +17,9 @@ def sgpr_pairs_f1max(file: DescriptorFile, *, seed: int = 0) -> Result:
     """Score pairs of frames as SGPR does: 3 m / 20 m in x and y, without a gap, 0.5 % of the negatives.
 
     Positive pairs are all pairs at most 3 m apart, including neighbouring frames and each frame with itself. Negative
-    pairs are more than 20 m apart, and each is kept with a probability of 0.005. Most positive pairs are therefore easy,
-    and even a recording without a revisit has a score. Published on KITTI's own poses (kxhit/SG_PR,
-    data_process/gen_sem_kitti_graph_pairs.py). The published code skips scans with few objects; here all scans are
+    pairs are more than 20 m apart, and each is kept with a probability of 0.005. Most positive pairs are therefore
+    easy, and even a recording without a revisit has a score. Published on KITTI's own poses (kxhit/SG_PR,
+    data_process/gen_sem_kitti_graph_pairs.py). The published code skips scans with few objects. Here all scans are
     used. The interval resamples the later frames of the pairs and does not redraw the negatives.
     """
     positions = positions_of(file, 2)

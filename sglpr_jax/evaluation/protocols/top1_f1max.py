@@ -11,7 +11,7 @@ METRES = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m"
 
 
 def top1_f1max(source: Source, *, seed: int = 0) -> Result:
-    """Score top-1 retrieval as LoGG3D-Net and Locus do: 3 m / 20 m in 3-D, the last 30 s excluded.
+    """Score top-1 retrieval as LoGG3D-Net and Locus do: right up to 3 m, wrong beyond 20 m, in 3-D.
 
     The answer to a query is the nearest descriptor among the frames at least 30 s older. `revisits.database_end` has
     the exact rule. An accepted answer is a true positive up to 3 m away and a false positive beyond 20 m. In between it

@@ -38,7 +38,7 @@ class SwinUnet(nn.Module):
     def __call__(
         self, image: Float[Array, "b h w c"], *, train: bool = False
     ) -> tuple[Float[Array, "b h//{self.patch} w//{self.patch} {self.embed_dim}"], dict[str, Float[Array, "b _ _ _"]]]:
-        """Returns the tokens, and the intermediate maps by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
+        """Return the tokens, and the intermediate maps by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
         stages = [
             {
                 "heads": heads,

@@ -22,7 +22,7 @@ class Spectrum(nn.Module):
 
     @nn.compact
     def __call__(self, features: Float[Array, "b r s c"]) -> Float[Array, "b {self.output}"]:
-        """Returns the vector before its L2 normalisation.
+        """Return the vector before its L2 normalisation.
 
         The transform and all later steps are float32. Frequency 0 is the mean.
         """

@@ -1,4 +1,4 @@
-"""Sceneries where places repeat, by name."""
+"""Surroundings where places repeat, by name."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from sglpr_jax.sim.things import Range
 
 @dataclasses.dataclass(frozen=True)
 class Repeating:
-    """Scenery where places repeat, and parameters of the drive through it."""
+    """Surroundings where places repeat, and parameters of the drive through them."""
 
     site: Callable[[np.random.Generator, float, bool], Site]
     """Function of a random generator, the line's length in metres, and whether it is closed. It draws the scenery."""

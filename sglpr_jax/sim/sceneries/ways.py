@@ -1,4 +1,4 @@
-"""Lines for sceneries where places repeat: roads, rings and rows, and the path of a vehicle along them."""
+"""Lines for surroundings where places repeat: roads, rings and rows, and the path of a vehicle along them."""
 
 from typing import Literal, NamedTuple
 
