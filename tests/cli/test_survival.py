@@ -122,7 +122,7 @@ def test_a_run_killed_again_and_again_ends_like_one_that_was_not(options, uninte
         if kill == "at the start":  # imports, compilation, restoring
             time.sleep(rng.uniform(0, 3))
         elif kill == "between checkpoints":  # after it has come a little further
-            runs.wait_for_checkpoint(process, steps=SCORE_EVERY * rng.integers(1, 3))
+            runs.wait_for_checkpoint(process, steps=SCORE_EVERY * int(rng.integers(1, 3)))
             time.sleep(rng.uniform(0, 0.1))
         else:
             runs.wait_for_lines(process, 1)
