@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.files import json_in_short, parse_json, read_arrays, replacing
+from sglpr_jax.files import json_in_short, parse_json, replacing
+from sglpr_jax.numpy_files import read_arrays
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.schema import Column, check_about, check_columns
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Num
 
-from sglpr_jax.data.formats.arrays import read_array
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.files import in_short
+from sglpr_jax.numpy_files import read_array
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
