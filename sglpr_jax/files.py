@@ -206,6 +206,15 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
+@contextlib.contextmanager
+def naming(source: Path | str) -> Iterator[None]:
+    """Put the name of a file before the message of a ValueError of the block."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
+
+
 def in_short(error: Exception) -> str:
     """Return the message of another library's error, on one line of at most 100 characters."""
     return _cut(" ".join(str(error).split()) or type(error).__name__, most=100)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import replacing
+from sglpr_jax.files import naming, replacing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared, Seen
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig, VerificationConfig
@@ -203,10 +203,8 @@ class PlaceMap:
         left_out = [name for name in ARRAYS if name not in more]
         if left_out:
             raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
-        try:
+        with naming(path):
             _check_map(index, more)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return cls(index, *(more[name] for name in ARRAYS))
 
     def _names_of(self, other: "PlaceMap", new: list[int], drive: Mapping[str, Float[np.ndarray, "4 4"]]) -> list[str]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.fields import Size
-from sglpr_jax.files import in_short, parse_json
+from sglpr_jax.files import in_short, naming, parse_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index_rows import (
     MOST,
@@ -182,14 +182,12 @@ class FleetIndex:
         arguments."""
         text = (self.table.schema.metadata or {}).get(b"about", b"null")
         about = parse_json(text, source=f"{self.place}, `about`")
-        try:
+        with naming(self.place):
             check_about(about, ABOUT, format=FORMAT)
             if about["width"] != self.width:
                 raise ValueError(f"expected descriptors of {self.width} numbers, found {about['width']}")
             check_weights(about["weights_hash"], weights_hash)
             _check_types({field.name: str(field.type) for field in self.table.schema}, self.width)
-        except ValueError as error:
-            raise ValueError(f"{self.place}: {error}") from error
         self.weights_hash = about["weights_hash"]
 
     def _names(self) -> list[str]:

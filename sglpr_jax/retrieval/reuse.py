@@ -60,11 +60,11 @@ def embed_or_reuse(
 def fingerprint(recording: Recording) -> str:
     """Hash a recording without reading its scans.
 
-    The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels count by their
-    size and modification time. Scans that are not files of their own, such as those of a bag, are identified by the
-    other data.
+    The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels, or those of a
+    bag, count by their size and modification time.
     """
-    scans, labels = ([_state(path) for path in paths] for paths in (recording.paths, recording.label_paths))
+    files = (recording.containers or recording.paths, recording.label_paths)
+    scans, labels = ([_state(path) for path in paths] for paths in files)
     mounting = None if recording.mounting is None else dataclasses.asdict(recording.mounting)
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
     for values in (recording.positions, recording.times):

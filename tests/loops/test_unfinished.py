@@ -8,6 +8,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bags import CLOUD, FILES, write_bag
+from bags import cloud as cloud_message
 from recordings import with_points
 
 import sglpr_jax
@@ -329,6 +331,23 @@ def test_scans_of_another_drive_have_other_settings_though_sizes_and_times_agree
         found.append(unfinished.settings(recording, finder))
     assert found[0]["recording"] == found[1]["recording"] and found[0] != found[1]
     assert unfinished.settings(dataclasses.replace(recording, name="other"), finder) != found[1]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_bag_of_other_scans_has_other_settings_though_its_size_and_times_agree(params, tmp_path, kind):
+    finder, found = sglpr_jax.LoopDetector(params).finder, []
+    for x in (5.0, 6.0):
+        path = tmp_path / str(x) / FILES[kind]
+        path.parent.mkdir()
+        clouds = [cloud_message(kind, i, np.full((9, 3), x + i)) for i in range(4)]
+        write_bag(path, kind, [("/points", CLOUD, float(i), one) for i, one in enumerate(clouds)])
+        for file in path.iterdir() if path.is_dir() else (path,):
+            os.utime(file, (1e9, 1e9))
+        recording = sglpr_jax.open_recording(path, sensor_height=1.73)
+        found.append(unfinished.settings(recording, finder))
+    assert found[0]["recording"] == found[1]["recording"] and found[0]["scans"] != found[1]["scans"]
+    os.utime(recording.containers[0], (2e9, 2e9))
+    assert unfinished.settings(recording, finder)["recording"] != found[1]["recording"]
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):
