@@ -23,6 +23,7 @@ from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion, agree_in_order
 from sglpr_jax.loops.transforms import travelled
+from sglpr_jax.models.params import Params
 
 RECENT = 8
 """Number of latest times that are compared with a new one."""

@@ -136,8 +136,9 @@ class FleetIndex:
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
         excluded = given_flags(exclude)
-        if excluded is not None or not 1 <= k <= MOST:
-            check_asked(k, excluded, places=len(self) if excluded is None else min(len(self), excluded.size))
+        places = MOST if excluded is None and 1 <= k <= MOST else len(self)  # counting the places of a table takes time
+        places = places if excluded is None else min(places, excluded.size)
+        check_asked(k, excluded, queries=len(queries), places=places)
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         where = "" if excluded is None else _without(excluded)

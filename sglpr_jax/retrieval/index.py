@@ -160,12 +160,13 @@ class Index:
             `k` places can be returned, the remaining rows are -1.
 
         Raises:
-          ValueError: If the descriptors have another width or come from other weights.
+          ValueError: If the descriptors have another width or come from other weights, or if the answers exceed the
+            bounds of `check_asked`.
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
         excluded = given_flags(exclude)
-        check_asked(k, excluded, places=len(self))
+        check_asked(k, excluded, queries=len(queries), places=len(self))
         allowed = np.ones(len(self), bool) if excluded is None else ~excluded
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)

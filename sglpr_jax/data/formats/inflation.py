@@ -26,7 +26,7 @@ def bound_bags() -> None:
         lz4=functools.partial(_declared, LZ4FrameDecompressor), zstd=functools.partial(_declared, zstd.ZstdDecompressor)
     )
     bounded = SimpleNamespace(**{**vars(zstd), "decompress": functools.partial(inflated, zstd.ZstdDecompressor)})
-    vars(rosbag2)["zstd"] = bounded
+    rosbag2.__dict__["zstd"] = bounded
 
 
 def inflated(decompressor: Callable[[], Any], content: bytes, *, most: int | None = None) -> bytes:
