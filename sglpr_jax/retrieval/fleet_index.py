@@ -4,8 +4,9 @@ A table is stored in a folder or in object storage, without a server. The answer
 rows in float32, and the distances of a few additional rows are recomputed in float64.
 """
 
+import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,8 @@ class FleetIndex:
             self._check_about(weights_hash)
 
     def __len__(self) -> int:
-        return 0 if self.table is None else self.table.count_rows()
+        with _intact(self.place):
+            return 0 if self.table is None else self.table.count_rows()
 
     @property
     def ids(self) -> list[str]:
@@ -159,9 +161,12 @@ class FleetIndex:
         """Returns the rows and descriptors of the nearest k places by LanceDB, without its approximate index."""
         search = self.table.search(query).distance_type("l2").bypass_vector_index()
         search = search.where(where, prefilter=True) if where else search
-        found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
-        vectors = found["descriptor"].combine_chunks().flatten().to_numpy()
-        return found["row"].to_numpy(), vectors.reshape(-1, self.width)
+        with _intact(self.place):
+            found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
+            rows, vectors = found["row"].to_numpy(), found["descriptor"].combine_chunks().flatten().to_numpy()
+            if (rows < 0).any() or len(np.unique(rows)) < len(rows) or not np.isfinite(vectors).all():
+                raise ValueError("rows that are no places")
+            return rows, vectors.reshape(-1, self.width)
 
     def _arrow(self, first: int, ids: list[str], columns: dict[str, np.ndarray]) -> Any:
         """Returns rows as an Arrow table for LanceDB. The schema contains the metadata of the index."""
@@ -181,14 +186,16 @@ class FleetIndex:
     def _check_about(self, weights_hash: str | None) -> None:
         """Reads the metadata and columns of the table. Raises ValueError if they are invalid or contradict the
         arguments."""
-        text = (self.table.schema.metadata or {}).get(b"about", b"null")
+        with _intact(self.place):
+            schema = self.table.schema
+        text = (schema.metadata or {}).get(b"about", b"null")
         about = parse_json(text, source=f"{self.place}, `about`")
         with naming(self.place):
             check_about(about, ABOUT, format=FORMAT)
             if about["width"] != self.width:
                 raise ValueError(f"expected descriptors of {self.width} numbers, found {about['width']}")
             check_weights(about["weights_hash"], weights_hash)
-            _check_types({field.name: str(field.type) for field in self.table.schema}, self.width)
+            _check_types({field.name: str(field.type) for field in schema}, self.width)
         self.weights_hash = about["weights_hash"]
 
     def _names(self) -> list[str]:
@@ -197,8 +204,13 @@ class FleetIndex:
     def _column(self, name: str) -> np.ndarray:
         if self.table is None:
             return np.empty(0)
-        found = self.table.search().select(["row", name]).limit(None).to_arrow()
-        return found[name].to_numpy()[np.argsort(found["row"].to_numpy())]
+        with _intact(self.place):
+            found = self.table.search().select(["row", name]).limit(None).to_arrow()
+            rows, values = found["row"].to_numpy(), found[name]
+            order = np.argsort(rows)
+            if values.null_count or not np.array_equal(rows[order], np.arange(len(rows))):
+                raise ValueError(f"places without a row or {name}")
+            return values.to_numpy()[order]
 
 
 _STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"}
@@ -242,7 +254,14 @@ def _open(connection: Any, place: str) -> Any:
     """Returns the table, or None if it does not exist yet."""
     if TABLE not in connection.list_tables().tables:
         return None
-    try:
+    with _intact(place):
         return connection.open_table(TABLE)
-    except Exception as error:  # LanceDB raises many types of errors for damaged files.
+
+
+@contextlib.contextmanager
+def _intact(place: str) -> Iterator[None]:
+    """Convert exceptions of LanceDB to a ValueError that names the index. It raises many types for damaged files."""
+    try:
+        yield
+    except Exception as error:
         raise ValueError(f"{place}: expected an index of LanceDB, found a broken one ({in_short(error)})") from error

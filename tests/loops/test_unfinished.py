@@ -5,7 +5,6 @@ import functools
 import os
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from bags import CLOUD, FILES, write_bag
@@ -16,14 +15,13 @@ import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find, joint, unfinished
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.probability import Curve, LoopModel
 from sglpr_jax.loops.registration import Registration
-from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
+
+from .kept import WANTED, fake_finder, keep, recalled
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
@@ -213,50 +211,6 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     found = find_loops(read, params, **options)
     assert found.whole and all(loop.overlap == 0.9 for loop in found.loops)
     assert len(asked) == 2 * len(found.loops)  # for their registration: no scan was looked at again
-
-
-def finder_of(**stored) -> CandidateFinder:
-    """A finder without a network."""
-    finder = object.__new__(CandidateFinder)
-    vars(finder).update(stored)
-    return finder
-
-
-def fake_finder(seed: int = 0, frames: int = 5) -> CandidateFinder:
-    """What a finder stores of some frames, drawn at random; the second frame has no scan."""
-    draw, index = np.random.default_rng(seed), Index.empty(4, weights_hash="w")
-    index.add(draw.normal(size=(frames, 4)))
-    images = list(draw.integers(0, 255, (frames, 6, 6), np.uint8))
-    links = [None, *(Peak(*draw.normal(size=6)) for _ in range(frames - 1))]
-    return finder_of(index=index, images=images, missing=[1], links=links)
-
-
-def fake_candidates(seed: int = 0) -> list[Candidate]:
-    draw = np.random.default_rng(seed)
-    x, y, yaw = map(jnp.asarray, draw.normal(size=3))
-    evidence = Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields))))
-    return [Candidate(4, 1, Alignment(x, y, yaw, jnp.eye(3), jnp.array(0.5), jnp.array(0.4)), evidence)]
-
-
-def recalled(folder: Path, wanted: dict) -> list:
-    """The frames that a checkpoint directory gives back."""
-    finder, found = finder_of(index=Index.empty(4, weights_hash="w")), []
-
-    def add(seen, compared):
-        found.append((seen, compared))
-        finder.index.add(np.zeros(4) if seen is None else seen.descriptor)
-
-    kept = unfinished.Unfinished.opened(folder, wanted)
-    kept.recall(finder, None, add, missing=True)
-    return found
-
-
-WANTED = {"format": unfinished.FORMAT, "name": "08", "recording": "a"}
-
-
-def keep(folder: Path, wanted: dict, seed: int = 0) -> Path:
-    unfinished.Unfinished.opened(folder, wanted).keep(fake_finder(seed), fake_candidates(seed), all=True)
-    return folder / "000000.safetensors"
 
 
 def test_frames_come_back_as_they_were_kept(tmp_path):
