@@ -117,7 +117,11 @@ ROADS = (
         UNFINISHED,
         frames_of,
         same=lambda found, files: found in (frames()[:0], frames()[:5], frames()),
-        damages=lambda file: {**SAFE, "array": either(another_array)} if file.endswith(".safetensors") else {**BYTES, "value": change_value},
+        damages=lambda file: (
+            {**SAFE, "array": either(another_array)}
+            if file.endswith(".safetensors")
+            else {**BYTES, "value": change_value}
+        ),
     ),
     FolderRoad(
         "checkpoints",

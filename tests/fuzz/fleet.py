@@ -8,7 +8,7 @@ import numpy as np
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 
 from .continued import files_of
-from .road import DESCRIPTORS, POSITIONS, TIMES, N, FolderRoad
+from .road import DESCRIPTORS, POSITIONS, TIMES, FolderRoad, N
 
 
 def fill(folder: Path) -> None:
