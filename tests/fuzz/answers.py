@@ -105,7 +105,7 @@ ROADS = (
         scores,
         lambda found, content: found == scores_said(content),
         {**NPZ, "about": change_about},
-        cost=10,
+        cost=3,
     ),
     Road(
         "relocalize",
@@ -114,7 +114,7 @@ ROADS = (
         relocated,
         lambda found, content: found == relocated_whole(),
         SAFE,
-        cost=5,
+        cost=3,
         slow=True,
     ),
     Road(

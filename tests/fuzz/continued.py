@@ -12,7 +12,7 @@ from loops.kept import WANTED, fake_candidates, fake_finder, recalled
 from recordings import of_scans
 
 from sglpr_jax.data.corruption.corruptions import CLEAN
-from sglpr_jax.loops.unfinished import Unfinished
+from sglpr_jax.loops.unfinished import ENDING, Unfinished
 from sglpr_jax.methods.method import ScanMethod
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.reuse import SETTINGS, _settings, embed_or_reuse
@@ -20,7 +20,7 @@ from sglpr_jax.training.checkpoint import Checkpoints
 from sglpr_jax.training.state import TrainState, new_state
 
 from .archives import ABOUT, ARRAYS, IDS, NPZ, change_about, double_id
-from .damage import BYTES
+from .damage import BYTES, Damage
 from .places import SAFE, another_array, either, written
 from .road import DESCRIPTORS, POSITIONS, TIMES, FolderRoad, N, Road, plain
 from .run_files import RUN, change_value
@@ -59,6 +59,11 @@ def frames() -> Any:
     with tempfile.TemporaryDirectory() as folder:
         stop_twice(Path(folder))
         return frames_of(Path(folder))
+
+
+def unfinished_damages(file: str) -> Mapping[str, Damage]:
+    """Damages of a file of frames, or of the settings. Frames of a damaged file are found again."""
+    return {**SAFE, "array": either(another_array)} if file.endswith(ENDING) else {**BYTES, "value": change_value}
 
 
 def save_twice(folder: Path) -> None:
@@ -117,11 +122,7 @@ ROADS = (
         UNFINISHED,
         frames_of,
         same=lambda found, files: found in (frames()[:0], frames()[:5], frames()),
-        damages=lambda file: (
-            {**SAFE, "array": either(another_array)}
-            if file.endswith(".safetensors")
-            else {**BYTES, "value": change_value}
-        ),
+        damages=unfinished_damages,
     ),
     FolderRoad(
         "checkpoints",

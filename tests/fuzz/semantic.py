@@ -59,7 +59,7 @@ ROADS = (
         segmented,
         same=lambda found, files: found == said_maps(files),
         damages=lambda file: BYTES,
-        cost=20,
+        cost=10,
         slow=True,
     ),
 )
