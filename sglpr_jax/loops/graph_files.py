@@ -253,13 +253,14 @@ def _from_json(line: bytes, where: str) -> Loop:
             raise ValueError(f"frames {query}, {match} and probability {value['probability']}")
         if not all(type(share) in (int, float) for share in shares):
             raise ValueError(f"probability and overlap {shares}")
+        shares = [float(share) for share in shares]  # whole numbers of any size
         pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
         if not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
             raise ValueError(f"an invalid pose: {pose.tolist()}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
     _check_loop(query, match, shares, where)
-    return Loop(query, match, pose, covariance, value["probability"], value["overlap"])
+    return Loop(query, match, pose, covariance, shares[0], *shares[1:])
 
 
 def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:

@@ -95,11 +95,12 @@ def _settings(method: Method, recording: Recording, corruption: Corruption, seed
 
 def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
     file = DescriptorFile.load(path)
-    found = file.config.get(SETTINGS, {})
-    for name, value in wanted.items():
-        if found.get(name) != value:
+    stored = file.config.get(SETTINGS)
+    found = stored if isinstance(stored, dict) else {}
+    for name in {**wanted, **found}:
+        if found.get(name) != wanted.get(name):
             raise ValueError(
-                f"{path}: expected descriptors made with {name} {json_in_short(value)}, found "
+                f"{path}: expected descriptors made with {name} {json_in_short(wanted.get(name))}, found "
                 f"{json_in_short(found.get(name))}; choose another --out, or delete the file"
             )
     return file

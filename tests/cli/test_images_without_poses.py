@@ -24,7 +24,9 @@ def test_descriptors_are_written_and_scores_ask_for_poses(command, pictures, tmp
     ended = command("embed", "--method", "polar-fft", "--data", pictures, "--out", out)
     assert ended.status == 0, ended.error
     assert "3 images" in ended.error and "poses: none" in ended.error
-    assert_one_line_error(command("evaluate", out), "06.npz: expected positions to score against, found", "without poses")
+    assert_one_line_error(
+        command("evaluate", out), "06.npz: expected positions to score against, found", "without poses"
+    )
 
 
 @pytest.mark.slow

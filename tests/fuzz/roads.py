@@ -16,6 +16,7 @@ from . import (
 from .road import FolderRoad, Road
 
 KINDS = (archives, cloud_files, places, rows, run_files, scans_and_images, tables, continued, answers, fleet, semantic)
-
 ROADS: dict[str, Road | FolderRoad] = {road.name: road for kind in KINDS for road in kind.ROADS}
 """By its name."""
+FILE_ROADS = {name: road for name, road in ROADS.items() if isinstance(road, Road)}
+"""Those that read one file."""

@@ -15,7 +15,7 @@ import pytest
 from .found import FOUND
 from .outcome import ALLOWED, Outcome, outcome
 from .road import Case, FolderRoad, Road
-from .roads import ROADS
+from .roads import FILE_ROADS, ROADS
 
 CASES = int(os.environ.get("SGLPR_FUZZ_CASES", "2000"))
 SEED = os.environ.get("SGLPR_FUZZ_SEED", "0")
@@ -43,7 +43,7 @@ def test_the_whole_file_is_right(road):
 
 @pytest.mark.parametrize(("name", "damaged"), FOUND)
 def test_what_was_found_stays_found(name, damaged):
-    road = ROADS[name]
+    road = FILE_ROADS[name]
     found = try_case(road, Case("found", road.file, damaged, road.beside))
     assert found.kind == "refused", found.text
 
