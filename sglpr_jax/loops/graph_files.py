@@ -196,7 +196,9 @@ def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4
 
 
 def _quaternions(values: Float[np.ndarray, "n 4"], where: Path | str) -> Float[np.ndarray, "n 4"]:
-    wrong = np.flatnonzero(np.abs(np.linalg.norm(values, axis=1) - 1) > 0.01)
+    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
+        lengths = np.linalg.norm(values, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1) > 0.01)
     if wrong.size:
         raise ValueError(f"{where}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
     return values

@@ -98,7 +98,7 @@ def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
     stored = file.config.get(SETTINGS)
     found = stored if isinstance(stored, dict) else {}
     for name in {**wanted, **found}:
-        if found.get(name) != wanted.get(name):
+        if name not in found or name not in wanted or found[name] != wanted[name]:
             raise ValueError(
                 f"{path}: expected descriptors made with {name} {json_in_short(wanted.get(name))}, found "
                 f"{json_in_short(found.get(name))}; choose another --out, or delete the file"

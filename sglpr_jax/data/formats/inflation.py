@@ -2,12 +2,16 @@
 
 import bz2
 import functools
+import os
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 MOST_BYTES = 2**28
 """Maximum size of a chunk or a message: 256 MiB. Recorders write chunks of 4 MiB, or of a single larger message."""
+
+INFLATION = 64
+"""Maximum size of an inflated file, as a multiple of its compressed size, if it is larger than `MOST_BYTES`."""
 
 
 @functools.cache
@@ -25,8 +29,26 @@ def bound_bags() -> None:
     storage_mcap.DECOMPRESSORS.update(
         lz4=functools.partial(_declared, LZ4FrameDecompressor), zstd=functools.partial(_declared, zstd.ZstdDecompressor)
     )
-    bounded = SimpleNamespace(**{**vars(zstd), "decompress": functools.partial(inflated, zstd.ZstdDecompressor)})
-    rosbag2.__dict__["zstd"] = bounded
+    bounded = {"decompress": functools.partial(inflated, zstd.ZstdDecompressor), "open": _bounded_file(zstd)}
+    rosbag2.__dict__["zstd"] = SimpleNamespace(**{**vars(zstd), **bounded})
+
+
+def _bounded_file(zstd: Any) -> type:
+    """Class of an open zstd file that inflates to at most `INFLATION` times its size, or `MOST_BYTES`."""
+
+    class BoundedFile(zstd.ZstdFile):
+        def __init__(self, file: Any, mode: str):
+            super().__init__(file, mode)
+            self._left = max(MOST_BYTES, INFLATION * os.fstat(file.fileno()).st_size)
+
+        def read(self, size: int | None = -1, /) -> bytes:
+            part = super().read(size)
+            self._left -= len(part)
+            if self._left < 0:
+                raise ValueError(f"expected at most {INFLATION} times the size of a compressed file, found more")
+            return part
+
+    return BoundedFile
 
 
 def inflated(decompressor: Callable[[], Any], content: bytes, *, most: int | None = None) -> bytes:
