@@ -248,9 +248,7 @@ def test_parts_that_inflate_beyond_the_bound_are_refused(tmp_path, name, monkeyp
     monkeypatch.setattr(inflation, "MOST_BYTES", 100)
     monkeypatch.setattr(inflation, "INFLATION", 1)
     most = "1 times the size" if "files" in name else "100 "
-    with pytest.raises(
-        ValueError, match=rf"expected an intact ROS bag, found .*at most {most}"
-    ):
+    with pytest.raises(ValueError, match=rf"expected an intact ROS bag, found .*at most {most}"):
         open_recording(path)
 
 
