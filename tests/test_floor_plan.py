@@ -19,6 +19,7 @@ FLOORS = (
         "losses",
         "metrics",
         "names",
+        "numpy_files",
         "poses",
         "progress",
         "revisits",
