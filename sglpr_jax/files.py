@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, reading of JSON and arrays, and errors that name their file."""
+"""Atomic writing of files and folders, reading of JSON, and errors that name their file."""
 
 import contextlib
 import errno
@@ -11,12 +11,9 @@ import shutil
 import tempfile
 import time
 import uuid
-import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 try:
     import fcntl
@@ -33,6 +30,10 @@ _HIDDEN = re.compile(r"\.[0-9a-f]{32}\.tmp$")
 
 class WriteError(OSError):
     """A file cannot be written. The message names it."""
+
+    def __init__(self, path: Path, reason: str):
+        super().__init__(f"{path}: cannot be written: {reason}")
+        self.path, self.reason = path, reason
 
 
 @contextlib.contextmanager
@@ -54,19 +55,26 @@ def replacing(path: Path, *, keep: bool = False) -> Iterator[Path]:
       with replacing(path) as temporary:
           temporary.write_bytes(content)
     """
+    with _temporary(path) as temporary:
+        yield temporary
+        _put(temporary, path, keep=keep)
+
+
+@contextlib.contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """A hidden path beside `path`. At the end of the block, what is left there is removed."""
     temporary = _hidden(path)
     try:
         with writing(path, temporary, *path.parents):
             path.parent.mkdir(parents=True, exist_ok=True)
             _sweep(path.parent.resolve())
             yield temporary
-            _put(temporary, path, keep=keep)
     finally:
         _remove(temporary)
 
 
 def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> list[Path]:
-    """Write several files of a folder, completely or not at all.
+    """Write several files of a folder. Every file is complete before the first one replaces its earlier version.
 
     Arguments:
       folder: Folder of the files. It is created if needed.
@@ -76,12 +84,29 @@ def write_all(folder: Path, files: Mapping[str, Callable[[Path], object]]) -> li
       The paths of the files.
 
     Raises:
-      WriteError: If a file cannot be written. All files in the folder then stay as they were.
+      WriteError: If a file cannot be written. All files in the folder then stay as they were. If only a replacement
+        fails, the message names the files that are new and those that stay.
     """
+    written: dict[Path, Path] = {}
     with contextlib.ExitStack() as opened:
         for name, write in files.items():
-            write(opened.enter_context(replacing(folder / name)))
-    return [folder / name for name in files]
+            temporary = opened.enter_context(_temporary(folder / name))
+            write(temporary)
+            written[folder / name] = temporary
+        _put_all(written)
+    return list(written)
+
+
+def _put_all(written: Mapping[Path, Path]) -> None:
+    """Rename temporary files to their final names. Raises WriteError with the files that stay if one cannot be."""
+    paths = list(written)
+    for at, path in enumerate(paths):
+        try:
+            _put(written[path], path, keep=False)
+        except OSError as error:
+            new, old = (", ".join(one.name for one in some) or "none" for some in (paths[:at], paths[at:]))
+            reason = f"{error.strerror or error}; new files: {new}; files that stay as they were: {old}"
+            raise WriteError(path, reason) from error
 
 
 def check_holds_only(folder: Path, names: Collection[str]) -> None:
@@ -181,29 +206,13 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
-    """Read every array of an .npz file, without pickle.
-
-    Raises:
-      FileNotFoundError: If the file does not exist.
-      ValueError: If it is another kind of file, or damaged. Both messages name the file and what was `expected`.
-    """
-    expected = f"{path}: expected {expected}"
-    if not path.is_file():
-        raise FileNotFoundError(f"{expected}, found no file")
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{expected}, found {path.stat().st_size} bytes that are not a complete .npz archive")
+@contextlib.contextmanager
+def naming(source: Path | str) -> Iterator[None]:
+    """Put the name of a file before the message of a ValueError of the block."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except MemoryError as error:  # the header gives a size beyond the memory
-        raise ValueError(f"{expected}, found a broken one: an array larger than the memory") from error
-    except Exception as error:  # zip, zlib and numpy raise many types of errors
-        raise ValueError(f"{expected}, found a broken one: {in_short(error)}") from error
-    strange = next((name for name, array in arrays.items() if not isinstance(array, np.ndarray)), None)
-    if strange is not None:  # numpy returns other files as bytes
-        raise ValueError(f"{expected}, found a file {strange!r} that is not an array")
-    return arrays
+        yield
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
 
 
 def in_short(error: Exception, *, most: int = 100) -> str:
@@ -225,12 +234,14 @@ def writing(path: Path, *others: Path) -> Iterator[None]:
     """Raise WriteError for an OSError of the block that names no file, e.g. of a full disk, or one of `others`."""
     try:
         yield
-    except WriteError:
-        raise
+    except WriteError as error:
+        if error.path not in others:
+            raise
+        raise WriteError(path, error.reason) from error
     except OSError as error:
         if error.filename is not None and Path(str(error.filename)) not in others:
             raise
-        raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise WriteError(path, error.strerror or str(error)) from error
 
 
 def check_writable(path: Path) -> None:

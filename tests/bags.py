@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -13,6 +14,7 @@ LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflec
 LIVOX = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 )
+CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
 """What a bag of each kind is called."""
@@ -52,6 +54,23 @@ def transforms(kind: str, seconds: float, found: Iterable[tuple[str, str, Any, A
             )
             for frame, child, at, turned in found
         ]
+    )
+
+
+def cloud(kind: str, seconds: float, points: np.ndarray) -> Any:
+    """A PointCloud2 of x, y, z at this time."""
+    store, points = typestore(kind).types, np.ascontiguousarray(points, "<f4")
+    field = store["sensor_msgs/msg/PointField"]
+    return store[CLOUD](
+        header=header(kind, seconds, "lidar"),
+        height=1,
+        width=len(points),
+        fields=[field(name=axis, offset=4 * at, datatype=7, count=1) for at, axis in enumerate("xyz")],
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(points),
+        data=points.view(np.uint8).reshape(-1),
+        is_dense=True,
     )
 
 

@@ -200,6 +200,28 @@ def test_several_files_are_written_together_or_not_at_all(tmp_path):
     assert names(tmp_path) == ["new"]
 
 
+def test_of_several_files_whose_renaming_fails_the_error_names_what_is_new(tmp_path):
+    """A folder cannot be replaced by a file."""
+    (tmp_path / "b" / "mine").mkdir(parents=True)
+    for name in "ac":
+        (tmp_path / name).write_text("old")
+    found = rf"{tmp_path}/b: cannot be written: .*; new files: a; files that stay as they were: b, c$"
+    with pytest.raises(WriteError, match=found):
+        write_all(tmp_path, {name: lambda path: path.write_text("new") for name in "abc"})
+    assert names(tmp_path) == ["a", "b", "c"]
+    assert (tmp_path / "a").read_text() == "new" and (tmp_path / "c").read_text() == "old"
+
+
+def test_an_error_below_a_temporary_path_names_the_final_one(tmp_path, monkeypatch):
+    def full(path, content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(WriteError, match=rf"^{tmp_path}/a: cannot be written: No space left on device$"):
+        write_all(tmp_path, {"a": lambda path: write_text(path, "x")})
+    assert names(tmp_path) == []
+
+
 def test_json_comes_back(tmp_path):
     write_json(tmp_path / "a.json", {"a": [1, None, "b"]})
     assert read_json(tmp_path / "a.json") == {"a": [1, None, "b"]}

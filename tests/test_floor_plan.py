@@ -20,6 +20,7 @@ FLOORS = (
         "losses",
         "metrics",
         "names",
+        "numpy_files",
         "poses",
         "progress",
         "revisits",

@@ -119,7 +119,7 @@ def _check(command: LoopsCommand) -> None:
 
 
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
-    from sglpr_jax.evaluation.page.of_loops import write_loops_page
+    from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
     from sglpr_jax.loops.explanation import why_few_queries, why_none
     from sglpr_jax.loops.find import find_loops
     from sglpr_jax.loops.folder import write_found
@@ -151,8 +151,9 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     if command.degenerate == "drop":
         found = found.without_degenerate()
     corrected = optimize_trajectory(found) if command.optimize else None
-    paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses)
-    paths += write_loops_page(found, command.out, optimized=corrected), record_command(command, command.out)
+    page = {PAGE: loops_page(found, optimized=corrected)}
+    paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses, texts=page)
+    paths.append(record_command(command, command.out))
     print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
     if corrected is not None:
         print(corrected)

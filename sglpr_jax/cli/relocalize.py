@@ -12,8 +12,8 @@ from rich.table import Table
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
-from sglpr_jax.fields import CountOrNone, Size
-from sglpr_jax.loops.choices import CANDIDATES
+from sglpr_jax.fields import CountOrNone
+from sglpr_jax.loops.choices import CANDIDATES, PlaceCount
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
 
@@ -44,7 +44,7 @@ class RelocalizeCommand:
     """Sequence of the recording. May be omitted if there is only one."""
     out: Path | None = None
     """JSON file for the answers: place, probability, world_from_query (4 x 4), covariance."""
-    candidates: Size = CANDIDATES
+    candidates: PlaceCount = CANDIDATES
     """Maximum number of answers. The scan is compared with this many places of the map. Answers more than 20 m apart
     exclude each other, and their probabilities add up to 1 at most."""
     weights: str = DEFAULT_WEIGHTS

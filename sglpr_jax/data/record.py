@@ -11,6 +11,7 @@ from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.label_images import read_label_image
 from sglpr_jax.data.formats.scan_files import read_labels, read_points_and_lasers
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.files import naming
 from sglpr_jax.labels import to_classes
 
 
@@ -63,10 +64,8 @@ class Record:
         """
         if self.labels is None:
             return None
-        try:
+        with naming(self.labels_file or self.name):
             return to_classes(self.labels, categories=categories)
-        except ValueError as error:
-            raise ValueError(f"{self.labels_file or self.name}: {error}") from error
 
 
 ReadRecord = Callable[[Path, Path | None, bool], Record]

@@ -32,7 +32,7 @@ class Recording:
     pose_source: str | None
     """Source of the positions, or None."""
     paths: tuple[Path, ...]
-    """Files of the scans or images."""
+    """Files of the scans or images. The scans of a bag have names instead, and the bag is in `containers`."""
     read: ReadRecord
     """Function that reads a record from its files."""
     label_paths: tuple[Path | None, ...] = ()
@@ -49,6 +49,8 @@ class Recording:
     """What the reader found, in words: the format of the scans and the ignored files."""
     rows: Int[np.ndarray, " n"] | None = None
     """Row of each scan in the whole recording, if scans are left out. None means that no scan is left out."""
+    containers: tuple[Path, ...] = ()
+    """Files that contain all scans, such as those of a bag. Empty if each scan is a file."""
 
     def __post_init__(self):
         """Raise ValueError if two scans have the same id, or if a field does not have one entry per scan."""

@@ -1,6 +1,7 @@
 """Times of scans and poses: unit, order, and row numbers that are not times."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +18,10 @@ SLOWEST_S = 10.0
 """Maximum median step of scans and poses, in seconds: keyframes at 0.1 Hz."""
 FASTEST_S = 0.005
 """Minimum mean step of scans, in seconds: twice the rate of the fastest LiDARs (100 Hz)."""
+FACTORS = (1e3, 1e6, 1e9)
+"""Ratios of two units."""
+SAME_FACTOR = 3.0
+"""Maximum deviation from one of `FACTORS`, as a ratio. Clocks that start at zero grow by more at a change."""
 PROOF = 5
 """Number of steps from which the unit is judged. Fewer steps prove nothing."""
 EPOCH = 1e8
@@ -59,6 +64,8 @@ def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
 
     With `numbers`, whole numbers count as numbers of frames. Headers of bags have a unit and may have whole seconds.
     """
+    if changed := unit_change(times):
+        return changed.found
     if len(times) and abs(times[-1]) > LATEST_S:
         return f"{times[-1]:g}, after the year 5000"
     steps = np.diff(times)
@@ -75,13 +82,52 @@ def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
     return ""
 
 
+class UnitChange(NamedTuple):
+    """Row at which the times of a file change to a smaller unit."""
+
+    row: int
+    """Row, from 0."""
+    found: str
+    """Description for messages."""
+
+
+def unit_change(times: Float[np.ndarray, " n"]) -> UnitChange | None:
+    """Find a row from which both the times and their steps are about 1e3, 1e6 or 1e9 times as large as before.
+
+    A pause or another rate alone is no change of the unit. Two steps on either side are required.
+    """
+    before = np.where(times[:-1] > 0, times[:-1], np.inf)
+    if not len(before):
+        return None
+    row = int(np.argmax(times[1:] / before)) + 1
+    usual = [float(np.median(steps)) for steps in map(_steps, (times[:row], times[row:])) if len(steps) > 1]
+    if len(usual) < 2:
+        return None
+    grown = np.array([times[row] / before[row - 1], usual[1] / usual[0]])
+    near = (
+        factor for factor in FACTORS if (grown > factor / SAME_FACTOR).all() and (grown < factor * SAME_FACTOR).all()
+    )
+    factor = next(near, None)
+    if factor is None:
+        return None
+    return UnitChange(row, f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large")
+
+
+def _steps(times: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """Positive steps between consecutive times."""
+    steps = np.diff(times)
+    return steps[steps > 0]
+
+
 def counts_rows(times: Float[np.ndarray, " n"]) -> bool:
     """Whether times merely count the rows: 0, 1, 2, ... or 1, 2, 3, ..."""
     return bool(len(times) and times[0] in (0, 1) and (np.diff(times) == 1).all())
 
 
 def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
-    """Raise ValueError if a time in seconds exceeds `LATEST_S` or is smaller than the previous one."""
+    """Raise ValueError if a time in seconds exceeds `LATEST_S`, is smaller than the previous one, or if the unit
+    changes."""
+    check_unit(times, source=source)
     late = np.flatnonzero(np.abs(times) > LATEST_S)
     if late.size:
         raise ValueError(
@@ -92,6 +138,12 @@ def check_order(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
     if backwards.size:
         row = int(backwards[0]) + 2
         raise ValueError(f"{source}, row {row}: expected a time >= {times[row - 2]}, found {times[row - 1]}")
+
+
+def check_unit(times: Float[np.ndarray, " n"], *, source: Path | str) -> None:
+    """Raise ValueError if the unit of times changes between two rows (`unit_change`)."""
+    if changed := unit_change(times):
+        raise ValueError(f"{source}, row {changed.row + 1}: expected times in one unit, found {changed.found}")
 
 
 def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:

@@ -21,6 +21,7 @@ from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
 from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import chosen_protocols
+from sglpr_jax.files import naming
 from sglpr_jax.names import printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
@@ -165,11 +166,9 @@ def evaluate_methods(
     chosen = chosen_protocols(source, protocols)
     results = {}
     for name, of_one in methods.items():
-        try:
+        with naming(name):
             check_agreement(source, of_one)
             results[name] = score(of_one, chosen_protocols(of_one, chosen))
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
     return Evaluation(
         title=_title(source, file),
         about=_about(source, file),

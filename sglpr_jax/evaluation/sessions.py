@@ -16,6 +16,7 @@ from sglpr_jax.evaluation.protocols.choice import ALL
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
 from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json
+from sglpr_jax.files import naming
 from sglpr_jax.names import printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
@@ -129,10 +130,8 @@ def evaluate_session_files(
     """Run `evaluate_sessions` on paths of descriptor files. Raises ValueError for other kinds of files, too."""
     files = [_read(path) for path in (database, *queries)]
     for path, file in zip(queries, files[1:], strict=True):
-        try:
+        with naming(path):
             check_same_method(files[0], file)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
     found = evaluate_sessions(files[0], files[1:], names, published=published)
     made_with = {"files": [str(path) for path in queries], "database": str(database)}
     return replace(found, about=f"{database}: {found.about}", made_with=made_with)

@@ -3,7 +3,9 @@
 They are a separate module, so that `--help` does not import the rest.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
+
+from sglpr_jax.fields import Bounds
 
 OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
 """Format of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum" has time,
@@ -15,6 +17,9 @@ MIN_PROBABILITY = 0.99
 """Minimum probability of a returned loop."""
 SPACING_M = 1.0
 """Minimum distance of consecutive places of a drive in a map, in metres."""
+PlaceCount = Annotated[int, Bounds(1, 1000)]
+PlaceCountOrNone = Annotated[int, Bounds(0, 1000)]
+"""Number of places whose images are compared with a query. Each takes milliseconds."""
 CANDIDATES = 5
 """Number of nearest places of a map that a query is compared with."""
 DRIFT_PERCENT = 1.0

@@ -4,7 +4,8 @@ import dataclasses
 import math
 
 from sglpr_jax.data.density_grid import RESOLUTION_M
-from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY
+from sglpr_jax.fields import check_fields
+from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, PlaceCount, PlaceCountOrNone
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
 
@@ -71,9 +72,9 @@ class MotionConfig:
 class RivalConfig:
     """Selection of the rivals of a match."""
 
-    of_query: int = 6
+    of_query: PlaceCountOrNone = 6
     """Maximum number of rivals before the query."""
-    of_match: int = 4
+    of_match: PlaceCountOrNone = 4
     """Maximum number of rivals around the match, half before and half after it."""
     age: tuple[float, float] = (0.27, 0.97)
     """Minimum and maximum time between a rival and the query or the match, without standing time, as fractions of the
@@ -86,14 +87,18 @@ class RivalConfig:
     overlap_m: float = 15.0
     """Distance below which two scans overlap, in metres."""
 
+    def __post_init__(self):
+        """Raises ValueError if a field has an invalid value."""
+        check_fields(self)
+
 
 @dataclasses.dataclass(frozen=True)
 class CandidateConfig:
     """Selection of candidate matches and of their rivals."""
 
-    candidates: int = 3
+    candidates: PlaceCount = 3
     """Number of nearest descriptors whose images are compared."""
-    elsewhere: int = 2
+    elsewhere: PlaceCountOrNone = 2
     """Number of nearest descriptors from other times (`rivals.age`) whose images are compared. The best fit of all
     compared frames is the candidate."""
     exclude_s: float = EXCLUDED_S
@@ -111,6 +116,10 @@ class CandidateConfig:
     """Minimum correlation of a candidate that is compared with rivals. Candidates below it are not loops."""
     rivals: RivalConfig = RivalConfig()
     motion: MotionConfig = MotionConfig()
+
+    def __post_init__(self):
+        """Raises ValueError if a field has an invalid value."""
+        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)

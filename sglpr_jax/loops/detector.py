@@ -12,7 +12,7 @@ from scipy.special import expit, logit
 
 from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.record import Record
-from sglpr_jax.data.times import PROOF, doubt
+from sglpr_jax.data.times import PROOF, doubt, unit_change
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
 from sglpr_jax.loops.config import DetectorConfig
@@ -24,6 +24,9 @@ from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion, agree_in_order
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.models.params import Params
+
+RECENT = 8
+"""Number of latest times that are compared with a new one."""
 
 
 class LoopDetector:
@@ -106,12 +109,15 @@ class LoopDetector:
         return self.add_seen(self.finder.seen(record), time=seconds, odometry=pose)
 
     def _seconds(self, time: Any) -> float | None:
-        """Convert a time to seconds. With "auto", raises ValueError as soon as the steps show another unit."""
+        """Convert a time to seconds. Raises ValueError as soon as the steps show another unit than before or, with
+        "auto", than seconds."""
         seconds, before = given_time(time, unit=self.time_unit), self.finder.index.times
-        if seconds is None or isinstance(time, DATES) or self.time_unit != "auto" or len(self) > PROOF:
+        if seconds is None or isinstance(time, DATES):
             return seconds
-        clock = np.array([seconds]) if before is None else np.append(before, seconds)
-        if found := doubt(clock):
+        clock = np.array([seconds]) if before is None else np.append(before[-RECENT:], seconds)
+        if changed := unit_change(clock):
+            raise ValueError(f"frame {len(self)}: expected times in the unit of those before, found {changed.found}")
+        if self.time_unit == "auto" and len(self) <= PROOF and (found := doubt(clock)):
             raise ValueError(
                 f"frame {len(self)}: expected times in seconds, found {found}; state the unit with LoopDetector(..., "
                 "time_unit=...), or leave the times out"

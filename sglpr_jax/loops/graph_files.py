@@ -196,7 +196,9 @@ def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4
 
 
 def _quaternions(values: Float[np.ndarray, "n 4"], where: Path | str) -> Float[np.ndarray, "n 4"]:
-    wrong = np.flatnonzero(np.abs(np.linalg.norm(values, axis=1) - 1) > 0.01)
+    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
+        lengths = np.linalg.norm(values, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1) > 0.01)
     if wrong.size:
         raise ValueError(f"{where}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
     return values
@@ -253,13 +255,14 @@ def _from_json(line: bytes, where: str) -> Loop:
             raise ValueError(f"frames {query}, {match} and probability {value['probability']}")
         if not all(type(share) in (int, float) for share in shares):
             raise ValueError(f"probability and overlap {shares}")
+        shares = [float(share) for share in shares]  # whole numbers of any size
         pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
         if not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
             raise ValueError(f"an invalid pose: {pose.tolist()}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
     _check_loop(query, match, shares, where)
-    return Loop(query, match, pose, covariance, value["probability"], value["overlap"])
+    return Loop(query, match, pose, covariance, shares[0], *shares[1:])
 
 
 def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.files import replacing
+from sglpr_jax.files import naming, replacing
 from sglpr_jax.loops.given import given_poses
 from sglpr_jax.poses import ROTATION_TOLERANCE
 from sglpr_jax.retrieval.index import Index
@@ -33,10 +33,8 @@ def read_places(path: Path | str, *, weights_hash: str | None) -> tuple[Index, d
     left_out = [name for name in ARRAYS if name not in more]
     if left_out:
         raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
-    try:
+    with naming(path):
         _check(index, more)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return index, {name: more[name] for name in ARRAYS}
 
 

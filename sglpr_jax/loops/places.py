@@ -14,9 +14,10 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan
+from sglpr_jax.fields import check_value
 from sglpr_jax.loops.add_scans import add_scans
 from sglpr_jax.loops.candidates import CandidateFinder, Compared, Seen
-from sglpr_jax.loops.choices import CANDIDATES, SPACING_M
+from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import planar_loop
@@ -133,9 +134,11 @@ class PlaceMap:
           One pose for each of the nearest places, the most probable first. Empty if the scan is almost empty.
 
         Raises:
-          ValueError: If other weights made the map, or if an array has another shape.
+          ValueError: If other weights made the map, if an array has another shape, or if `candidates` is not from 1 to
+            1000.
           TypeError: If an argument is not parameters, a record or an array.
         """
+        check_value(candidates, PlaceCount, "candidates")
         finder = CandidateFinder(params)
         seen = finder.seen(given_record(record, mounting=self.mounting() if len(self) else None))
         image = seen.image

@@ -70,12 +70,25 @@ def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray 
 
 
 def _sample(recording: Recording) -> str:
-    """Hash the bytes of the first, the middle and the last scan file. Sizes and times of files may agree by chance."""
+    """Hash the bytes of the first, the middle and the last scan file, or the points of these scans of a bag.
+
+    Sizes and times of files may agree by chance.
+    """
     digest = hashlib.sha256()
     for row in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
         path = recording.paths[row]
-        digest.update(path.read_bytes() if path.is_file() else b"")
+        if path.is_file():
+            digest.update(path.read_bytes())
+        elif recording.containers:
+            digest.update(_points(recording, row))
     return digest.hexdigest()[:16]
+
+
+def _points(recording: Recording, row: int) -> bytes:
+    """Points of a scan as bytes. Empty if the scan cannot be read, which the search reports."""
+    with contextlib.suppress(ValueError, OSError):
+        return recording.points(row).tobytes()
+    return b""
 
 
 def _digest(values: np.ndarray | None) -> str | None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sglpr_jax.fields import field_types, is_config, read_value, require
+from sglpr_jax.files import naming
 from sglpr_jax.models.config import ModelConfig
 
 RENAMED = {"rings": "circular"}
@@ -24,10 +25,8 @@ def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
       ValueError: If a field is missing, unknown or invalid. The message names `source`, the field, and the expected and
         the found value.
     """
-    try:
+    with naming(source):
         return _read(ModelConfig, values, field="")
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
 
 
 def _read(annotation: Any, value: Any, field: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from sglpr_jax.files import in_short
+from sglpr_jax.files import in_short, naming
 from sglpr_jax.models.backbones.swin_config import SwinConfig
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
@@ -74,10 +74,8 @@ def import_swin_unet(params: Params, path: Path | str) -> Params:
       FileNotFoundError: If the file does not exist.
       ValueError: If the file is not a safetensors file, or if names or shapes differ from the model.
     """
-    try:
+    with naming(path):
         weights = from_torch_names(read_checkpoint(path), params.config)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return dataclasses.replace(params, weights={**params.weights, **weights})
 
 
@@ -90,10 +88,8 @@ def import_swin_t(params: Params, path: Path | str) -> SwinTImport:
       FileNotFoundError: If the file does not exist.
       ValueError: If the file is not a safetensors file, or if no weight fits.
     """
-    try:
+    with naming(path):
         return from_swin_t(read_checkpoint(path), params)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:

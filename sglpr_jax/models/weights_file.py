@@ -106,8 +106,9 @@ def _read_tensors(path: Path, config: ModelConfig, known: Collection[str]) -> di
                 if CHECKED_FOR in metadata:  # files of earlier versions have none
                     raise ValueError(f"{path}: expected the {CONFIG_FILE} that it was saved with, found a changed one")
             for name, part in about.items():
-                if part.get_dtype() not in STORED:
-                    raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)}, found {part.get_dtype()}")
+                if part.get_dtype() not in STORED or 0 in part.get_shape():
+                    found = f"{part.get_dtype()} {tuple(part.get_shape())}"
+                    raise ValueError(f"{path}: expected {name} as {' or '.join(STORED)} with values, found {found}")
             values = {name: file.get_tensor(name) for name in about}
     except (safetensors.SafetensorError, UnicodeDecodeError) as error:
         raise ValueError(

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.files import json_in_short, parse_json, read_arrays, replacing
+from sglpr_jax.files import json_in_short, naming, parse_json, replacing
+from sglpr_jax.numpy_files import read_arrays
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.schema import Column, check_about, check_columns
 
@@ -117,7 +118,7 @@ class DescriptorFile:
         if not set(REQUIRED) <= set(arrays):
             raise ValueError(f"{path}: expected arrays {', '.join(REQUIRED)}; found {', '.join(arrays) or 'none'}")
         about = _read_about(path, arrays["about"])
-        try:
+        with naming(path):
             return cls(
                 ids=_ids(arrays["ids"]),
                 descriptors=arrays["descriptors"],
@@ -125,8 +126,6 @@ class DescriptorFile:
                 times=arrays.get("times"),
                 **{name: about[name] for name in ABOUT},
             )
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
 
 
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
@@ -161,11 +160,9 @@ def _read_about(path: Path, text: np.ndarray) -> dict[str, Any]:
     about = parse_json(str(text), source=f"{path}, `about`")
     if isinstance(about, dict) and about.get("format") == FORMAT_1:
         about = {"distance": "l2", **about, "format": FORMAT}
-    try:
+    with naming(path):
         check_about(about, ABOUT, format=FORMAT)
         distance_function(about["distance"])
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return about
 
 

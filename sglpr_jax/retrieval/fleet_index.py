@@ -4,8 +4,9 @@ A table is stored in a folder or in object storage, without a server. The answer
 in float32, and the distances of a few additional rows are recomputed in float64.
 """
 
+import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.fields import Size
-from sglpr_jax.files import in_short, parse_json
+from sglpr_jax.files import in_short, naming, parse_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index_rows import (
     MOST,
@@ -76,7 +77,8 @@ class FleetIndex:
             self._check_about(weights_hash)
 
     def __len__(self) -> int:
-        return 0 if self.table is None else self.table.count_rows()
+        with _intact(self.place):
+            return 0 if self.table is None else self.table.count_rows()
 
     @property
     def ids(self) -> list[str]:
@@ -137,8 +139,9 @@ class FleetIndex:
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
         excluded = given_flags(exclude)
-        if excluded is not None or not 1 <= k <= MOST:
-            check_asked(k, excluded, places=len(self) if excluded is None else min(len(self), excluded.size))
+        places = MOST if excluded is None and 1 <= k <= MOST else len(self)  # counting the places of a table takes time
+        places = places if excluded is None else min(places, excluded.size)
+        check_asked(k, excluded, queries=len(queries), places=places)
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
         where = "" if excluded is None else _without(excluded)
@@ -159,9 +162,12 @@ class FleetIndex:
         """Return the rows and descriptors of the nearest k places by LanceDB, without its approximate index."""
         search = self.table.search(query).distance_type("l2").bypass_vector_index()
         search = search.where(where, prefilter=True) if where else search
-        found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
-        vectors = found["descriptor"].combine_chunks().flatten().to_numpy()
-        return found["row"].to_numpy(), vectors.reshape(-1, self.width)
+        with _intact(self.place):
+            found = search.select(["row", "descriptor", "_distance"]).limit(k).to_arrow()
+            rows, vectors = found["row"].to_numpy(), found["descriptor"].combine_chunks().flatten().to_numpy()
+            if (rows < 0).any() or len(np.unique(rows)) < len(rows) or not np.isfinite(vectors).all():
+                raise ValueError("rows that are no places")
+            return rows, vectors.reshape(-1, self.width)
 
     def _arrow(self, first: int, ids: list[str], columns: dict[str, np.ndarray]) -> Any:
         """Return rows as an Arrow table for LanceDB. The schema contains the metadata of the index."""
@@ -181,16 +187,16 @@ class FleetIndex:
     def _check_about(self, weights_hash: str | None) -> None:
         """Read the metadata and columns of the table. Raises ValueError if they are invalid or contradict the
         arguments."""
-        text = (self.table.schema.metadata or {}).get(b"about", b"null")
+        with _intact(self.place):
+            schema = self.table.schema
+        text = (schema.metadata or {}).get(b"about", b"null")
         about = parse_json(text, source=f"{self.place}, `about`")
-        try:
+        with naming(self.place):
             check_about(about, ABOUT, format=FORMAT)
             if about["width"] != self.width:
                 raise ValueError(f"expected descriptors of {self.width} numbers, found {about['width']}")
             check_weights(about["weights_hash"], weights_hash)
-            _check_types({field.name: str(field.type) for field in self.table.schema}, self.width)
-        except ValueError as error:
-            raise ValueError(f"{self.place}: {error}") from error
+            _check_types({field.name: str(field.type) for field in schema}, self.width)
         self.weights_hash = about["weights_hash"]
 
     def _names(self) -> list[str]:
@@ -199,8 +205,13 @@ class FleetIndex:
     def _column(self, name: str) -> np.ndarray:
         if self.table is None:
             return np.empty(0)
-        found = self.table.search().select(["row", name]).limit(None).to_arrow()
-        return found[name].to_numpy()[np.argsort(found["row"].to_numpy())]
+        with _intact(self.place):
+            found = self.table.search().select(["row", name]).limit(None).to_arrow()
+            rows, values = found["row"].to_numpy(), found[name]
+            order = np.argsort(rows)
+            if values.null_count or not np.array_equal(rows[order], np.arange(len(rows))):
+                raise ValueError(f"places without a row or {name}")
+            return values.to_numpy()[order]
 
 
 _STORED = {"descriptors": "descriptor", "times": "time", "positions": "position"}
@@ -244,7 +255,14 @@ def _open(connection: Any, place: str) -> Any:
     """Return the table, or None if it does not exist yet."""
     if TABLE not in connection.list_tables().tables:
         return None
-    try:
+    with _intact(place):
         return connection.open_table(TABLE)
-    except Exception as error:  # LanceDB raises many types of errors for damaged files.
+
+
+@contextlib.contextmanager
+def _intact(place: str) -> Iterator[None]:
+    """Convert exceptions of LanceDB to a ValueError that names the index. It raises many types for damaged files."""
+    try:
+        yield
+    except Exception as error:
         raise ValueError(f"{place}: expected an index of LanceDB, found a broken one ({in_short(error)})") from error

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.fields import Size
-from sglpr_jax.files import in_short, parse_json, replacing
+from sglpr_jax.files import in_short, naming, parse_json, replacing
 from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.retrieval.index_rows import (
@@ -38,6 +38,8 @@ FORMAT = "sglpr-jax index 1"
 """Format in every file."""
 ABOUT = {"width": Size, "weights_hash": str, "distance": str, "ids": list}
 """JSON values in the header of every file."""
+TYPES = ("F32", "F64", "U8", "I64")
+"""Types of arrays in every file, also of the additional arrays of `to_bytes`, in the terms of safetensors."""
 FIRST_ROOM = 256
 """Number of rows that an empty index has capacity for."""
 SPARE = 16
@@ -158,12 +160,13 @@ class Index:
             `k` places can be returned, the remaining rows are -1.
 
         Raises:
-          ValueError: If the descriptors have another width or come from other weights.
+          ValueError: If the descriptors have another width or come from other weights, or if the answers exceed the
+            bounds of `check_asked`.
         """
         check_weights(self.weights_hash, weights_hash)
         queries = checked_rows(descriptors, self.width)
         excluded = given_flags(exclude)
-        check_asked(k, excluded, places=len(self))
+        check_asked(k, excluded, queries=len(queries), places=len(self))
         allowed = np.ones(len(self), bool) if excluded is None else ~excluded
         rows = np.full((len(queries), k), -1)
         distances = np.full((len(queries), k), np.inf)
@@ -216,10 +219,8 @@ class Index:
         about, arrays = _read(path)
         columns = {name: arrays.pop(name) for name in COLUMNS if name in arrays}
         index = cls(about["width"], about["weights_hash"], about["distance"], about["ids"], columns)
-        try:
+        with naming(path):
             check_weights(index.weights_hash, weights_hash)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
         return index, arrays
 
     def _nearest(
@@ -274,20 +275,24 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
+            _check_types({name: file.get_slice(name).get_dtype() for name in file.keys()})  # noqa: SIM118
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except OSError:
-        raise
-    except Exception as error:  # safetensors raises many types of errors, also for types that numpy lacks
+    except (safetensors.SafetensorError, ValueError) as error:
         raise ValueError(f"{path}: expected an index, found an invalid safetensors file ({in_short(error)})") from error
     text = metadata.get("about", "")
     if metadata.get("sha256") != _checksum(text, arrays):
         raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")
     about = parse_json(text, source=f"{path}, `about`")
-    try:
+    with naming(path):
         _check_index(about, arrays)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return about, arrays
+
+
+def _check_types(found: Mapping[str, str]) -> None:
+    """Raises ValueError if an array has a type that no index has. Numpy lacks some types of safetensors."""
+    for name, dtype in found.items():
+        if dtype not in TYPES:
+            raise ValueError(f"array {name!r:.60} of type {dtype}")
 
 
 def _check_index(about: Any, arrays: dict[str, np.ndarray]) -> None:

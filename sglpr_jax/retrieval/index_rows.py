@@ -11,6 +11,8 @@ from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 MOST = 2**20
 """Maximum number of answers to a query, unless an index has more places."""
+MOST_ANSWERS = 2**26
+"""Maximum number of answers to all queries of a call: 1 GiB of rows and distances. A single query may have more."""
 
 
 class Found(NamedTuple):
@@ -103,12 +105,15 @@ def given_flags(exclude: Any) -> Bool[np.ndarray, " n"] | None:
     return flags.astype(bool)
 
 
-def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, places: int) -> None:
-    """Raise ValueError if k is below 1, k exceeds both `MOST` and `places`, or `exclude` does not fit."""
+def check_asked(k: int, exclude: Bool[np.ndarray, " n"] | None, *, queries: int, places: int) -> None:
+    """Raise ValueError if k is below 1, k exceeds both `MOST` and `places`, the answers to several queries exceed
+    `MOST_ANSWERS`, or `exclude` does not fit."""
     if k < 1:
         raise ValueError(f"expected k of 1 or more, found {k}")
     if k > max(MOST, places):
         raise ValueError(f"expected k up to {max(MOST, places)}, found {k}")
+    if queries > 1 and queries * k > MOST_ANSWERS:
+        raise ValueError(f"expected at most {MOST_ANSWERS // k} queries at a time for k = {k}, found {queries}")
     if exclude is not None and exclude.shape != (places,):
         raise ValueError(f"expected one flag for each of {places} places to exclude, found {exclude.shape}")
 

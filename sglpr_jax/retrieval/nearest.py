@@ -7,10 +7,13 @@ from jaxtyping import Bool, Float32, Int
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 from sglpr_jax.retrieval.distances import distance_function, smallest
+from sglpr_jax.retrieval.index_rows import check_asked
 from sglpr_jax.same_place import SAME_PASS_FRAMES
 
 BLOCK = 512
-"""Number of queries compared with the whole database at a time."""
+"""Maximum number of queries compared with the whole database at a time."""
+PAIRS = 2**26
+"""Maximum number of pairs compared at a time, unless the database has more places."""
 SHOWN = 10
 """Maximum number of queries in a printed result."""
 
@@ -65,8 +68,8 @@ def nearest(
       Rows and distances, nearest first. Places with equal distances are in the order of the database.
 
     Raises:
-      ValueError: If the files have different methods or weights, if `k` is below 1, or if `exclude_s` is set and there
-        are no times.
+      ValueError: If the files have different methods or weights, if `k` is below 1, if `k` or all answers exceed the
+        bounds of `check_asked`, or if `exclude_s` is set and there are no times.
 
     Example:
       print(nearest(file))              # places that one recording comes back to
@@ -78,8 +81,9 @@ def nearest(
     k_there = min(k, len(database))
     rows = np.full((len(queries), k), -1)
     distances = np.full((len(queries), k), np.inf, np.float32)
-    for start in range(0, len(queries), BLOCK):
-        block = np.arange(start, min(start + BLOCK, len(queries)))
+    step = int(np.clip(PAIRS // len(database), 1, BLOCK))
+    for start in range(0, len(queries), step):
+        block = np.arange(start, min(start + step, len(queries)))
         found = compare(queries.descriptors[block], database.descriptors)
         if own:
             found = np.where(_old_enough(queries, block, exclude_frames, exclude_s), found, np.float32(np.inf))
@@ -101,7 +105,6 @@ def _old_enough(
 
 def _check(queries: DescriptorFile, database: DescriptorFile, k: int, seconds: float) -> None:
     check_same_method(queries, database)
-    if k < 1:
-        raise ValueError(f"expected k of 1 or more, found {k}")
+    check_asked(k, None, queries=len(queries), places=len(database))
     if seconds > 0 and queries.times is None:
         raise ValueError(f"sequence {queries.sequence}: expected times for excluding recent seconds, found none")

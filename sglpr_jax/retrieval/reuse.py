@@ -60,11 +60,11 @@ def embed_or_reuse(
 def fingerprint(recording: Recording) -> str:
     """Hash a recording without reading its scans.
 
-    The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels count by their
-    size and modification time. Scans that are not files of their own, such as those of a bag, are identified by the
-    other data.
+    The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels, or those of a
+    bag, count by their size and modification time.
     """
-    scans, labels = ([_state(path) for path in paths] for paths in (recording.paths, recording.label_paths))
+    files = (recording.containers or recording.paths, recording.label_paths)
+    scans, labels = ([_state(path) for path in paths] for paths in files)
     mounting = None if recording.mounting is None else dataclasses.asdict(recording.mounting)
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
     for values in (recording.positions, recording.times):
@@ -95,11 +95,12 @@ def _settings(method: Method, recording: Recording, corruption: Corruption, seed
 
 def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
     file = DescriptorFile.load(path)
-    found = file.config.get(SETTINGS, {})
-    for name, value in wanted.items():
-        if found.get(name) != value:
+    stored = file.config.get(SETTINGS)
+    found = stored if isinstance(stored, dict) else {}
+    for name in {**wanted, **found}:
+        if name not in found or name not in wanted or found[name] != wanted[name]:
             raise ValueError(
-                f"{path}: expected descriptors made with {name} {json_in_short(value)}, found "
+                f"{path}: expected descriptors made with {name} {json_in_short(wanted.get(name))}, found "
                 f"{json_in_short(found.get(name))}; choose another --out, or delete the file"
             )
     return file

@@ -61,12 +61,15 @@ def test_too_few_poses_name_the_frame(bev_root):
         open_recording(bev_root, "06")
 
 
-def test_missing_poses_or_images_are_named(bev_root):
+def test_images_without_poses_have_no_positions(bev_root):
     (bev_root / "06/pose.txt").unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"06/pose\.txt: expected a file with 12 numbers a line, one line per frame, found none"
-    ):
-        open_recording(bev_root, "06")
+    (bev_root / "06/imgs/000001.png").rename(bev_root / "06/imgs/000001-b.png")  # no row of a pose
+    sequence = open_recording(bev_root, "06")
+    assert (sequence.positions, sequence.pose_source, len(sequence)) == (None, None, 3)
+    assert sequence.description[-1] == "times: none; poses: none"
+
+
+def test_missing_images_are_named(bev_root):
     (bev_root / "07/imgs").mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match=r"07/imgs: expected images \(\*\.png\), found none"):
         open_recording(bev_root, "07")

@@ -9,6 +9,8 @@ import pytest
 from sglpr_jax.data import open_recording, recording_names
 
 MICRO = 1532402927647951
+TWICE = f"samples/LIDAR_TOP/n015__LIDAR_TOP__{MICRO}.pcd.bin"
+"""A scan that another row lists, too."""
 LIDAR_ON_CAR = [0.94, 0.0, 1.84]
 LEFT = [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]
 """A quarter turn to the left: w x y z."""
@@ -108,6 +110,14 @@ def change(root: Path, table: str, row: int, **values: object) -> None:
         ("ego_pose", 1, {"translation": [1, 2]}, r"ego_pose\.json: expected 3 numbers as 'translation'"),
         ("ego_pose", 1, {"translation": [1, 2, float("nan")]}, "expected finite numbers as 'translation', found"),
         ("calibrated_sensor", 1, {"rotation": [2, 0, 0, 0]}, r"expected a rotation qx qy qz qw of length 1 in row 1"),
+        ("ego_pose", 1, {"rotation": [1e300, 0, 0, 0]}, r"ego_pose\.json: expected a rotation .* of length 1 in row 1"),
+        ("ego_pose", 1, {"translation": [1, 2, 10**400]}, r"ego_pose\.json: expected 3 numbers as 'translation'"),
+        (
+            "sample_data",
+            0,
+            {"filename": TWICE},
+            r"sample_data\.json: .*a unique id for each scan, found .* twice",
+        ),
     ],
 )
 def test_malformed_tables_are_named(root, table, row, values, message):

@@ -72,6 +72,31 @@ def test_a_binary_file_ends_with_its_last_element(tmp_path, format):
         read_ply(path)
 
 
+@pytest.mark.parametrize("format", ORDERS)
+def test_a_binary_file_ends_with_its_last_list(tmp_path, format):
+    after = "element face 2\nproperty uchar kind\nproperty list short int vertex_indices\n"
+    faces = [np.array([length], f"{ORDERS[format]}i2").tobytes() + bytes(4 * length) for length in (3, 0)]
+    path = write(tmp_path / "a.ply", format=format, after=after)
+    whole = path.read_bytes() + b"".join(b"k" + face for face in faces)
+    for content in (whole, whole[:-9]):  # the vertices are whole, and the faces are not read
+        path.write_bytes(content)
+        np.testing.assert_array_equal(read_ply(path), CLOUD)
+    path.write_bytes(whole + b"1")
+    with pytest.raises(ValueError, match=r"a\.ply: .*expected at most 81 bytes after the header, found 82"):
+        read_ply(path)
+    path.write_bytes(whole.replace(b"list short", b"list float"))
+    with pytest.raises(ValueError, match="expected a list of numbers for vertex_indices, found list float int"):
+        read_ply(path)
+
+
+def test_a_list_of_negative_length_is_refused(tmp_path):
+    after = "element face 1\nproperty list char int vertex_indices\n"
+    path = write(tmp_path / "a.ply", format="binary_little_endian", after=after)
+    path.write_bytes(path.read_bytes() + b"\xff" + bytes(4))
+    with pytest.raises(ValueError, match="expected lists of 0 or more items in face, found -1"):
+        read_ply(path)
+
+
 def test_nan_as_windows_spells_it(tmp_path):
     path = write(tmp_path / "a.ply")
     path.write_bytes(path.read_bytes().replace(b" nan", b" -nan(ind)"))
@@ -128,7 +153,7 @@ def test_a_cut_off_binary_and_a_list_among_the_coordinates(tmp_path):
         read_ply(path)
     path = write(tmp_path / "b.ply", format="binary_little_endian")
     path.write_bytes(path.read_bytes().replace(b"property float32 i", b"property list uchar int i"))
-    with pytest.raises(ValueError, match=r"expected numbers for intensity of vertex, found a list"):
+    with pytest.raises(ValueError, match=r"expected numbers for intensity of vertex, found list uchar int"):
         read_ply(path)
     with pytest.raises(FileNotFoundError, match=r"c\.ply: expected a \.ply file, found none"):
         read_ply(tmp_path / "c.ply")

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.formats import inflation
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
 from sglpr_jax.data.readable import readable
 from sglpr_jax.data.readers import ros
@@ -238,6 +239,28 @@ def test_compressed_bags(tmp_path, name):
     else:
         with pytest.raises(ValueError, match=r"drive\.(mcap|db3).*: expected .*metadata\.yaml is missing"):
             open_recording(root)
+
+
+@pytest.mark.parametrize("name", COMPRESSIONS)
+def test_parts_that_inflate_beyond_the_bound_are_refused(tmp_path, name, monkeypatch):
+    kind, compression = COMPRESSIONS[name]
+    path = write(tmp_path / KINDS[kind], kind, compression=compression)
+    monkeypatch.setattr(inflation, "MOST_BYTES", 100)
+    monkeypatch.setattr(inflation, "INFLATION", 1)
+    most = "1 times the size" if "files" in name else "100 "
+    with pytest.raises(ValueError, match=rf"expected an intact ROS bag, found .*at most {most}"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("log", ["wal", "journal"])
+@pytest.mark.parametrize("lone", [True, False])
+def test_a_log_beside_a_bag_of_sqlite_is_named(tmp_path, log, lone):
+    path = write(tmp_path / "drive", "ros2")
+    (path / f"drive.db3-{log}").write_bytes(b"")
+    assert len(open_recording(path)) == 3, "an empty log is left by a recorder that ended well"
+    (path / f"drive.db3-{log}").write_bytes(b"messages")
+    with pytest.raises(ValueError, match=rf"drive\.db3: expected a bag that its recorder has closed, found .*-{log} "):
+        open_recording(path / "drive.db3" if lone else path)
 
 
 @pytest.mark.parametrize("kind", ["ros2", "mcap"])

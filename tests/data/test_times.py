@@ -1,12 +1,16 @@
 """Times in seconds are kept, row numbers are dropped, and other units are one clear error unless they are stated."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.pose_files import read_times, read_tum
+from sglpr_jax.data.formats.ros_tracks import Stamps
+from sglpr_jax.data.formats.timed_poses import match_times
 from sglpr_jax.data.formats.trajectory import read_trajectory
-from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, doubt, times_of
+from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, doubt, times_of, unit_change
 from sglpr_jax.data.warning import DataWarning
 
 SECONDS = np.arange(280) / 10
@@ -57,6 +61,53 @@ def test_few_steps_and_stops_prove_nothing():
     assert doubt(np.array([0.0, 500.0, 900.0])) == "" and doubt(np.zeros(50)) == "" and doubt(np.zeros(0)) == ""
     stops = np.repeat(SECONDS, 3) + np.repeat(np.arange(28), 30) * 60.0
     assert doubt(stops) == ""
+
+
+@pytest.mark.parametrize("start", [0.0, 12.5, 1.7e9])
+@pytest.mark.parametrize("row", [3, 140, 277])
+@pytest.mark.parametrize("factor", [1e3, 1e6, 1e9])
+def test_a_unit_that_changes_in_the_middle_is_refused_whatever_unit_is_stated(start, row, factor):
+    times = start + SECONDS
+    times[row:] *= factor
+    for unit in PER_SECOND:
+        with pytest.raises(
+            ValueError, match=rf"a\.txt, row {row + 1}: expected times in one unit, found .* times as l"
+        ):
+            times_of(times, source="a.txt", unit=unit)
+    assert doubt(times).endswith("times as large")
+
+
+def test_a_pause_a_new_clock_and_another_rate_are_no_change_of_the_unit():
+    for later in (1e4 + SECONDS, 1.7e9 + SECONDS, 100 + 100 * SECONDS, np.array([28e9, 28.1e9])):
+        times = np.append(SECONDS, later)
+        np.testing.assert_array_equal(times_of(times, source="a", unit="s"), times)
+    assert unit_change(np.zeros(9)) is None and unit_change(-SECONDS[::-1]) is None
+
+
+def test_a_unit_that_changes_is_refused_on_every_road(tmp_path):
+    times = np.append(12 + np.arange(4) / 10, (12.4 + np.arange(4) / 10) * 1e9)
+    folder_of_scans(tmp_path / "scans", 8)
+    np.savetxt(tmp_path / "scans" / "times.txt", times)
+    write_tum(tmp_path / "poses.tum", times)
+    (tmp_path / "poses.csv").write_text("t,x,y,z\n" + "".join(f"{t},0,0,0\n" for t in times))
+    roads = {
+        "times.txt": lambda: open_recording(tmp_path / "scans"),
+        "poses.tum": lambda: read_tum(tmp_path / "poses.tum"),
+        "poses.csv": lambda: read_trajectory(tmp_path / "poses.csv"),
+        "stamps.csv": lambda: match(times, times[:4]),
+        "lidar": lambda: match(times[:4], times),
+    }
+    for name, read in roads.items():
+        with pytest.raises(
+            ValueError, match=rf"{name}, row 5: expected times in one unit, found 1\.24e\+10 after 12\.3"
+        ):
+            read()
+    assert not Stamps(times.astype(np.int64), times).orderly
+
+
+def match(stamps, times):
+    ticks = {"stamps": (stamps * 1e6).astype(np.int64), "times": (times * 1e6).astype(np.int64)}
+    return match_times(**ticks, tick_s=1e-6, max_gap_s=0.1, poses=Path("stamps.csv"), scans=Path("lidar"))
 
 
 def test_times_that_go_back_name_their_row():

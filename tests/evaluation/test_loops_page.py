@@ -7,7 +7,7 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.evaluation import figures
-from sglpr_jax.evaluation.page.of_loops import loops_page, write_loops_page
+from sglpr_jax.evaluation.page.of_loops import loops_page
 from sglpr_jax.loops.candidates import Candidate
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop, Rejected
@@ -28,7 +28,7 @@ def found(tmp_path) -> FoundLoops:
 
 
 def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_path):
-    page = Parsed(write_loops_page(found, tmp_path).read_text())
+    page = Parsed(loops_page(found))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs"]
     assert all(address.startswith("data:") for address in page.addresses)
     table = page.texts["Loops"]

@@ -1,17 +1,18 @@
 """What became of a damaged file: it was refused in one good line, read rightly, or something that may never be."""
 
 import contextlib
+import re
 import resource
 import signal
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sglpr_jax.data.warning import DataWarning
 
-from .damage import Damaged
+from .road import Case, FolderRoad, Road
 
 LONGEST_S = 60
 MOST_BYTES = 2**31
@@ -34,24 +35,28 @@ class Hang(BaseException):
     """A reader did not come back."""
 
 
-def outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Callable[[Any], bool]) -> Outcome:
-    """Read `path`, which holds `damaged`. `same` says whether a result is that of the undamaged file."""
-    before = sorted(path.parent.rglob("*"))
-    found = _outcome(path, damaged, read, same)
-    new = sorted(set(path.parent.rglob("*")) - set(before))
-    return Outcome("new file", str(new[0])) if new else found
+def outcome(road: Road | FolderRoad, case: Case, folder: Path) -> Outcome:
+    """Read the files of a case, which are in `folder`."""
+    before = set(folder.rglob("*"))
+    found = _outcome(road, case, folder)
+    new = sorted(str(path.relative_to(folder)) for path in set(folder.rglob("*")) - before)
+    new = [path for path in new if not (road.written and re.match(road.written, path))]
+    return Outcome("new file", new[0]) if new else found
 
 
-def _outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Callable[[Any], bool]) -> Outcome:
+def _outcome(road: Road | FolderRoad, case: Case, folder: Path) -> Outcome:
+    opened, damaged = folder / road.opened(case), case.damaged
+    names = {opened.name, *(Path(file).name for file in (case.file, *case.beside))}
     try:
         with _limited(), warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", DataWarning)
-            result = read(path)
+            result = road.read(opened)
     except (ValueError, OSError) as error:
         line = str(error)
         if _for_want_of_memory(error):
             return Outcome("memory", line)
-        good = path.name in line and "expected" in line and "found" in line and len(line) < 1000 and "\n" not in line
+        named = any(name in line for name in names)
+        good = named and "expected" in line and "found" in line and len(line) < 1000 and "\n" not in line
         if damaged.expected == "same":
             return Outcome("bad message", f"refused what is the same: {line}")
         return Outcome("refused" if good else "bad message", line)
@@ -60,9 +65,9 @@ def _outcome(path: Path, damaged: Damaged, read: Callable[[Path], Any], same: Ca
     except Exception:
         return Outcome("traceback", traceback.format_exc())
     with contextlib.suppress(Exception):  # a plain parser that fails where ours did not says: it is not the same
-        if damaged.expected != "refused" and same(result):
+        if damaged.expected != "refused" and road.says(result, case):
             return Outcome("right", "")
-    if told and path.name in str(told[0].message):
+    if told and any(name in str(told[0].message) for name in names):
         return Outcome("told", str(told[0].message))
     return Outcome("silent", repr(result)[:300])
 

@@ -64,7 +64,7 @@ def change_header(content: bytes, draw: Random) -> Damaged:
 def another_array(content: bytes, draw: Random) -> Damaged:
     """One array has a value more, less or another; the checksum is the old one."""
     values, header = safetensors.numpy.load(content), safetensors_parts(content)[0]["__metadata__"]
-    name = draw.choice(sorted(values))
+    name = draw.choice([name for name in sorted(values) if values[name].size])
     array = values[name].copy()
     array.flat[draw.randrange(array.size)] += 1
     values[name] = draw.choice((array, values[name][:-1], values[name].astype(np.float16)))
@@ -128,8 +128,8 @@ def said_table(content: bytes) -> Any:
     return [[int(row[0]), int(row[1]), _matrix(row[2:9]), float(row[9])] for row in rows]
 
 
-def in_a_graph(damage: Damage) -> Damage:
-    """A word of a g2o file is another: that may be the kind of its line, and other kinds are left out."""
+def either(damage: Damage) -> Damage:
+    """The same damage, which a reader may also leave out: lines of unknown kinds, or frames that are found again."""
     return lambda content, draw: Damaged(damage(content, draw).content, "either")
 
 
@@ -212,7 +212,7 @@ ROADS = (
         "g2o",
         "loops.g2o",
         written(lambda path: write_g2o(path, LOOPS, POSES), "loops.g2o"),
-        damages={**BYTES, "word": in_a_graph(change_word), "missing": in_a_graph(drop_word)},
+        damages={**BYTES, "word": either(change_word), "missing": either(drop_word)},
         **reread(read_graph, said_graph),
     ),
     Road(

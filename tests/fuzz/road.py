@@ -3,15 +3,24 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from random import Random
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .damage import (
-    Damage,
-)
+from .damage import BYTES, Damage, Damaged
 
 N = 5
+
+
+class Case(NamedTuple):
+    """A damaged file among others that are whole."""
+
+    kind: str
+    """Name of the damage."""
+    file: str
+    damaged: Damaged
+    beside: Mapping[str, bytes]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +39,71 @@ class Road:
     """Whole files that must lie beside it."""
     cost: int = 1
     """How many times as long as others a case takes: so many times fewer are tried."""
+    written: str = ""
+    """Pattern of the files that reading may write, relative to the folder."""
+    slow: bool = False
+    """Whether the first case takes long, because programs are compiled."""
+
+    def intact(self) -> Case:
+        """The case of the whole file."""
+        return Case("none", self.file, Damaged(self.whole, "same"), self.beside)
+
+    def case(self, draw: Random) -> Case:
+        """A damaged file."""
+        kind = draw.choice(sorted(self.damages))
+        return Case(kind, self.file, self.damages[kind](self.whole, draw), self.beside)
+
+    def opened(self, case: Case) -> str:
+        """What is read: a file or folder, relative to the folder of the case."""
+        return case.file
+
+    def says(self, found: Any, case: Case) -> bool:
+        """Whether a result is what the files of the case say."""
+        return self.same(found, case.damaged.content)
+
+
+@dataclasses.dataclass(frozen=True)
+class FolderRoad:
+    """One way in that reads a folder, of which any file may be damaged."""
+
+    name: str
+    folder: str
+    """What the folder is called."""
+    files: Callable[[], Mapping[str, bytes]]
+    """Whole files by their path in the folder. They are made once, when they are needed."""
+    read: Callable[[Path], Any]
+    same: Callable[[Any, Mapping[str, bytes]], bool]
+    """Whether a result is what the files say."""
+    damages: Callable[[str], Mapping[str, Damage]] = lambda file: BYTES
+    """Damages of a file, by its path."""
+    cost: int = 1
+    written: str = ""
+    slow: bool = False
+
+    def intact(self) -> Case:
+        """The case of whole files."""
+        (file, content), *_ = self._files().items()
+        return Case("none", file, Damaged(content, "same"), self._files())
+
+    def case(self, draw: Random) -> Case:
+        """A damaged file among whole ones."""
+        files = self._files()
+        file = draw.choice(sorted(files))
+        damages = self.damages(file)
+        kind = draw.choice(sorted(damages))
+        return Case(kind, file, damages[kind](files[file], draw), files)
+
+    def opened(self, case: Case) -> str:
+        """What is read."""
+        return self.folder
+
+    def says(self, found: Any, case: Case) -> bool:
+        """Whether a result is what the files of the case say."""
+        files = {**case.beside, case.file: case.damaged.content}
+        return self.same(found, {file.removeprefix(f"{self.folder}/"): content for file, content in files.items()})
+
+    def _files(self) -> dict[str, bytes]:
+        return {f"{self.folder}/{file}": content for file, content in self.files().items()}
 
 
 def plain(value: Any) -> Any:

@@ -10,7 +10,7 @@ from cli.conftest import assert_one_line_error, run_command
 from .archives import DESCRIPTOR_FILE
 from .damage import BYTES
 from .road import N
-from .roads import ROADS
+from .roads import FILE_ROADS
 from .rows import TWELVE
 
 CASES = 5
@@ -32,7 +32,7 @@ COMMANDS = {
 def test_a_command_refuses_a_damaged_file(name, seed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
-    road, draw = ROADS[name], Random(seed)
+    road, draw = FILE_ROADS[name], Random(seed)
     for path, content in {
         "good/poses.txt": TWELVE,
         "good/08.npz": DESCRIPTOR_FILE,

@@ -8,7 +8,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen, square_image
-from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, SequenceConfig
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, RivalConfig, SequenceConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import MIN_OVERLAP
@@ -162,6 +162,14 @@ def test_pairs_that_other_places_fit_as_well_are_rejected_with_that_reason(param
 def test_what_is_no_probability_is_refused(config, name, value):
     with pytest.raises(ValueError, match=f"expected {name} from 0 to 1, found {value}"):
         config(**{name: value})
+
+
+@pytest.mark.parametrize("config", [CandidateConfig, RivalConfig])
+def test_more_comparisons_than_fit_into_memory_are_refused(config):
+    name = "candidates" if config is CandidateConfig else "of_query"
+    for value in (10**9, -1):
+        with pytest.raises(ValueError, match=f"{name}: expected a number from [01] up to 1000, found {value}"):
+            config(**{name: value})
 
 
 def test_scans_without_points_or_with_one_close_no_loops(params):

@@ -11,6 +11,7 @@ from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
+from sglpr_jax.loops import folder
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.graph_files import read_g2o, read_loops_csv, read_loops_jsonl
@@ -79,6 +80,20 @@ def test_a_file_that_cannot_be_written_is_named(found, tmp_path):
     (tmp_path / "out").write_text("a file, no folder")
     with pytest.raises(WriteError, match="out"):
         write_found(found, tmp_path / "out")
+
+
+def test_a_disk_that_is_full_in_the_middle_leaves_the_files_of_the_earlier_run(found, tmp_path, monkeypatch):
+    write_found(found, tmp_path, optimized=found.odometry[:5], texts={"index.html": "old"})
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(path, *args, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(folder, "write_kitti", full)
+    none = dataclasses.replace(found, loops=(), odometry=2 * found.odometry)
+    with pytest.raises(WriteError, match=rf"^{tmp_path}/trajectory.kitti: cannot be written: No space left on device"):
+        write_found(none, tmp_path, optimized=found.odometry[:5], texts={"index.html": "new"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_frames_keep_the_numbers_of_the_recording(found, tmp_path):

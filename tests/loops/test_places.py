@@ -77,6 +77,11 @@ def test_a_map_comes_back_from_its_file(places, tmp_path):
 
 
 @pytest.mark.slow
+def test_more_answers_than_places_that_can_be_compared_are_refused(places, params, drive):
+    with pytest.raises(ValueError, match="candidates: expected a number from 1 up to 1000, found 1000000000"):
+        places.relocate(params, drive.record(20), candidates=10**9)
+
+
 def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, first, places, params):
     recording, poses = first
     sunday = dataclasses.replace(recording, name="sunday")

@@ -206,6 +206,13 @@ def test_other_units_from_python_are_one_line_as_soon_as_steps_show_them(params,
     assert found_in(detector_of(params, time_unit=unit), STAMPS[unit]) == SAME
 
 
+def test_a_unit_that_changes_from_python_is_one_line_as_soon_as_steps_show_it(params):
+    times = 5 + np.array(SECONDS)
+    times[7:] *= 1e9
+    with pytest.raises(ValueError, match=r"frame 9: expected times in the unit of those before, found .* after 6\.2"):
+        found_in(detector_of(params), times)
+
+
 def test_row_numbers_from_python_are_one_line_and_no_times_are_frames(params):
     with pytest.raises(ValueError, match=r"frame 5: expected times in seconds, found row numbers \(0, 1, 2, \.\.\.\)"):
         found_in(detector_of(params), STAMPS["rows"])

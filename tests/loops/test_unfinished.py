@@ -5,23 +5,23 @@ import functools
 import os
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from bags import CLOUD, FILES, write_bag
+from bags import cloud as cloud_message
 from recordings import with_points
 
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find, joint, unfinished
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.probability import Curve, LoopModel
 from sglpr_jax.loops.registration import Registration
-from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
+
+from .kept import WANTED, fake_finder, keep, recalled
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
@@ -213,50 +213,6 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
     assert len(asked) == 2 * len(found.loops)  # for their registration: no scan was looked at again
 
 
-def finder_of(**stored) -> CandidateFinder:
-    """A finder without a network."""
-    finder = object.__new__(CandidateFinder)
-    vars(finder).update(stored)
-    return finder
-
-
-def fake_finder(seed: int = 0, frames: int = 5) -> CandidateFinder:
-    """What a finder stores of some frames, drawn at random; the second frame has no scan."""
-    draw, index = np.random.default_rng(seed), Index.empty(4, weights_hash="w")
-    index.add(draw.normal(size=(frames, 4)))
-    images = list(draw.integers(0, 255, (frames, 6, 6), np.uint8))
-    links = [None, *(Peak(*draw.normal(size=6)) for _ in range(frames - 1))]
-    return finder_of(index=index, images=images, missing=[1], links=links)
-
-
-def fake_candidates(seed: int = 0) -> list[Candidate]:
-    draw = np.random.default_rng(seed)
-    x, y, yaw = map(jnp.asarray, draw.normal(size=3))
-    evidence = Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields))))
-    return [Candidate(4, 1, Alignment(x, y, yaw, jnp.eye(3), jnp.array(0.5), jnp.array(0.4)), evidence)]
-
-
-def recalled(folder: Path, wanted: dict) -> list:
-    """The frames that a checkpoint directory gives back."""
-    finder, found = finder_of(index=Index.empty(4, weights_hash="w")), []
-
-    def add(seen, compared):
-        found.append((seen, compared))
-        finder.index.add(np.zeros(4) if seen is None else seen.descriptor)
-
-    kept = unfinished.Unfinished.opened(folder, wanted)
-    kept.recall(finder, None, add, missing=True)
-    return found
-
-
-WANTED = {"format": unfinished.FORMAT, "name": "08", "recording": "a"}
-
-
-def keep(folder: Path, wanted: dict, seed: int = 0) -> Path:
-    unfinished.Unfinished.opened(folder, wanted).keep(fake_finder(seed), fake_candidates(seed), all=True)
-    return folder / "000000.safetensors"
-
-
 def test_frames_come_back_as_they_were_kept(tmp_path):
     keep(tmp_path, WANTED)
     found, finder = recalled(tmp_path, WANTED), fake_finder()
@@ -329,6 +285,23 @@ def test_scans_of_another_drive_have_other_settings_though_sizes_and_times_agree
         found.append(unfinished.settings(recording, finder))
     assert found[0]["recording"] == found[1]["recording"] and found[0] != found[1]
     assert unfinished.settings(dataclasses.replace(recording, name="other"), finder) != found[1]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_bag_of_other_scans_has_other_settings_though_its_size_and_times_agree(params, tmp_path, kind):
+    finder, found = sglpr_jax.LoopDetector(params).finder, []
+    for x in (5.0, 6.0):
+        path = tmp_path / str(x) / FILES[kind]
+        path.parent.mkdir()
+        clouds = [cloud_message(kind, i, np.full((9, 3), x + i)) for i in range(4)]
+        write_bag(path, kind, [("/points", CLOUD, float(i), one) for i, one in enumerate(clouds)])
+        for file in path.iterdir() if path.is_dir() else (path,):
+            os.utime(file, (1e9, 1e9))
+        recording = sglpr_jax.open_recording(path, sensor_height=1.73)
+        found.append(unfinished.settings(recording, finder))
+    assert found[0]["recording"] == found[1]["recording"] and found[0]["scans"] != found[1]["scans"]
+    os.utime(recording.containers[0], (2e9, 2e9))
+    assert unfinished.settings(recording, finder)["recording"] != found[1]["recording"]
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):

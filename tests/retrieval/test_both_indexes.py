@@ -95,6 +95,8 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(new: New):
         index.query(draw(1), 0)
     with pytest.raises(ValueError, match="expected k up to 1048576, found 1000000000"):
         index.query(draw(1), 10**9)
+    with pytest.raises(ValueError, match="expected at most 64 queries at a time for k = 1048576, found 65"):
+        index.query(draw(65), 2**20)
     with pytest.raises(ValueError, match="one flag for each of 5"):
         index.query(draw(1), exclude=np.zeros(6, bool))
     assert len(index) == 5

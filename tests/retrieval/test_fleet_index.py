@@ -83,6 +83,25 @@ def test_other_tables_and_broken_ones_are_refused(tmp_path):
         FleetIndex(tmp_path / "other", width=WIDTH)
 
 
+@pytest.mark.parametrize("size", [1, 500])
+def test_data_that_are_cut_are_named_when_they_are_read(tmp_path, size):
+    index = filled(tmp_path, 30)
+    for file in (tmp_path / f"{TABLE}.lance" / "data").iterdir():
+        file.write_bytes(file.read_bytes()[:-size])
+    index = FleetIndex(tmp_path, width=WIDTH)
+    for read in (lambda: index.query(draw(1)), lambda: index.ids, lambda: index.times):
+        with pytest.raises(ValueError, match=rf"^{tmp_path}: expected an index of LanceDB, found a broken one"):
+            read()
+
+
+def test_places_whose_rows_are_no_rows_are_refused(tmp_path):
+    index = filled(tmp_path, 5)
+    index.table.update(where="row = 4", values={"row": 2})
+    for read in (lambda: index.query(draw(1), 5), lambda: index.ids):
+        with pytest.raises(ValueError, match=rf"^{tmp_path}: expected an index of LanceDB, found a broken one"):
+            read()
+
+
 @pytest.mark.parametrize(
     ("about", "message"),
     [

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from sglpr_jax.retrieval import nearest as nearest_module
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import l2
 from sglpr_jax.retrieval.nearest import nearest
 
 
@@ -61,6 +63,22 @@ def test_recent_frames_of_the_own_recording_are_no_answers(descriptors, frames, 
 def test_fewer_than_k_are_filled_and_ties_come_in_order():
     found = nearest(file_of(np.zeros((3, 2))), k=4, exclude_frames=0)
     np.testing.assert_array_equal(found.rows, [[-1] * 4, [0, -1, -1, -1], [0, 1, -1, -1]])
+
+
+def test_many_places_are_compared_with_fewer_queries_at_a_time(descriptors, monkeypatch):
+    whole = nearest(file_of(descriptors), k=3)
+    monkeypatch.setattr(nearest_module, "PAIRS", 5 * len(descriptors))
+    asked = []
+    monkeypatch.setattr(nearest_module, "distance_function", lambda name: lambda q, d: asked.append(len(q)) or l2(q, d))
+    few = nearest(file_of(descriptors), k=3)
+    assert max(asked) == 5 and np.array_equal(few.rows, whole.rows)
+
+
+def test_more_answers_than_fit_into_memory_are_refused(descriptors):
+    with pytest.raises(ValueError, match="expected k up to 1048576, found 1000000000"):
+        nearest(file_of(descriptors), k=10**9)
+    with pytest.raises(ValueError, match="expected at most 64 queries at a time for k = 1048576, found 700"):
+        nearest(file_of(descriptors), k=2**20)
 
 
 def test_a_result_prints_itself():

@@ -1,6 +1,5 @@
 """Reads points from numpy files: .npy and .npz."""
 
-import math
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from jaxtyping import Float32
 
 from sglpr_jax.data.formats.scan_size import MOST_POINTS, check_bytes
 from sglpr_jax.files import in_short
+from sglpr_jax.numpy_files import read_array
 
 NAMES = ("points", "xyz", "pointcloud", "cloud", "scan")
 """Names of the array with the points in an .npz file with several arrays, in order of preference."""
@@ -65,26 +65,6 @@ def _check_exists(path: Path) -> None:
 def _chosen(names: Sequence[str]) -> str | None:
     """Name of the array with the points, or None."""
     return next((name for name in NAMES if name in names), names[0] if len(names) == 1 else None)
-
-
-def read_array(stream: Any, *, size: int) -> np.ndarray:
-    """Read an array in numpy's format, without pickle. The header may declare more than the file contains.
-
-    Arguments:
-      stream: Open file, or member of an archive.
-      size: Size of the stream in bytes.
-
-    Raises ValueError if the header declares another size, before memory is allocated. Numpy raises many types of errors
-    for broken headers.
-    """
-    shorter = np.lib.format.read_magic(stream) == (1, 0)
-    read_header = np.lib.format.read_array_header_1_0 if shorter else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read_header(stream)
-    declared = stream.tell() + math.prod(shape) * dtype.itemsize
-    if declared != size and not dtype.hasobject:  # numpy itself rejects pickled objects
-        raise ValueError(f"expected {declared} bytes by its header, found {size}")
-    stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _read_scan(stream: Any, *, size: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.scan_size import check_points
+from sglpr_jax.files import naming
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
 NCLT_UNIT_M = 0.005
@@ -69,10 +70,8 @@ def read_records(path: Path, format: RecordFormat) -> Records:
             f"{path}: expected {dtype.itemsize} bytes for each point ({format}), found {size} bytes in total; the file"
             f" is truncated, or has another format ({others} bytes a point; pcd has a header)"
         )
-    try:
+    with naming(path):
         check_points(size // dtype.itemsize, bytes_each=dtype.itemsize)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     records = np.fromfile(path, dtype=dtype)
     lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
     with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers

@@ -58,7 +58,7 @@ def numbers_of(path: Path, rows: Sequence[dict[str, Any]], name: str, size: int)
     values = column_of(path, rows, name)
     try:
         numbers = np.array(values, np.float64).reshape(len(rows), size)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{path}: expected {size} numbers as {name!r}, found others ({in_short(error)})") from error
     strange = ~np.isfinite(numbers).all(axis=1)
     if strange.any():

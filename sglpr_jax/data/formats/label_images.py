@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int, Int32, UInt16
 
 from sglpr_jax.data.formats.grey_png import read_grey_png
+from sglpr_jax.files import naming
 from sglpr_jax.labels import to_classes
 
 
@@ -31,10 +32,8 @@ def read_label_image(path: Path, *, shape: tuple[int, int]) -> Int32[np.ndarray,
     if raw.shape != shape:
         expected, found = (f"{rows} rows of {columns} pixels" for columns, rows in (shape, raw.shape))
         raise ValueError(f"{path}: expected {expected}, the size of the image, found {found}")
-    try:
+    with naming(path):
         to_classes(raw)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return raw
 
 

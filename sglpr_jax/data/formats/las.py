@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sglpr_jax.data.formats.scan_size import check_points
-from sglpr_jax.files import in_short
+from sglpr_jax.files import in_short, naming
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record before and after the points, in bytes."""
@@ -27,10 +27,8 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
         import laspy
     except ImportError as error:
         raise ImportError(f"{path}: .las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
-    try:
+    with naming(path):
         _check_sizes(path)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     try:
         with laspy.open(path) as stream:
             found = stream.read()

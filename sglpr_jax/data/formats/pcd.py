@@ -19,6 +19,8 @@ _NUMBERS = {
     **{("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8"},
 }
 """Numpy types by TYPE and SIZE."""
+KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
+"""First words of the lines of a header, before that of DATA."""
 AXES = ("x", "y", "z")
 
 
@@ -104,10 +106,13 @@ def _keywords(text: str) -> dict[str, list[str]]:
     words: dict[str, list[str]] = {}
     for line in text.splitlines():
         keyword, *values = line.split() or ["#"]
+        if keyword.startswith("#"):
+            continue
+        if keyword not in KEYWORDS:  # it may be a damaged one
+            raise ValueError(f"expected {', '.join(KEYWORDS)} or a comment in the header, found {line[:80]!r}")
         if keyword in words:
-            raise ValueError(f"expected each line of the header once, found {keyword[:40]} again")
-        if not keyword.startswith("#"):
-            words[keyword] = values
+            raise ValueError(f"expected each line of the header once, found {keyword} again")
+        words[keyword] = values
     return words
 
 

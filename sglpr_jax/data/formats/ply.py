@@ -27,8 +27,8 @@ class _Element:
     name: str
     count: int
     """Number of instances in the file."""
-    properties: list[tuple[str, str | None]] = field(default_factory=list)
-    """Name and type of each property. The type of a list of variable length is `None`."""
+    properties: list[tuple[str, str]] = field(default_factory=list)
+    """Name and type of each property. The type of a list is "list", the type of its length, and that of its items."""
 
     @property
     def sizes(self) -> list[int]:
@@ -36,13 +36,13 @@ class _Element:
         wrong = next((name for name, kind in self.properties if kind not in _TYPES), None)
         if wrong is not None:
             found = dict(self.properties)[wrong]
-            raise ValueError(f"expected numbers for {wrong} of {self.name}, found {found or 'a list'}")
-        return [np.dtype(_TYPES[str(kind)]).itemsize for _, kind in self.properties]
+            raise ValueError(f"expected numbers for {wrong} of {self.name}, found {found}")
+        return [_size(kind) for _, kind in self.properties]
 
     @property
     def is_list(self) -> bool:
         """Whether the size of an instance varies."""
-        return any(kind is None for _, kind in self.properties)
+        return any(kind.startswith("list ") for _, kind in self.properties)
 
     @property
     def bytes(self) -> int:
@@ -92,8 +92,8 @@ def _parse_header(lines: Sequence[str]) -> tuple[str, list[_Element]]:
                 orders.append(found)
             case ["element", name, count]:
                 elements.append(_Element(name, whole_number(count, of=f"number of {name}")))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1].properties.append((name, None))
+            case ["property", "list", length, item, name] if elements:
+                elements[-1].properties.append((name, f"list {length} {item}"))
             case ["property", kind, *name] if elements and name:
                 elements[-1].properties.append((" ".join(name), kind))
             case _:
@@ -122,7 +122,7 @@ def _read_binary(
     body: bytes, vertices: _Element, behind: Sequence[_Element], order: str, columns: Sequence[int]
 ) -> Float32[np.ndarray, "n 3"]:
     offsets = list(accumulate(vertices.sizes, initial=0))
-    kinds = [order + _TYPES[str(kind)] for _, kind in vertices.properties]
+    kinds = [order + _TYPES[kind] for _, kind in vertices.properties]
     record = np.dtype(
         {
             "names": list("xyz"),
@@ -133,11 +133,45 @@ def _read_binary(
     )
     if len(body) < vertices.bytes:
         raise ValueError(f"expected {vertices.count} points of {record.itemsize} bytes, found {len(body)} bytes")
-    if not any(element.is_list for element in behind):  # the size of lists is not known
-        _check_end(len(body), vertices.bytes + sum(element.bytes for element in behind), unit="bytes")
+    end = vertices.bytes
+    for element in behind:
+        end = _end_of_lists(body, end, element, order) if element.is_list else end + element.bytes
+    _check_end(len(body), end, unit="bytes")
     records = np.frombuffer(body, record, count=vertices.count)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+
+
+def _end_of_lists(body: bytes, at: int, element: _Element, order: str) -> int:
+    """Position behind all instances of an element with lists, which starts at `at`. It may be behind the file."""
+    steps = [_step(kind, name) for name, kind in element.properties]
+    for _ in range(element.count):
+        for length_size, item_size, signed in steps:
+            length = 1
+            if length_size:
+                words = body[at : at + length_size]
+                length = int.from_bytes(words, "big" if order == ">" else "little", signed=signed)
+            if length < 0:
+                raise ValueError(f"expected lists of 0 or more items in {element.name}, found {length}")
+            at += length_size + length * item_size
+        if at >= len(body):  # the rest of the lists is missing: the vertices are whole
+            break
+    return at
+
+
+def _step(kind: str, name: str) -> tuple[int, int, bool]:
+    """Size of the length of a list (0 for a number), size of an item, and whether the length is signed."""
+    if not kind.startswith("list "):
+        return 0, _size(kind), False
+    _, length, item = kind.split(" ")
+    if _TYPES.get(length, "f")[0] not in "iu" or item not in _TYPES:
+        raise ValueError(f"expected a list of numbers for {name}, found {kind}")
+    return _size(length), _size(item), _TYPES[length][0] == "i"
+
+
+def _size(kind: str) -> int:
+    """Size of a number in bytes."""
+    return np.dtype(_TYPES[kind]).itemsize
 
 
 def _read_text(

@@ -46,7 +46,9 @@ def check_positions(path: Path, positions: Float[np.ndarray, "n 3"]) -> None:
 
 def check_quaternions(path: Path, quaternions: Float[np.ndarray, "n 4"]) -> None:
     """Raise ValueError if a quaternion qx qy qz qw does not have length 1. The message names its row in `path`."""
-    wrong = np.flatnonzero(~(np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROTATION_TOLERANCE))
+    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
+        lengths = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(~(np.abs(lengths - 1) <= ROTATION_TOLERANCE))
     if wrong.size:
         found = " ".join(f"{value:g}" for value in quaternions[wrong[0]])
         raise ValueError(f"{path}: expected a rotation qx qy qz qw of length 1 in row {wrong[0] + 1}, found {found}")

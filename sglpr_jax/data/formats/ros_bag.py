@@ -11,6 +11,7 @@ import numpy as np
 
 from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.bounded_file import BoundedPath
+from sglpr_jax.data.formats.inflation import bound_bags
 from sglpr_jax.data.formats.livox import CUSTOM_MSG, POINT, read_custom_msg
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
 from sglpr_jax.data.formats.ros_message import RosMessage
@@ -36,6 +37,11 @@ class RosBag:
         self._reader = _open(self.paths)
         self._lock = threading.Lock()
         weakref.finalize(self, self._reader.close)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files of all bags, in order."""
+        return tuple(file for path in self.paths for file in (sorted(path.iterdir()) if path.is_dir() else (path,)))
 
     @property
     def topics(self) -> dict[str, str]:
@@ -171,6 +177,17 @@ def _about_metadata(path: Path) -> str:
     return f"; open the folder with {metadata}" if metadata.is_file() else f"; {metadata} is missing ({REINDEX})"
 
 
+def _check_closed(path: Path) -> None:
+    """Raise ValueError if SQLite has a log beside a file of a bag: it holds messages that the file lacks."""
+    for file in sorted(path.glob("*.db3")) if path.is_dir() else (path,):
+        for log in (file.with_name(f"{file.name}-wal"), file.with_name(f"{file.name}-journal")):
+            if log.is_file() and log.stat().st_size:
+                raise ValueError(
+                    f"{file}: expected a bag that its recorder has closed, found {log.name} beside it, with changes "
+                    f"that are not in the bag; `sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'` merges them"
+                )
+
+
 def _open(paths: tuple[Path, ...]) -> Any:
     try:
         from rosbags.highlevel import AnyReader
@@ -179,6 +196,9 @@ def _open(paths: tuple[Path, ...]) -> Any:
         raise ImportError(f"{paths[0]}: bags need the extra `ros` (pip install 'sglpr-jax[ros]')") from error
     if paths[0].name.endswith(COMPRESSED):
         raise ValueError(f"{paths[0]}: expected a file that is not compressed{_about_metadata(paths[0])}")
+    for path in paths:
+        _check_closed(path)
+    bound_bags()
     with _broken(paths[0]):
         reader = AnyReader([BoundedPath(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()

@@ -89,7 +89,7 @@ class Track:
 
 def _are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
     """Whether each quaternion has length 1."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         lengths = np.linalg.norm(np.reshape(np.asarray(quaternions, np.float64), (-1, 4)), axis=1)
         return np.abs(lengths - 1) <= UNIT
 

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
+from sglpr_jax.data.times import check_unit
+
 WIDEST_S = (1.0, 2.0)
 """Maximum time between two poses for interpolation, in seconds: the least and the greatest value (`widest_gap_s`)."""
 JITTER = 1.5
@@ -56,9 +58,11 @@ def match_times(
       scans: Folder of the scans, for messages.
 
     Raises:
-      ValueError: If no scan has a pose within `max_gap_s`.
+      ValueError: If no scan has a pose within `max_gap_s`, or the unit of times changes.
     """
     order = np.argsort(stamps, kind="stable")
+    check_unit(stamps[order] * tick_s, source=poses)
+    check_unit(times * tick_s, source=scans)
     rows = order[nearest_rows(stamps[order], times)]
     gaps_s = np.abs(stamps[rows] - times) * tick_s
     kept = gaps_s <= max_gap_s

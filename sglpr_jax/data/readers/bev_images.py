@@ -2,14 +2,15 @@
 
 - `00/imgs/000000.png`: 8-bit density image. The number is the frame; frames may be missing.
 - `00/labels/000000.png`: label image (`label_images.py`), optional for each frame.
-- `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame.
+- `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame (optional).
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
 from sglpr_jax.data.formats.grey_png import read_grey_png
@@ -26,10 +27,10 @@ def recording_names(root: Path) -> tuple[str, ...]:
 
 
 def open_recording(root: Path, name: str) -> Recording:
-    """Open `root/<name>`.
+    """Open `root/<name>`. Without the file of poses, `positions` is `None`.
 
     Raises:
-      FileNotFoundError: If the images or the poses are missing.
+      FileNotFoundError: If the images are missing.
       ValueError: If the poses are malformed, or an image is not named by the row of its pose.
     """
     folder = root / name
@@ -37,20 +38,25 @@ def open_recording(root: Path, name: str) -> Recording:
     if not image_paths:
         raise FileNotFoundError(f"{folder / 'imgs'}: expected images (*.png), found none")
     ids = tuple(path.stem for path in image_paths)
-    world_from_lidar = read_poses(folder / "pose.txt")
+    poses = folder / "pose.txt"
     labels = {path.stem: path for path in files_in(folder / "labels", ".png")}
-    rows = rows_of(ids, rows=len(world_from_lidar), path=folder / "pose.txt")
     return Recording(
         name=name,
         ids=ids,
-        positions=world_from_lidar[rows, :, 3],
+        positions=_positions(poses, ids) if poses.is_file() else None,
         times=None,
-        pose_source=f"{name}/pose.txt",
+        pose_source=f"{name}/pose.txt" if poses.is_file() else None,
         paths=image_paths,
         resolution_m=RESOLUTION_M,
         read=partial(image_record, read=read_image),
         label_paths=tuple(labels.get(image) for image in ids),
     )
+
+
+def _positions(path: Path, ids: Sequence[str]) -> Float[np.ndarray, "n 3"]:
+    """Positions of the frames in metres. Raises ValueError if a frame is not named by the row of its pose."""
+    world_from_lidar = read_poses(path)
+    return world_from_lidar[rows_of(ids, rows=len(world_from_lidar), path=path), :, 3]
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w"]:
@@ -69,7 +75,7 @@ def as_counts(grey: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
 
 
 READER = Reader(
-    layout="NN/imgs/*.png with NN/pose.txt (BEV images)",
+    layout="NN/imgs/*.png (BEV images)",
     recording_names=recording_names,
     open=lambda root, name, options: open_recording(root, name),
     rank=1,

@@ -25,7 +25,7 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import read_json
+from sglpr_jax.files import naming, read_json
 from sglpr_jax.poses import positions_from_camera
 
 SIMULATION = "simulation.json"
@@ -98,10 +98,8 @@ def _mounting(root: Path) -> Mounting | None:
     height = sensor.get("height_m") if isinstance(sensor, dict) else None
     if not isinstance(height, int | float):
         raise ValueError(f"{path}: expected the settings of a simulated dataset with sensor.height_m, found none")
-    try:
+    with naming(path):
         return None if height == MODEL_HEIGHT_M else Mounting(float(height))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:

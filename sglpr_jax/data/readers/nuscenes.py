@@ -22,6 +22,7 @@ from sglpr_jax.data.formats.scan_files import scan_id
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import scan_record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import naming
 from sglpr_jax.names import path_inside
 
 CHANNEL = "LIDAR_TOP"
@@ -56,19 +57,21 @@ def open_recording(root: Path, name: str) -> Recording:
     paths, rows = zip(*(there[i] for i in order), strict=True)
     keys = sum(path.parent.parent.name == "samples" for path in paths)
     missing = f", {len(scans) - len(paths)} more are listed but missing" if len(scans) > len(paths) else ""
-    return Recording(
-        name=name,
-        ids=tuple(map(scan_id, paths)),
-        positions=_positions(tables, rows),
-        times=ticks[order] / 1e6,
-        pose_source=f"{tables.name}/ego_pose.json",
-        paths=paths,
-        read=scan_record,
-        found=(
-            f"format: {described('nuscenes')}, rotated to x forward",
-            f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
-        ),
-    )
+    positions = _positions(tables, rows)
+    with naming(table):  # a scan may be listed twice
+        return Recording(
+            name=name,
+            ids=tuple(map(scan_id, paths)),
+            positions=positions,
+            times=ticks[order] / 1e6,
+            pose_source=f"{tables.name}/ego_pose.json",
+            paths=paths,
+            read=scan_record,
+            found=(
+                f"format: {described('nuscenes')}, rotated to x forward",
+                f"{keys} key frames and {len(paths) - keys} sweeps{missing}",
+            ),
+        )
 
 
 def _versions(root: Path) -> tuple[Path, ...]:

@@ -28,6 +28,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
+from sglpr_jax.files import naming
 
 ENDINGS = (".bag", ".mcap", ".db3")
 PAUSE_NS = 60 * 10**9
@@ -79,6 +80,7 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
         paths=tuple(Path(scan) for scan in ids),
         read=partial(_read, bag=bag, topic=topic, where=where),
         on_disk=False,
+        containers=bag.files,
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
     lidar = bag.frame(topic, int(recorded[0])).strip("/")
@@ -246,10 +248,8 @@ def _read(
     where: dict[str, tuple[int, int]],
 ) -> Record:
     time, nth = where[path.name]
-    try:
+    with naming(f"scan {path.name}"):
         found = bag.cloud(topic, time, nth)
-    except ValueError as error:
-        raise ValueError(f"scan {path.name}: {error}") from error
     return Record(points=found.points, lasers=found.lasers if lasers else None)
 
 

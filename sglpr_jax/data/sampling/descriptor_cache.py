@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int
 
-from sglpr_jax.files import read_arrays, replacing
+from sglpr_jax.files import replacing
+from sglpr_jax.numpy_files import read_arrays
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

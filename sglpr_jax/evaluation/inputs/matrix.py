@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Num
 
-from sglpr_jax.data.formats.arrays import read_array
 from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors
 from sglpr_jax.evaluation.inputs.positions import needed
-from sglpr_jax.files import in_short
+from sglpr_jax.files import in_short, naming
+from sglpr_jax.numpy_files import read_array
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
@@ -20,10 +20,8 @@ def read_matrix(path: Path, trajectory: Trajectory | None, *, sequence: str, dis
     """
     rows = _load(path)
     trajectory = needed(path, trajectory, rows=len(rows))
-    try:
+    with naming(path):
         return as_descriptors(rows, trajectory, sequence=sequence, method=path.stem, distance=distance)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _load(path: Path) -> Num[np.ndarray, "n d"]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from sglpr_jax.data.formats.scan_poses import poses_at_scans, unturned
 from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.files import naming
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 
@@ -20,10 +21,8 @@ def read_own_file(path: Path, trajectory: Trajectory | None) -> DescriptorFile:
     """
     file = DescriptorFile.load(path)
     if trajectory is not None:
-        try:
+        with naming(path):
             file = _placed(file, trajectory, path.name)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
     if file.positions is None:
         raise ValueError(f"{path}: expected positions to score against, found descriptors of scans without poses")
     return file

@@ -12,6 +12,7 @@ from sglpr_jax.data.formats.trajectory import Trajectory
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.evaluation.inputs.text_list import as_frame, as_score, check_rows, padded, read_lines
 from sglpr_jax.evaluation.protocols import TopK
+from sglpr_jax.files import naming
 
 Answer = tuple[int, float | None]
 """A retrieved frame and its score, or None without a score."""
@@ -34,7 +35,7 @@ def read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str)
     nearest = padded([[frame for frame, _ in row] for row in answers], fill=-1).astype(np.int64)
     frames = np.column_stack([queries, nearest])
     check_rows(where, frames, len(trajectory.positions), trajectory.source)
-    try:
+    with naming(path):
         return TopK(
             sequence=sequence,
             positions=trajectory.positions,
@@ -44,8 +45,6 @@ def read_top_k_list(path: Path, trajectory: Trajectory | None, *, sequence: str)
             nearest=nearest,
             scores=_scores(answers),
         )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _read_line(where: str, line: str) -> tuple[int, list[Answer]]:

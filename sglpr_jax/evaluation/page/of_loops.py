@@ -1,14 +1,12 @@
 """HTML page of the loops of a recording: trajectory, matched images, probabilities, rejected pairs."""
 
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.evaluation import figures, loop_figures
 from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing, paragraph
-from sglpr_jax.files import write_text
 from sglpr_jax.loops.candidates import square_image
 from sglpr_jax.loops.explanation import why_none
 from sglpr_jax.loops.find import FoundLoops
@@ -23,12 +21,6 @@ from sglpr_jax.same_place import NEGATIVE_M
 PAGE = "index.html"
 SHOWN_PAIRS = 9
 SHOWN_ROWS = 40
-
-
-def write_loops_page(found: FoundLoops, folder: Path, *, optimized: OptimizedTrajectory | None = None) -> Path:
-    """Write the page into `folder`, atomically. Without matplotlib (extra `viz`) it has no pictures."""
-    write_text(folder / PAGE, loops_page(found, optimized=optimized))
-    return folder / PAGE
 
 
 def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> str:

@@ -1,0 +1,75 @@
+"""Reading of numpy's .npy and .npz files without pickle. Declared sizes are checked before memory is allocated."""
+
+import math
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sglpr_jax.files import in_short
+
+INFLATION = 32
+"""Maximum size of the arrays of an archive, as a multiple of the size of its file. Descriptors compress less."""
+SMALL_BYTES = 2**26
+"""Arrays up to this total size are read from archives of any size: 64 MiB."""
+
+
+def read_arrays(path: Path, *, expected: str) -> dict[str, np.ndarray]:
+    """Read every array of an .npz file, without pickle.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If it is another kind of file, or damaged, or if its arrays are larger than `SMALL_BYTES` and
+        `INFLATION` times its size. All messages name the file and what was `expected`.
+    """
+    expected = f"{path}: expected {expected}"
+    if not path.is_file():
+        raise FileNotFoundError(f"{expected}, found no file")
+    size = path.stat().st_size
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{expected}, found {size} bytes that are not a complete .npz archive")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_inflated(archive.infolist(), size)
+            return {member.filename.removesuffix(".npy"): _member(archive, member) for member in archive.infolist()}
+    except Exception as error:  # zip, zlib and numpy raise many types of errors
+        raise ValueError(f"{expected}, found a broken one: {in_short(error)}") from error
+
+
+def read_array(stream: Any, *, size: int) -> np.ndarray:
+    """Read an array in numpy's format, without pickle. The header may declare more than the file contains.
+
+    Arguments:
+      stream: Open file, or member of an archive.
+      size: Size of the stream in bytes.
+
+    Raises ValueError if the header declares another size, before memory is allocated. Numpy raises many types of errors
+    for broken headers.
+    """
+    shorter = np.lib.format.read_magic(stream) == (1, 0)
+    read_header = np.lib.format.read_array_header_1_0 if shorter else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(stream)
+    declared = stream.tell() + math.prod(shape) * dtype.itemsize
+    if declared != size and not dtype.hasobject:  # numpy itself rejects pickled objects
+        raise ValueError(f"expected {declared} bytes by its header, found {size}")
+    if not dtype.itemsize and math.prod(shape):  # any number of empty values fits into any file
+        raise ValueError(f"expected values of at least one byte, found {dtype} {shape}")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _check_inflated(members: Sequence[zipfile.ZipInfo], size: int) -> None:
+    """Raise ValueError if the directory of an archive of `size` bytes declares too many bytes."""
+    declared, most = sum(member.file_size for member in members), max(SMALL_BYTES, INFLATION * size)
+    if declared > most:
+        raise ValueError(f"expected arrays of at most {most} bytes in {size} bytes, found {declared}")
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(member) as stream:
+        try:
+            return read_array(stream, size=member.file_size)
+        except Exception as error:
+            raise ValueError(f"array {member.filename!r}: {in_short(error)}") from error
