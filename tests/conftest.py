@@ -3,6 +3,7 @@
 import contextlib
 import os
 import resource
+import tempfile
 from pathlib import Path
 
 import jax
@@ -17,7 +18,10 @@ from sglpr_jax.models.sglpr import init
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sglpr-jax-tests"
+HOME = os.path.expanduser("~")
+if HOME == "~":  # a user without a home folder
+    HOME = f"{tempfile.gettempdir()}/home-{os.getuid()}"
+COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or f"{HOME}/.cache") / "sglpr-jax-tests"
 """Compiled programs, kept for all workers and for the next run. Small ones too: tests call thousands of them."""
 KEPT = {"JAX_COMPILATION_CACHE_DIR": str(COMPILED), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 jax.config.update("jax_compilation_cache_dir", str(COMPILED))
