@@ -30,7 +30,8 @@ class DemoCommand:
     """
 
     out: Path = Path("runs/demo")
-    """Output folder. The training run of an earlier demo is replaced; its simulated recordings are kept."""
+    """Output folder. The training run of an earlier demo is replaced. The simulated recordings of an earlier demo are
+    kept."""
     scans: int = SCANS
     """Scans of each recording."""
     steps: CountOrNone = 20

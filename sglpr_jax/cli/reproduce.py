@@ -31,7 +31,7 @@ class ReproduceCommand:
     paper's.
 
     Every test recording has its own models, trained on all other recordings (leave-one-out), one for each variant of a
-    table. Finished runs in --out are reused; an interrupted run is resumed.
+    table. Finished runs in --out are reused, and interrupted runs are resumed.
 
     Example:
       bin/reproduce table4 figure9 --plan                          prints the missing trainings and their duration

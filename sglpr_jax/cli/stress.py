@@ -30,14 +30,15 @@ class StressCommand:
     """Folder for results.json, config.json, command.json, stress.png and the descriptors. It is created if it does not
     exist."""
     weights: str | None = None
-    """Name of shipped weights or folder of a training run; adds the network to the methods. None: sglpr if --method is
-    not given, otherwise no network."""
+    """Name of shipped weights or folder of a training run. The network with these weights is added to the methods.
+    None: sglpr if --method is not given, otherwise no network."""
     method: tuple[MethodName, ...] = ()
     """Methods that need no weights."""
     protocol: tuple[str, ...] = ()
     """Names of protocols, or `all`. If omitted, top1-f1max and pairs-f1max."""
     corruption: tuple[str, ...] = ()
-    """Names (beams-16) or kinds (beams) of corruptions. If omitted, all; for ready-made images, only rotation."""
+    """Names (beams-16) or kinds (beams) of corruptions. If omitted, all corruptions, or only rotation for ready-made
+    images."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     seed: CountOrNone = 0
     """Seed of the corruptions. The seed and the scan's number determine the corruption of a scan."""

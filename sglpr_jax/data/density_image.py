@@ -16,7 +16,8 @@ REACH_M = 25.0
 FLOOR_M = -1.2
 """Minimum height of a point above the sensor, in metres. It is about 0.5 m above the road."""
 CEILING_M = 200.0
-"""Maximum height of a point above the sensor, in metres. No scan reaches it; it keeps voxel numbers within 32 bits."""
+"""Maximum height of a point above the sensor, in metres. No scan reaches this height. The limit keeps voxel numbers
+within 32 bits."""
 MAX_VOXELS = 6000
 """Maximum number of voxels of a scan."""
 MOST_SPREAD = 2**25

@@ -42,7 +42,7 @@ def loops(
 
 
 def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.figure.Figure":
-    """Draw named trajectories from above. The first is grey; a dot marks the end of each."""
+    """Draw named trajectories from above. The first trajectory is grey. A dot marks the end of each trajectory."""
     figure = figure_from_above(np.concatenate(list(named.values())))
     axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
     for (name, positions), colour in zip(named.items(), ("0.6", "#2b5fc4", "#d62728"), strict=False):

@@ -43,7 +43,7 @@ def stress_test(
       methods: Methods by name.
       folder: Folder for descriptors. Descriptors with the same settings are reused.
       corruptions: Names or kinds of corruptions. By default all; for ready-made images only rotation.
-      protocols: Names of protocols that score descriptors. By default top-1 F1max and pairs F1max.
+      protocols: Names of protocols that score descriptors. By default, top-1 F1max and pairs F1max are used.
       seed: Seed of the corruptions.
       batch: Number of scans described at a time.
       progress: Reports the progress of each embedding.

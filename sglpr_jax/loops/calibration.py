@@ -1,8 +1,8 @@
 """Calibration of loop probabilities on a drive with odometry, without labelled loops.
 
-Negative pairs are farther apart than the odometry can drift; those with the nearest descriptors are used. Positive
-pairs are some metres apart in one pass, with one scan rotated. They are easier than revisits, because nothing has moved
-between the two scans.
+Negative pairs are farther apart than the odometry can drift. Of these pairs, the ones with the nearest descriptors are
+used. Positive pairs are some metres apart in one pass, with one scan rotated. They are easier than revisits, because
+nothing has moved between the two scans.
 """
 
 from collections.abc import Callable

@@ -33,7 +33,7 @@ class LoopDetector:
     """Finds loop closures in a stream of scans or images, with or without times and odometry.
 
     `LoopModel` computes the probability of a pair from descriptors and images. The sequential test (`loops.sequence`)
-    adds the evidence of neighbouring frames; at least one neighbour must agree. Loops that contradict the odometry are
+    adds the evidence of neighbouring frames. At least one neighbour must agree. Loops that contradict the odometry are
     rejected. Without odometry, loops that contradict the motion estimated from the images are rejected. The first loop
     of a revisit is returned at least one frame late, together with others.
 

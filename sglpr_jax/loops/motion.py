@@ -1,9 +1,9 @@
 """Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
 
-The test for repeating places needs to know which earlier scans resemble the query because they show the same place.
-The motion is accurate enough for that over some tens of metres; it does not replace odometry. Where the surroundings
-do not show how the sensor moved, as in a tunnel, the motion is unknown and a new segment begins. Its pose is
-extrapolated at the last known velocity, and its drift grows fast.
+The test for repeating places needs to know which earlier scans resemble the query because they show the same place. The
+motion is accurate enough for this purpose over some tens of metres. It does not replace odometry. Where the
+surroundings do not show how the sensor moved, as in a tunnel, the motion is unknown and a new segment begins. Its pose
+is extrapolated at the last known velocity, and its drift grows fast.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Exhaustive search of the pose between two images: all rotations and shifts, on merged cells.
 
 The square root of the query's image is rotated, band-passed and correlated with the square root of the match's image.
-The band-pass is the difference of a narrow and a wide blur. It keeps structures as wide as a wall, a pole or a trunk;
-without it one street looks like any other. The correlation is needed at small shifts only, so the inverse Fourier
-transform is a product with small matrices, which is faster than a full transform.
+The band-pass is the difference of a narrow and a wide blur. The band-pass keeps structures as wide as a wall, a pole or
+a trunk. Without the band-pass, one street looks like any other. The correlation is needed at small shifts only, so the
+inverse Fourier transform is a product with small matrices, which is faster than a full transform.
 """
 
 import functools

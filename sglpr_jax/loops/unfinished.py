@@ -156,7 +156,7 @@ class Unfinished:
             self.kept = len(finder.index)
 
     def keep(self, finder: CandidateFinder, candidates: Sequence[Candidate] = (), *, all: bool = False) -> None:
-        """Write the new frames if they fill a file; with `all`, write them in any case. Raises WriteError."""
+        """Write the new frames if they fill a file or, with `all`, in any case. Raises WriteError."""
         first, end = self.kept, len(finder.index)
         if end - first < (1 if all else FRAMES):
             return

@@ -17,7 +17,7 @@ def average(models: Sequence[Params], *, shares: Sequence[float] | None = None) 
 
     The average is useful only if one training started from the weights of another. In independent trainings the same
     channel has different meanings. Whitening layers are removed, because each was fitted to the descriptors of its own
-    model; fit a new one.
+    model. Fit a new one to the average.
 
     Arguments:
       models: Models whose configurations are equal except for the whitening layer.

@@ -81,7 +81,7 @@ def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]):
 
 
 def gelu(x: Float[Array, "*dims"]) -> Float[Array, "*dims"]:
-    """Exact GELU: x times the normal distribution function. It uses erf; `jax.nn.gelu` uses the slower erfc."""
+    """Exact GELU: x times the normal distribution function. It uses erf, `jax.nn.gelu` the slower erfc."""
     return 0.5 * x * (1 + jax.lax.erf(x * math.sqrt(0.5)))
 
 

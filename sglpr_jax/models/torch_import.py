@@ -68,7 +68,7 @@ class SwinTImport(NamedTuple):
 
 
 def import_swin_unet(params: Params, path: Path | str) -> Params:
-    """Load the backbone, the expansion and the segmentation head from a Swin-Unet checkpoint; the place head is kept.
+    """Load the backbone, the expansion and the segmentation head from a Swin-Unet checkpoint. The place head is kept.
 
     Raises:
       FileNotFoundError: If the file does not exist.

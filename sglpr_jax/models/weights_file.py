@@ -70,7 +70,7 @@ def load(weights: Path | str) -> Params:
     For the directory of a training run, its `weights` folder is read. The values are converted to float32.
 
     Arguments:
-      weights: A name from `shipped_weights()`, or a folder. Names take precedence; a folder with the same name is
+      weights: A name from `shipped_weights()`, or a folder. Names take precedence. Write a folder with the same name as
         "./NAME".
 
     Raises:

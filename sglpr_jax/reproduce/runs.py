@@ -33,7 +33,9 @@ WITHOUT_TRAINING = "without-training"
 
 @functools.cache
 def _opened(data: Path, seq: str, pose_source: PoseChoice) -> Recording:
-    """Open a recording once. If a scan disappears later, reading it fails; a new listing would silently omit it."""
+    """Open a recording once. If a scan disappears later, reading it fails. A second opening would silently omit the
+    scan.
+    """
     return open_recording(data, seq, pose_source=pose_source)
 
 

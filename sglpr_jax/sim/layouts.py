@@ -122,7 +122,9 @@ def nclt_scan(points: Float[np.ndarray, "n 4"], _labels: np.ndarray, _mounting: 
 
 
 def _nclt_files(poses: TimedPoses) -> dict[str, bytes]:
-    """Ground truth in the axes north, east, down. It has one row per scan; NCLT has 100 rows per second."""
+    """Ground truth in the axes north, east, down. The file has one row per scan. NCLT's own files have 100 rows per
+    second.
+    """
     lidar_from_body = np.eye(4)
     lidar_from_body[2, 3] = -NCLT_HEIGHT_M
     world_from_body = poses.world_from_lidar @ lidar_from_body

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 
 class Callback:
-    """Follows a training run. Subclasses override the methods they need; the defaults do nothing.
+    """Follows a training run. Subclasses override the methods that they need. The methods of this class do nothing.
 
     If several hosts train together, only the first host calls them.
 

@@ -1,4 +1,5 @@
-"""Checkpoints of a training run. They are written atomically with checksums; the newest ones and the best are kept.
+"""Checkpoints of a training run. Checkpoints are written atomically with checksums. The newest ones and the best one
+are kept.
 
 This is the only file that imports orbax.
 
@@ -137,7 +138,8 @@ class Checkpoints:
         return found.unlogged[_UNLOGGED]
 
     def best_params(self, config: TrainConfig) -> Params:
-        """Return the weights with the best score among the kept checkpoints; of equal scores, the latest.
+        """Return the weights with the best score among the kept checkpoints. Of several equal scores, the latest
+        counts.
 
         Raises ValueError if there is no checkpoint.
         """

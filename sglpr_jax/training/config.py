@@ -12,7 +12,7 @@ from sglpr_jax.models.config import ModelConfig
 class LossConfig:
     """Weights and variants of the loss (equations 5 and 8).
 
-    The paper gives no margin and no distance; docs/decisions/paper.md explains the values used here.
+    The paper gives no margin and no distance. docs/decisions/paper.md explains the values used here.
     """
 
     margin: NotNegative = 0.3
@@ -20,7 +20,7 @@ class LossConfig:
     squared: bool = False
     """Use squared descriptor distances in equation 5."""
     closest_positive: bool = True
-    """Compare the anchor with its closest positive; otherwise with its farthest."""
+    """Compare the anchor with its closest positive. If False, compare it with its farthest positive."""
     reduction: Literal["max", "sum"] = "max"
     """`max` is the lazy triplet loss. `sum` adds up all negatives inside the margin."""
     temperature: NotNegative = 0.0
@@ -111,7 +111,7 @@ class TrainConfig:
     share_negatives: bool = False
     """Use the places of all tuples of a step as negatives, if they are far enough away."""
     also_tuples: CountOrNone = 0
-    """Tuples per step from the second dataset; they are part of `tuples`."""
+    """Tuples per step from the second dataset, included in `tuples`."""
     also_triplets: bool = False
     """Include the tuples of the second dataset in the triplet loss. Otherwise they are random places for the
     segmentation losses alone."""
@@ -125,7 +125,8 @@ class TrainConfig:
     by any angle."""
     occlusion: OcclusionConfig = OcclusionConfig()
     max_points: Count = 131072
-    """Maximum number of points of a scan. Smaller scans are padded to this size; larger ones are thinned evenly."""
+    """Maximum number of points of a scan. Smaller scans are padded to this size, and larger scans are thinned
+    evenly."""
     seed: CountOrNone = 0
     """Seed of the weights and of all random choices."""
     log_every: Count = 10

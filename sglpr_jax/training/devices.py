@@ -25,8 +25,8 @@ Function = TypeVar("Function", bound=Callable)
 def data_mesh(config: TrainConfig, devices: Sequence[Any] | None = None) -> Mesh:
     """Arrange the devices of a run (default: all) in one row, host after host.
 
-    Their number must divide the tuples of a step and the images of a chunk. Each host uses the largest possible number;
-    idle devices are reported on stderr. Raises ValueError if one device per host is already too many.
+    Their number must divide the tuples of a step and the images of a chunk. Each host uses the largest possible number.
+    Idle devices are reported on stderr. Raises ValueError if one device per host is already too many.
     """
     by_host: dict[int, list[Any]] = {}
     for device in jax.devices() if devices is None else devices:

@@ -49,9 +49,9 @@ def validation_score(
 def retrieval(descriptors: Float32[np.ndarray, "n d"], pool: TuplePool, *, gap: int) -> tuple[float, float]:
     """Return Recall@1 and top-1 F1max. Every frame searches other recordings and frames more than `gap` frames away.
 
-    Recall@1 is the fraction found among the frames with a match; there must be at least one. For F1max, the nearest
-    frame is accepted up to a threshold on the descriptor distance. It is right within the positive distance of places
-    and wrong beyond the negative one.
+    Recall@1 is the fraction found among the frames with a match. At least one frame must have a match. For F1max, the
+    nearest frame is accepted up to a threshold on the descriptor distance. It is right within the positive distance of
+    places and wrong beyond the negative one.
     """
     every = np.arange(len(pool))
     same_recording = pool.recording[:, None] == pool.recording[None]

@@ -131,7 +131,7 @@ def test_one_far_frame_among_many_is_found():
 
 
 def test_drives_without_positives_or_negatives_are_refused():
-    with pytest.raises(ValueError, match=r"no two frames lie within 3\.0 m"):
+    with pytest.raises(ValueError, match=r"expected frames within 3\.0 m"):
         TuplePool([np.arange(30.0).reshape(10, 3) * 5], TupleConfig())
     pool = TuplePool([np.zeros((5, 3))], TupleConfig())
     with pytest.raises(ValueError, match=r"no frame lies farther than 20\.0 m from frame \d of the pool"):

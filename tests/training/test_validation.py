@@ -85,5 +85,5 @@ def test_revisits_count_where_there_are_any_and_neighbours_elsewhere(monkeypatch
 
 def test_a_part_without_two_frames_of_one_place_is_refused():
     street = np.column_stack([np.arange(60.0) * 10, np.zeros((60, 2))])
-    with pytest.raises(ValueError, match=r"validation\.share is too small: no two frames lie within 3\.0 m"):
+    with pytest.raises(ValueError, match=r"validation\.share is too small: expected frames within 3\.0 m"):
         validation_score([sequence(street)], [np.arange(5)], TrainConfig())

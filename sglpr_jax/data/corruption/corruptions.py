@@ -130,7 +130,8 @@ CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() f
 
 
 def chosen_corruptions(names: Sequence[str]) -> tuple[Corruption, ...]:
-    """Return the corruptions with the given names. A kind selects all its strengths; no names select everything.
+    """Return the corruptions with the given names. A kind selects all its strengths. Without names, all corruptions are
+    returned.
 
     Raises:
       ValueError: If a name is unknown. The message contains the nearest name.

@@ -45,7 +45,7 @@ class Track:
     positions: Float[np.ndarray, "n 3"]
     """Positions in metres."""
     quaternions: Float[np.ndarray, "n 4"]
-    """Quaternions x, y, z, w. They are not normalised and may be invalid; see `turned`."""
+    """Quaternions x, y, z, w. The quaternions are not normalised and may be invalid (see `turned`)."""
     child: str
     """Child frame, such as "base_link". Empty if the messages do not name it."""
     frame: str

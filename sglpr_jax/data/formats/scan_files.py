@@ -39,7 +39,7 @@ def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
     """Return the format of a scan by its name, for "auto".
 
     The ending defines the format of files with a header. `*.pcd.bin` is nuscenes. A file in a folder `velodyne_sync` is
-    nclt. The name of any other .bin file does not define a format; it is `records`.
+    nclt. The name of any other .bin file does not define a format. Such a file has the format `records`.
     """
     for format in READERS:
         if path.suffix.lower() == f".{format}":

@@ -1,6 +1,6 @@
 """Reader of ready-made BEV images in BEVPlace's layout.
 
-- `00/imgs/000000.png`: 8-bit density image. The number is the frame; frames may be missing.
+- `00/imgs/000000.png`: 8-bit density image. The file name is the number of the frame. Frames may be missing.
 - `00/labels/000000.png`: label image (`label_images.py`), optional for each frame.
 - `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame (optional).
 """

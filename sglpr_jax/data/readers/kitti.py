@@ -1,6 +1,6 @@
 """Reader of the layout of KITTI odometry and SemanticKITTI.
 
-- `sequences/08/velodyne/000000.bin`: a scan. The number is the frame; frames may be missing.
+- `sequences/08/velodyne/000000.bin`: a scan. The file name is the number of the frame. Frames may be missing.
 - `sequences/08/labels/000000.label`: SemanticKITTI's labels, optional for each frame.
 - `sequences/08/times.txt`: timestamps in seconds, one line per frame (optional).
 - `sequences/08/poses.txt`: SemanticKITTI's poses. Their loops are also closed in height.

@@ -75,7 +75,7 @@ def open_recording(root: Path, name: str) -> Recording:
 
 
 def _versions(root: Path) -> tuple[Path, ...]:
-    """Folders of tables. v1.0-mini comes first; it is the fastest to read."""
+    """Folders of tables. v1.0-mini comes first, because it is the fastest to read."""
     return tuple(sorted(path.parent for path in root.glob("v1.0-*/scene.json")))
 
 

@@ -29,8 +29,8 @@ class TupleConfig:
     cluster_m: NotNegative = 100.0
     """Maximum distance of the anchors of a cluster from its first anchor, in metres."""
     mining: Literal["none", "hardest"] = "none"
-    """`none`: random negatives, as in the paper. `hardest`: negatives that look most like the anchor (BEVPlace++);
-    anchors of a cluster are then similar instead of near each other."""
+    """`none`: random negatives, as in the paper. `hardest`: negatives whose descriptors are most similar to the
+    anchor's (BEVPlace++). The anchors of a cluster then have similar descriptors instead of being near each other."""
     hardest: CountOrNone = 10
     """Number of most similar places beyond the negative distance, from which negatives are drawn."""
     refresh_steps: CountOrNone = 1000

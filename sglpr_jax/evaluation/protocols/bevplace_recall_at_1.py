@@ -12,9 +12,9 @@ def bevplace_recall_at_1(source: Source, *, seed: int = 0) -> Result:
     A query counts if the database has a frame less than 5 m away. It is found if the frame of the nearest descriptor is
     less than 5 m away. The published split is used if name and number of frames are those of a KITTI sequence with a
     published split. For other recordings the database is the first 60 % of the frames. Their queries begin at the first
-    frame 20 m from the last frame of the database, because frames in between are neighbours and no revisits.
-    Published on the LiDAR-frame poses that come with the images (zjuluolun/BEVPlace2, kitti_dataset.py). The published
-    code uses every fifth frame of sequence 08; here all frames are used. The interval resamples the queries that count.
+    frame 20 m from the last frame of the database, because frames in between are neighbours and no revisits. Published
+    on the LiDAR-frame poses that come with the images (zjuluolun/BEVPlace2, kitti_dataset.py). The published code uses
+    every fifth frame of sequence 08. Here all frames are used. The interval resamples the queries that count.
     """
     return recall_on_split(source, "Recall@1", "BEVPlace++", SPLITS, dimensions=3, numbers=(1,), seed=seed)
 

@@ -30,7 +30,7 @@ def overlap_transformer_f1max(
     The database of frame i is frames 0 to i - 101. The last frame is not a query. Queries of F1max begin at frame 150.
     An accepted answer is a true positive if it overlaps with the query, else a false positive. A rejected answer is a
     false negative if the database has an overlapping frame, else a true negative. Every distinct distance is a
-    threshold; the published code uses 10,000 thresholds up to a squared distance of 1. Recall@1, 5, 10, 20 and 1 % of
+    threshold. The published code uses 10,000 thresholds up to a squared distance of 1. Recall@1, 5, 10, 20 and 1 % of
     all frames are over all queries with an overlapping frame. Published on KITTI 00 with overlaps from its poses
     (haomo-ai/OverlapTransformer, test/test_kitti00_PR.py). The interval resamples the queries of F1max.
 

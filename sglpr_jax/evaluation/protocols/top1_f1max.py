@@ -16,7 +16,7 @@ def top1_f1max(source: Source, *, seed: int = 0) -> Result:
     The answer to a query is the nearest descriptor among the frames at least 30 s older. `revisits.database_end` has
     the exact rule. An accepted answer is a true positive up to 3 m away and a false positive beyond 20 m. In between it
     is not counted. A rejected answer is a false negative if the database has a frame within 3 m of the query, else a
-    true negative. Every distinct distance is a threshold; the published code uses 1000 thresholds (Locus: 200).
+    true negative. Every distinct distance is a threshold. The published code uses 1000 thresholds (Locus: 200).
     Published on SemanticKITTI's poses (LoGG3D-Net, evaluation/eval_sequence.py). The interval resamples queries.
     """
     return score_top1(source, "top-1 F1max", f"{METRES}, {excluded(source)}", lambda apart: apart > NEGATIVE_M, seed)

@@ -1,8 +1,9 @@
 """The paper's Swin-Unet on tokens of circular convolutions, which a rotation of the scan only shifts.
 
-A patch of eight sectors changes under rotations smaller than its size; a convolution follows them. Therefore the stem
-reduces the polar image like the circular CNN, and the attention windows use the resulting tokens. A rotation by a whole
-number of windows of the coarsest map is a shift of the tokens. Other rotations must be learnt.
+A patch of eight sectors changes under rotations smaller than the patch. The result of a convolution shifts with such
+rotations. Therefore the stem reduces the polar image like the circular CNN, and the attention windows use the resulting
+tokens. A rotation by a whole number of windows of the coarsest map is a shift of the tokens. Other rotations must be
+learnt.
 """
 
 import dataclasses
