@@ -93,11 +93,11 @@ def read_value(value: Any, annotation: Any, field: str) -> Any:
 
     Arguments:
       value: JSON value, or the value of a field.
-      annotation: Annotation of the field, without nested configurations.
-      field: Name of the field for the message.
+      annotation: Type annotation of the field. It may not be a nested configuration.
+      field: Name of the field, for error messages.
 
     Raises:
-      ValueError: If the field rejects the value. A `float` without bounds accepts infinity.
+      ValueError: If the value does not fit the annotation. Infinity fits a `float` without bounds.
     """
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:

@@ -263,12 +263,12 @@ def check_writable(path: Path) -> None:
 
 
 def half_written(folder: Path) -> list[Path]:
-    """Return the hidden paths of `replacing` that killed processes left in `folder` and below."""
+    """Return the unfinished files and folders of `replacing` in `folder` and below, left by killed processes."""
     return list(folder.rglob(".*.tmp"))
 
 
 def remove_half_written(folder: Path) -> None:
-    """Remove the hidden paths of `replacing` that killed processes left in `folder` and below."""
+    """Remove the unfinished files and folders of `replacing` in `folder` and below, left by killed processes."""
     for left in half_written(folder):
         _remove(left)
 

@@ -114,7 +114,7 @@ def _check(command: LoopsCommand) -> None:
     for path in (command.odometry, command.source.poses, command.source.times):
         if path is not None and path.resolve() in written:
             raise ValueError(
-                f"{path}: expected an input that is no output file, found one that this run would overwrite"
+                f"{path}: expected inputs that this run does not overwrite, found an output file; choose another --out"
             )
 
 

@@ -152,10 +152,10 @@ def _solved(
 def _bend(
     odometry: Float[np.ndarray, "n 4 4"], poses: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], **rules: Any
 ) -> Float[np.ndarray, " k"]:
-    """Deviation of a solution from the odometry for each inlier, in sigmas.
+    """Deviation of the solved poses from the odometry at each loop, in standard deviations.
 
-    It is the maximum over the path between the two frames of the inlier and the paths from them to neighbouring frames
-    of inliers.
+    Deviations are measured along the path between the two frames of the loop, and along the paths from each of them to
+    the next earlier and later frame of any loop. The largest one counts.
     """
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))

@@ -106,7 +106,7 @@ class LayerNorm(nn.Module):
 def layer_norm(
     x: Float[Array, "n c"], scale: Float[Array, " c"], bias: Float[Array, " c"], epsilon: float
 ) -> Float[Array, "n c"]:
-    """Normalise every row. The derivative is explicit, because XLA passes over the rows more often for JAX's."""
+    """Normalise every row. XLA passes over the rows more often for the derivative of JAX than for this one."""
     mean, per_deviation = _statistics(x, epsilon)
     return (x - mean) * (per_deviation * scale[None]) + bias[None]
 

@@ -93,7 +93,7 @@ class TupleBatches(BatchSource):
 
 
 def _named(recordings: Sequence[Recording], pool: TuplePool, frames: Int[np.ndarray, "t k"]) -> list[str]:
-    """Describe frames of a pool: their recordings and the ids of their scans."""
+    """Return the recordings and scan ids of the given frames, as text for messages."""
     places, named = np.unique(frames), []
     for number, recording in enumerate(recordings):
         ids = [recording.ids[pool.frame[f]] for f in places[pool.recording[places] == number]]

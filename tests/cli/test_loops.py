@@ -196,7 +196,7 @@ def test_input_that_the_run_would_write_is_refused(command, town, odometry, tmp_
     path = tmp_path / "found" / "trajectory-optimized.tum"
     write_tum(path, odometry, np.arange(float(SCANS)))
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found", flag, path)
-    assert_one_line_error(ended, "trajectory-optimized.tum: expected an input that is no output file")
+    assert_one_line_error(ended, "trajectory-optimized.tum: expected inputs that this run does not overwrite")
     assert path.exists()
 
 

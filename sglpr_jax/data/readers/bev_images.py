@@ -31,7 +31,7 @@ def open_recording(root: Path, name: str) -> Recording:
 
     Raises:
       FileNotFoundError: If the images are missing.
-      ValueError: If the poses are malformed, or an image is not named by the row of its pose.
+      ValueError: If the poses are malformed, or the name of an image is not the number of a row of poses.
     """
     folder = root / name
     image_paths = files_in(folder / "imgs", ".png")
@@ -54,7 +54,7 @@ def open_recording(root: Path, name: str) -> Recording:
 
 
 def _positions(path: Path, ids: Sequence[str]) -> Float[np.ndarray, "n 3"]:
-    """Positions of the frames in metres. Raises ValueError if a frame is not named by the row of its pose."""
+    """Positions of the frames in metres. Raises ValueError if an id is not the number of a row of poses."""
     world_from_lidar = read_poses(path)
     return world_from_lidar[rows_of(ids, rows=len(world_from_lidar), path=path), :, 3]
 
