@@ -108,7 +108,7 @@ def rotate_labels(labels: Int[Array, "*b h w"], angle: Float[Array, "*b"]) -> In
 
 
 def _rotated(image: Shaped[Array, "*b h w"], angle: Float[Array, "*b"], *, order: int) -> Shaped[Array, "*b h w"]:
-    """Images rotated about their centre. Order 0 takes the nearest cell, order 1 interpolates."""
+    """Rotate images about their centre by `angle`, in radians. Order 0 takes the nearest cell, order 1 interpolates."""
     *batch, height, width = image.shape
     down, right = np.mgrid[:height, :width].astype(np.float32)
     down, right = down - (height - 1) / 2, right - (width - 1) / 2

@@ -53,7 +53,7 @@ def read_array(stream: Any, *, size: int) -> np.ndarray:
     shape, _, dtype = read_header(stream)
     declared = stream.tell() + math.prod(shape) * dtype.itemsize
     if declared != size and not dtype.hasobject:  # numpy itself rejects pickled objects
-        raise ValueError(f"expected {declared} bytes by its header, found {size}")
+        raise ValueError(f"expected {declared} bytes of data, as its header declares, found {size}")
     if not dtype.itemsize and math.prod(shape):  # any number of empty values fits into any file
         raise ValueError(f"expected values of at least one byte, found {dtype} {shape}")
     stream.seek(0)

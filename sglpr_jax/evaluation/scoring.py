@@ -94,7 +94,7 @@ def evaluate(
     """Score descriptors, a top-k list or scored pairs.
 
     Arguments:
-      source: A file that `evaluation.inputs` can read, an input read from one, or descriptors (n, d) as an array of
+      source: A file that `evaluation.inputs` can read, an opened input, or descriptors (n, d) as an array of
         numpy, of JAX or of any type that numpy converts.
       protocols: Names in `PROTOCOLS`. `all` selects every protocol that fits the source. An empty sequence selects
         the default protocols that fit, or every protocol that fits if no default does.
@@ -142,7 +142,9 @@ def _of_array(rows: ArrayLike, trajectory: Trajectory | None, distance: str) -> 
     """Return an array as unnamed descriptors. Raises ValueError without a matrix or without positions."""
     rows = np.asarray(rows)
     if rows.ndim != 2:
-        raise ValueError(f"expected a file, an input read from one, or descriptors (n, d), found {rows.shape}")
+        raise ValueError(
+            f"expected a file, an opened input, or descriptors (n, d), found an array of shape {rows.shape}"
+        )
     if trajectory is None:
         raise ValueError(f"expected positions of {len(rows)} frames beside their descriptors, found none")
     return as_descriptors(rows, trajectory, sequence="", method="", distance=distance)

@@ -93,7 +93,7 @@ def stress_protocols(names: Sequence[str]) -> list[str]:
 def fitting_corruptions(
     recording: Recording, names: Sequence[str], seed: int
 ) -> tuple[tuple[Corruption, ...], dict[str, str]]:
-    """Return the corruptions that fit the recording, and the reasons why others were skipped.
+    """Return the corruptions that can be applied to the recording, and for each skipped one the reason.
 
     Each corruption is tried on three scans. Corruptions that need laser rings are skipped if the scans have no rings.
 
@@ -103,7 +103,8 @@ def fitting_corruptions(
       seed: Seed of the corruptions.
 
     Raises:
-      ValueError: If the recording has no poses, if another corruption does not fit, or if all corruptions were skipped.
+      ValueError: If the recording has no poses, if a corruption fails for another reason than missing rings, or if all
+        corruptions were skipped.
     """
     if recording.positions is None:
         raise ValueError(f"sequence {recording.name}: expected poses to score against, found none")

@@ -1,4 +1,4 @@
-"""Semantic maps of scans and ready-made images, by the segmentation head that training uses."""
+"""Semantic maps of scans and ready-made images, predicted by the segmentation head that training uses."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

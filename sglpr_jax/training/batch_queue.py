@@ -20,7 +20,7 @@ class BatchSource(ABC):
         """Return this host's part of the batch of a step. Repeated calls return the same batch."""
 
     def refresh(self, step: int, params: Params) -> None:
-        """Update the source with the weights before `step`. The batches from that step on may depend on them."""
+        """Give the source the weights before a step. The batches from that step on may depend on these weights."""
         return None  # default: the batches do not depend on the weights
 
     def places(self, step: int) -> str:

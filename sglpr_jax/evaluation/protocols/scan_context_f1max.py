@@ -12,13 +12,15 @@ GAP = 50
 
 
 def scan_context_f1max(source: Source, *, seed: int = 0) -> Result:
-    """Score top-1 retrieval as Scan Context's evaluator does: 5 m in x and y, a gap of 50 frames.
+    """Score top-1 retrieval as Scan Context's evaluator does: 5 m in x and y.
 
-    The database of frame i is frames 0 to i - 49. The last frame is not a query. An accepted answer is a true positive
+    The database of frame i is frames 0 to i - 49. The last frame is not a query. An answer is accepted if its
+    descriptor distance is at most the threshold. An accepted answer is a true positive
     if it is less than 5 m away, else a false positive. A rejected answer is a false negative if the database has a
     frame less than 5 m away, else a true negative. The published code (gisbi-kim/scancontext, fast_evaluator/main.m)
     compares 50 candidates chosen by ring key, at 100 thresholds. Here all frames are compared and every distinct
-    distance is a threshold. Published on the pose files of that code, one per sequence. The interval resamples queries.
+    distance is a threshold. The published numbers belong to the pose files of that code, one for each sequence. The
+    confidence interval is a bootstrap over queries.
     """
     result = Result(
         name="Scan Context F1max",

@@ -53,8 +53,8 @@ class CircularBlock(nn.Module):
 class CircularNet(nn.Module):
     """Network from the polar image to the features of the place head and all intermediate maps.
 
-    Average pooling loses details that are smaller than its blocks. Therefore, fine blocks run beside the others at the
-    full number of sectors. Their maps are averaged to the size of the maps that they join.
+    Average pooling loses details that are smaller than its window. Therefore, a second branch of blocks keeps all
+    sectors. Each of its maps is averaged to the size of a map of the main branch, to which it is joined.
     """
 
     config: CircularConfig
@@ -76,7 +76,10 @@ class CircularNet(nn.Module):
 
 
 class CircularDecoder(nn.Module):
-    """Decoder from the features to the resolution of the averaged image. It uses every finer map again."""
+    """Decoder from the features to the resolution of the image after average pooling.
+
+    At each finer resolution it joins the last map that the network computed there (skip connection).
+    """
 
     widths: tuple[int, ...]
     """Channels of the blocks that made the maps."""

@@ -68,7 +68,11 @@ class SwinUnet(nn.Module):
         return x
 
     def _decode(self, x, stages: list[dict], seen: dict, train: bool):
-        """Decoder stage i has the resolution of encoder stage `level`. Stage 0 only expands the bottleneck."""
+        """Return the map of the last decoder stage for the bottleneck features `x`.
+
+        Decoder stage i has the resolution of encoder stage n - 1 - i and adds the channels of that stage from `seen`.
+        Stage 0 only expands the bottleneck.
+        """
         for i, level in enumerate(reversed(range(len(stages)))):
             if i > 0:
                 x = jnp.concatenate([x, seen[f"skip{level}"]], axis=-1)
