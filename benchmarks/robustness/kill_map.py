@@ -21,7 +21,7 @@ from rich.progress import track
 
 import sglpr_jax
 from sglpr_jax.files import half_written, remove_half_written
-from sglpr_jax.loops.graph_files import write_tum
+from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.sim import Sensor, write_dataset
 

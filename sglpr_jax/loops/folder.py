@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import text_bytes, write_all
 from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.graph_files import (
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop_files import (
     write_g2o,
     write_kitti,
     write_loops_csv,
@@ -20,7 +21,6 @@ from sglpr_jax.loops.graph_files import (
     write_rejected_jsonl,
     write_tum,
 )
-from sglpr_jax.loops.loop import Loop
 
 GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
 REJECTED = "rejected.jsonl"

@@ -13,7 +13,7 @@ from sglpr_jax.data.readable import only
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.choices import OdometryFormat
-from sglpr_jax.loops.graph_files import read_g2o
+from sglpr_jax.loops.loop_files import read_g2o
 from sglpr_jax.poses import are_rotations
 
 BAGS = (".bag", ".mcap", ".db3")

@@ -12,8 +12,8 @@ from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.loops import find
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
-from sglpr_jax.loops.graph_files import read_g2o, read_loops_jsonl, write_kitti, write_tum
 from sglpr_jax.loops.loop import Loop, Rejected
+from sglpr_jax.loops.loop_files import read_g2o, read_loops_jsonl, write_kitti, write_tum
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights_file import load
 

@@ -7,7 +7,7 @@ import pytest
 from bags import TRANSFORMS, header, transforms, typestore, write_bag
 
 from sglpr_jax.data.formats.pose_files import read_tum
-from sglpr_jax.loops.graph_files import read_g2o, write_tum
+from sglpr_jax.loops.loop_files import read_g2o, write_tum
 from sglpr_jax.loops.optimization import trajectory_error
 from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.transforms import inverse, quaternions, transform

@@ -11,7 +11,7 @@ import pytest
 
 from sglpr_jax.cli.config_file import COMMAND_FILE
 from sglpr_jax.data import open_recording
-from sglpr_jax.loops.graph_files import write_tum
+from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.sim import Sensor, write_dataset
 
 pytestmark = pytest.mark.slow

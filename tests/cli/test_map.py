@@ -11,8 +11,8 @@ import sglpr_jax
 from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data import open_recording
 from sglpr_jax.loops import places
-from sglpr_jax.loops.graph_files import write_tum
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.loops.places import PlaceMap, Relocated, map_recording
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights import weights_hash

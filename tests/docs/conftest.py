@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import sglpr_jax
-from sglpr_jax.loops.graph_files import write_tum
+from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.methods.registry import method_named
 from sglpr_jax.sim import Sensor, write_dataset
 

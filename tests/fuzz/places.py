@@ -14,7 +14,8 @@ from sglpr_jax.data.cache.packed import open_pack, packed
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.graph_files import (
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop_files import (
     read_g2o,
     read_loops_csv,
     read_loops_jsonl,
@@ -22,7 +23,6 @@ from sglpr_jax.loops.graph_files import (
     write_loops_csv,
     write_loops_jsonl,
 )
-from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.retrieval.index import Index

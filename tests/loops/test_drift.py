@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.drift import deviations, position_deviations, step_deviations
-from sglpr_jax.loops.graph_files import read_g2o, write_g2o
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop_files import read_g2o, write_g2o
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
 

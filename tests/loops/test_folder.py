@@ -14,8 +14,8 @@ from sglpr_jax.files import WriteError
 from sglpr_jax.loops import folder
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.graph_files import read_g2o, read_loops_csv, read_loops_jsonl
 from sglpr_jax.loops.loop import Loop, Rejected
+from sglpr_jax.loops.loop_files import read_g2o, read_loops_csv, read_loops_jsonl
 from sglpr_jax.loops.transforms import transform
 
 

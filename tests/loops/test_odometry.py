@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
-from sglpr_jax.loops.graph_files import write_g2o, write_kitti, write_tum
+from sglpr_jax.loops.loop_files import write_g2o, write_kitti, write_tum
 from sglpr_jax.loops.odometry import at_scans, read_odometry
 from sglpr_jax.loops.transforms import transform
 

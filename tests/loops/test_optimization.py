@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.graph_files import read_g2o, write_g2o
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop_files import read_g2o, write_g2o
 from sglpr_jax.loops.optimization import MOST_RISEN_M, optimize_trajectory, optimized, trajectory_error
 from sglpr_jax.loops.transforms import from_quaternions, inverse, transform
 

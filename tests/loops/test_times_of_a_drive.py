@@ -21,7 +21,7 @@ from sglpr_jax.loops.candidates import Candidate, Compared, Seen
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.explanation import why_few_queries
-from sglpr_jax.loops.graph_files import write_tum
+from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.loops.odometry import at_scans, read_odometry
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of

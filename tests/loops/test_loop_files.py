@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
 from sglpr_jax.data.formats.trajectory import read_trajectory
-from sglpr_jax.loops.graph_files import (
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop_files import (
     read_g2o,
     read_loops_csv,
     read_loops_jsonl,
@@ -18,7 +19,6 @@ from sglpr_jax.loops.graph_files import (
     write_loops_jsonl,
     write_tum,
 )
-from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.transforms import inverse
 
 
