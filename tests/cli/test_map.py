@@ -207,7 +207,7 @@ def test_answers_that_share_the_probability_say_so(capsys, command, tmp_path):
         Console(width=140).print(_table("scan.bin", few))
         assert ("Answers more than 20 m apart share the probability" in capsys.readouterr().out) == words
     ended = command("relocalize", "scan.bin", "--map", tmp_path / "map", "--candidates", "1000000000")
-    assert_one_line_error(ended, "--candidates: expected a number from 1 up to 1048576, found 1000000000")
+    assert_one_line_error(ended, "--candidates: expected a number from 1 up to 1000, found 1000000000")
 
 
 def test_a_scan_of_one_point_and_a_map_of_others_or_with_a_flipped_byte(command, places_file, tmp_path):
