@@ -16,6 +16,7 @@ FLOORS = (
         "fields",
         "files",
         "grid",
+        "growing",
         "labels",
         "losses",
         "metrics",

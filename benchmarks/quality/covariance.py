@@ -24,9 +24,9 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sglpr_jax.loops.candidates import square_image
 from sglpr_jax.loops.loop import Loop, planar_loop
 from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.seen import square_image
 from sglpr_jax.loops.transforms import inverse, moved_covariance
 from sglpr_jax.loops.upright import upright_from_lidar
 from sglpr_jax.loops.verification import align

@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,8 @@ from jaxtyping import Float
 from benchmarks.quality.loops import drifted
 from sglpr_jax.data.record import Record
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.candidates import CandidateFinder, Compared, Seen
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.unfinished import columns, compared_of
 from sglpr_jax.models.params import Params
 
@@ -68,11 +69,12 @@ def compared(
         with np.load(path) as file:
             return compared_of(dict(file), range(len(drive.seen)))
     poses = drive.odometry(odometry)
-    candidates: list[Any] = []
+    found = []
     for i, (seen, time) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
         pose = None if poses is None else poses[i]
-        candidates += finder.add_seen(seen, time=time, odometry=pose)
-    kept = columns(candidates, finder.links)
+        finder.add_seen(seen, time=time, odometry=pose)
+        found.append(finder.compared)
+    kept = columns(found)
     path.parent.mkdir(exist_ok=True, parents=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **kept)

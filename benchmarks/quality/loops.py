@@ -26,7 +26,7 @@ import sglpr_jax
 from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
-from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.candidates import Candidate, Compared
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import settled
@@ -35,6 +35,7 @@ from sglpr_jax.loops.optimization import optimized, trajectory_error
 from sglpr_jax.loops.pose_search import query_spectra
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.reliability import Bin, reliability_of
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
@@ -134,14 +135,10 @@ class Speed:
         drive = simulate_recording("08", scans=60, sensor=sensor, seed=101)
         records = [drive.record(i, labels=False) for i in range(20)]
         rows = np.random.default_rng(0).normal(size=(self.frames, finder.index.width)).astype(np.float32)
-        finder.index.add(rows / np.linalg.norm(rows, axis=1, keepdims=True), times=np.arange(self.frames) / 10)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         image = finder.seen(records[0]).image
-        finder.images += [image] * self.frames
-        finder.details += [image] * self.frames
-        finder.empty += [False] * self.frames
-        finder.links += [None] * self.frames
-        for frame in range(self.frames):
-            finder.motion.add(frame / 10)
+        for frame, row in enumerate(rows):
+            finder.add_seen(Seen(row, image, records[0].mounting), time=frame / 10, compared=Compared([], None))
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
         rules = finder.config.rivals
         sizes = finder.config.candidates + 1, rules.of_query + rules.of_match
@@ -149,7 +146,7 @@ class Speed:
         peak = finder.search(spectra, [image], 1).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
-            ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder.index.recent(500.0))),
+            ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None))),
             ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
             ("comparison", lambda i: finder.search(spectra, [image] * sizes[0], sizes[0])),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),

@@ -27,9 +27,11 @@ from benchmarks.quality.drives import distances
 from benchmarks.quality.map_closures import peer_python, run_peer
 from benchmarks.quality.repeating import REVISIT_M, revisits
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.probability import DEFAULTS, models
+from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
 from sglpr_jax.poses import distances as all_distances
@@ -51,7 +53,7 @@ class ScanContextFinder(CandidateFinder):
 
     def __init__(self, params: Params):
         super().__init__(params)
-        self.index = Index.empty(NUMBERS, weights_hash=self.index.weights_hash)
+        self.stored = StoredScans(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
 
     def seen(self, record: Record) -> Seen:
         """The matrix of Scan Context in place of the descriptor."""

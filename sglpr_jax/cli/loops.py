@@ -75,6 +75,10 @@ class LoopsCommand:
     """Report unreadable scans and skip them."""
     near_m: float = DetectorConfig.near_m
     """With odometry, a loop must agree with at least half of the loops within this travelled distance, in metres."""
+    keyframe_m: float = DetectorConfig.keyframe_m
+    """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
+    max_places: int | None = DetectorConfig.max_places
+    """Maximum number of stored scans, to limit memory. By default all are stored."""
     candidates: CandidateConfig = DetectorConfig.candidates
     verification: VerificationConfig = DetectorConfig.verification
     consistency: ConsistencyConfig = DetectorConfig.consistency

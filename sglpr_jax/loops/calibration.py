@@ -17,12 +17,13 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
-from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.pose_search import occupied, query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.rivals import distance_share, rival_share
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params

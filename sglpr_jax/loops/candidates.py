@@ -4,15 +4,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Float32, Int, Num, UInt8
+from jaxtyping import Array, Bool, Complex, Float, Float32, Int, UInt8
 
-from sglpr_jax.bev import centre_crop, even_cells
-from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
-from sglpr_jax.data.views import check_ready_made, image_view, picture, view
+from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.background import Background
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
 from sglpr_jax.loops.drift import position_deviations
@@ -21,13 +18,16 @@ from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, occupied, query_spectra, search_spectra, within_reach
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals
+from sglpr_jax.loops.seen import Seen, described
+from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.loops.trajectory import Trajectory
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
 from sglpr_jax.loops.verification import Alignment, refined
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.revisits import are_recent
 
 
 class Candidate(NamedTuple):
@@ -50,18 +50,12 @@ class Compared(NamedTuple):
     """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
-class Seen(NamedTuple):
-    """Descriptor and image of a scan or ready-made image."""
-
-    descriptor: Float32[np.ndarray, " d"]
-    image: UInt8[np.ndarray, "n n"]
-    """Density image."""
-    mounting: Mounting | None
-    """Mounting of the sensor. Descriptor and image are gravity-aligned."""
-
-
 class CandidateFinder:
-    """Finds candidates in a stream of scans. Stores descriptor and image of each scan."""
+    """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
+
+    A frame takes constant time, with two exceptions: the search for the nearest descriptor (a matrix product) is
+    proportional to the number of stored scans, and the drift of the odometry to the number of frames.
+    """
 
     def __init__(
         self,
@@ -70,26 +64,56 @@ class CandidateFinder:
         config: CandidateConfig = CandidateConfig(),
         verification: VerificationConfig = VerificationConfig(),
         drift: DriftModel = DriftModel(),
+        keyframe_m: float = 0.0,
+        max_places: int | None = None,
     ):
+        """Create a finder without frames. The arguments are those of `DetectorConfig`."""
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
         self.params, self.config, self.verification, self.drift = params, config, verification, drift
-        self.index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
-        self.images: list[UInt8[np.ndarray, "n n"]] = []
-        self.details: list[UInt8[np.ndarray, "m m"]] = []
-        """Centre of each image without the background, for comparison."""
-        self.odometry: list[Float[np.ndarray, "4 4"]] = []
+        index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
+        self.stored = StoredScans(index, keyframe_m=keyframe_m, max_places=max_places)
+        """Descriptors, and centres of the images without the background, for comparison."""
+        self.compared = Compared([], None)
+        """Comparisons of the last frame."""
+        self.odometry = Trajectory()
+        """Poses of all frames from odometry. Empty if there is no odometry."""
         self.mounting: Mounting | None = None
         """Mounting of the sensor, the same for all frames."""
-        self.empty: list[bool] = []
-        """Whether each frame is almost empty (`is_empty`)."""
+        self._empty = GrowingArray(np.empty(0, bool))
         self.motion = Motion(config.motion)
         self.background = Background(frames=config.background_frames, least=config.min_background_frames)
-        self.links: list[Peak | None] = []
-        """Pose of each frame in the frame of its keyframe, if there is no odometry."""
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
+        self._times = GrowingArray(np.empty(0))
+        self._keyframe = np.zeros((0, 0), np.uint8)
+        """Image of the keyframe of the motion, as in `stored`."""
+
+    def __len__(self) -> int:
+        """Number of added frames."""
+        return len(self._empty)
+
+    @property
+    def index(self) -> Index:
+        """Descriptors of the stored scans. Their frames are `stored.frames`."""
+        return self.stored.index
+
+    @property
+    def times(self) -> Float[np.ndarray, " n"] | None:
+        """Time of each frame in seconds, or None if they have no times."""
+        return self._times.rows if len(self._times) else None
+
+    @property
+    def empty(self) -> Bool[np.ndarray, " n"]:
+        """Whether each frame is almost empty (`is_empty`)."""
+        return self._empty.rows
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes of all frames: descriptors, compressed images, poses and times."""
+        arrays = self.stored, self.motion, self.odometry, self._times, self._empty
+        return sum(one.nbytes for one in arrays)
 
     def add(
         self, record: Record, *, time: float | None = None, odometry: Float[np.ndarray, "4 4"] | None = None
@@ -123,41 +147,53 @@ class CandidateFinder:
           compared: Comparisons of an earlier run. If they are given, they are not repeated.
         """
         self._check(seen, time, odometry)
+        frame = len(self)
         if seen is None:
-            self.missing.append(len(self.index))
+            self.missing.append(frame)
             seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
         pose = None if odometry is None else np.asarray(odometry, np.float64)
-        position = None if pose is None else pose[:3, 3]
-        clock = len(self.index) * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
+        clock = frame * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
         upright = None if pose is None else pose @ inverse(upright_from_lidar(seen.mounting))
         middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
+        empty = self.is_empty(seen.image)
+        if not empty:
+            self.stored.check(frame, middle)
         detail, keyframe = self.background.without(middle), self.motion.keyframe
         if compared is None:
+            position = None if pose is None else pose[:3, 3]
             compared = self._compared(seen._replace(image=detail), time, position, upright, clock)
         else:
             self.motion.add(clock, pose=upright, link=compared.link)
-        if middle.size and (self.motion.keyframe != keyframe or not self.images):
+        if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
-        self.index.add(seen.descriptor, times=time, positions=position)
-        self.images.append(seen.image)
-        self.details.append(detail)
-        self.empty.append(self.is_empty(seen.image))
-        self.links.append(compared.link)
-        self.mounting = seen.mounting
-        if pose is not None:
-            self.odometry.append(pose)
+        if self.motion.keyframe == frame:
+            self._keyframe = detail
+        self._keep(frame, seen, detail, time, pose, empty)
+        self.compared = compared
         return compared.candidates
+
+    def _keep(
+        self,
+        frame: int,
+        seen: Seen,
+        detail: UInt8[np.ndarray, "m m"],
+        time: float | None,
+        pose: Float[np.ndarray, "4 4"] | None,
+        empty: bool,
+    ) -> None:
+        """Store what later frames need of a frame."""
+        if not empty and self.stored.is_new_place(frame, self.motion):
+            self.stored.add(frame, seen.descriptor, detail)
+        self._empty.append(empty)
+        self.mounting = seen.mounting
+        if time is not None:
+            self._times.append(time)
+        if pose is not None:
+            self.odometry.add(pose)
 
     def seen(self, record: Record) -> Seen:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
-        model = self.params.config
-        check_ready_made(record, model.image)
-        whole, _ = picture(record, None)
-        if record.points is None or model.image == "density":
-            bev = image_view(whole, None, model.grid).image
-        else:
-            bev = view(record, model.grid, image=model.image).image
-        return Seen(np.asarray(describe(self.params, bev)), _kept(whole), record.mounting)
+        return described(self.params, record)
 
     def is_empty(self, image: UInt8[np.ndarray, "n n"]) -> bool:
         """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
@@ -177,8 +213,8 @@ class CandidateFinder:
             return Compared([], None)
         rows = self._rows(seen.descriptor, self._excluded(time, position))
         key = self.motion.keyframe
-        linked = pose is None and len(self.details) > 0 and not self.empty[key]
-        matches = [self.details[row] for row in ([*rows, key, key] if linked else rows)]
+        linked = pose is None and len(self) > 0 and not self.empty[key]
+        matches = [self.stored.image(row) for row in rows.tolist()] + 2 * linked * [self._keyframe]
         priors = np.full((len(matches), 3), np.nan)
         if linked:
             priors[-1] = self.motion.prior(clock)
@@ -192,43 +228,48 @@ class CandidateFinder:
         return Compared([self._candidate(seen, spectra, rows, peaks.some(slice(len(rows))), best)], link)
 
     def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
-        """Frames with the nearest descriptors, and frames with the nearest descriptors at other times than the
-        first.
-        """
+        """Stored scans with the nearest descriptors, and those with the nearest ones at other times than the first."""
         rows = self.nearest(descriptor, self.config.candidates, excluded)
         if not len(rows):
             return rows
-        excluded = excluded | self.motion.about(int(rows[0]), self.config.rivals.age[0] * self.config.exclude_s)
+        excluded = excluded | self._about(int(rows[0]))
         return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
+
+    def _about(self, row: int) -> Bool[np.ndarray, " n"]:
+        """Whether each stored scan was recorded at about the same time as one of them."""
+        frames = self.stored.frames
+        return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s)[frames]
 
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k frames with the nearest descriptors, nearest first."""
+        """Up to k stored scans with the nearest descriptors, nearest first."""
         rows = self.index.query(descriptor, k, exclude=excluded).rows
         return rows[rows >= 0]
 
     def _candidate(
         self, seen: Seen, spectra: Complex[Array, "s t f"], compared: Int[np.ndarray, " k"], peaks: Peak, best: int
     ) -> Candidate:
-        """Candidate of the best compared frame. Compared frames that are known to show another place are rivals."""
-        match, peak = int(compared[best]), peaks.one(best)
-        distance = float(np.linalg.norm(self.index.descriptors[match] - seen.descriptor))
-        alignment = jax.device_get(refined(seen.image, self.details[match], peak, config=self.verification))
+        """Candidate of the best compared scan. Compared scans that are known to show another place are rivals."""
+        row, peak, stored = int(compared[best]), peaks.one(best), self.stored
+        frames, image = stored.frames, stored.image(row)
+        match = int(frames[row])
+        distance = float(np.linalg.norm(self.index.descriptors[row] - seen.descriptor))
+        alignment = jax.device_get(refined(seen.image, image, peak, config=self.verification))
         shares = np.nan, np.nan
         if peak.correlation >= self.config.min_rival_correlation:
-            usable, exclude_s = ~np.array(self.empty, bool), self.config.exclude_s
             rules, known = self.config.rivals, self.index.descriptors
-            rows = rivals(seen.descriptor, known, match, self.motion, usable, exclude_s=exclude_s, config=rules)
-            found = self.search(spectra, [self.details[row] for row in rows], rules.of_query + rules.of_match)
-            by_motion = expected_poses(self.motion, len(self.index), rows, np.eye(4), config=rules)
+            exclude_s = self.config.exclude_s
+            rows = rivals(seen.descriptor, known, frames, match, self.motion, exclude_s=exclude_s, config=rules)
+            found = self.search(spectra, [stored.image(one) for one in rows.tolist()], rules.of_query + rules.of_match)
+            by_motion = expected_poses(self.motion, len(self), frames[rows], np.eye(4), config=rules)
             shares = self._shares(seen, match, distance, peak, rows, found, [by_motion])
-            far = ~self.motion.about(match, rules.age[0] * exclude_s)[compared] & self.motion.same(match, compared)
+            far = ~self._about(row)[compared] & self.motion.same(match, frames[compared])
             elsewhere = self._shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
             shares = np.fmax(shares, elsewhere)
-        cells = min(occupied(image, self.verification) for image in (seen.image, self.details[match]))
+        cells = min(occupied(one, self.verification) for one in (seen.image, image))
         evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
-        return Candidate(len(self.index), match, alignment, evidence)
+        return Candidate(len(self), match, alignment, evidence)
 
     def _shares(
         self,
@@ -242,7 +283,8 @@ class CandidateFinder:
     ) -> tuple[float, float]:
         """`distance_share` and `rival_share` of a match, with the rivals `rows`."""
         rules, match_from_query = self.config.rivals, transform(float(peak.x), float(peak.y), float(peak.yaw))
-        expected = [*expected, expected_poses(self.motion, match, rows, match_from_query, config=rules)]
+        frames = self.stored.frames[rows]
+        expected = [*expected, expected_poses(self.motion, match, frames, match_from_query, config=rules)]
         apart = np.linalg.norm(self.index.descriptors[rows] - seen.descriptor, axis=1)
         return (
             distance_share(distance, apart, expected, config=rules),
@@ -266,40 +308,28 @@ class CandidateFinder:
         return found.some(slice(len(matches)))
 
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
-        if not len(self.index):
+        if not len(self):
             return
-        if seen is not None and seen.mounting != self.mounting and len(self.missing) < len(self.index):
+        if seen is not None and seen.mounting != self.mounting and len(self.missing) < len(self):
             raise ValueError(f"expected one sensor mounting for all frames, {self.mounting}, found {seen.mounting}")
         for name, given, known in (
-            ("a time", time is not None, self.index.times is not None),
-            ("odometry", odometry is not None, bool(self.odometry)),
+            ("a time", time is not None, self.times is not None),
+            ("odometry", odometry is not None, len(self.odometry) > 0),
         ):
             if given != known:
-                raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self.index)})")
-        if time is not None and self.index.times is not None and time < self.index.times[-1]:
-            raise ValueError(f"expected times that do not decrease, found {time} after {self.index.times[-1]}")
+                raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self)})")
+        if time is not None and self.times is not None and time < self.times[-1]:
+            raise ValueError(f"expected times that do not decrease, found {time} after {self.times[-1]}")
 
     def _excluded(self, time: float | None, position: Float[np.ndarray, " 3"] | None) -> Bool[np.ndarray, " n"]:
-        """Frames that cannot match the next one: too recent, almost empty, or too far away by odometry."""
-        config, known = self.config, self.index.positions
-        excluded = self.index.recent(time, seconds=config.exclude_s, frames=config.exclude_frames)
-        excluded = excluded | np.array(self.empty, bool) | self.motion.near_last(config.min_travelled_m)
-        if position is not None and known is not None and len(known):
+        """Stored scans that cannot match the next frame: too recent, or too far away by odometry."""
+        config, frames = self.config, self.stored.frames
+        recent = are_recent(len(self), self.times, time, seconds=config.exclude_s, frames=config.exclude_frames)
+        excluded = (recent | self.motion.near_last(config.min_travelled_m))[frames]
+        if position is not None and len(self.odometry):
+            known = self.odometry.poses[:, :3, 3]
             drifted = position_deviations(np.concatenate([known, position[None]]), -1, drift=self.drift)[:-1]
-            apart = np.linalg.norm(known - position, axis=1)
+            apart = np.linalg.norm(known[frames] - position, axis=1)
             place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
-            excluded = excluded | (apart > place_m + self.drift.max_deviation * drifted)
+            excluded = excluded | (apart > place_m + self.drift.max_deviation * drifted[frames])
         return excluded
-
-
-def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
-    """Central square of an image, with an even number of cells, as 8 bits."""
-    even = even_cells(jnp.asarray(image, jnp.float32))
-    size = min(even.shape)
-    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / MAX_COUNT)
-    return np.round(grey).clip(0, 255).astype(np.uint8)
-
-
-def square_image(record: Record) -> UInt8[np.ndarray, "n n"]:
-    """Image for the verification of loops: the density image or the ready-made image, as 8 bits."""
-    return _kept(picture(record, None)[0])

@@ -205,6 +205,12 @@ class DetectorConfig:
     near_m: float = 200.0
     """With odometry, a loop must be consistent with at least half of the loops within this travelled distance, in
     metres."""
+    keyframe_m: float = 0.0
+    """Minimum distance of a stored scan from the previous one, in metres. Nearer scans that are turned by less than 20
+    degrees are searched for loops, but not stored. 0 stores every scan."""
+    max_places: int | None = None
+    """Maximum number of stored scans. Beyond it, scans with a loop to a newer stored scan are forgotten first, then the
+    oldest. None stores all."""
     candidates: CandidateConfig = CandidateConfig()
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
@@ -217,5 +223,9 @@ class DetectorConfig:
     """Drift of the odometry. Loops that contradict it are rejected."""
 
     def __post_init__(self):
-        """Raises ValueError if the probability is outside [0, 1]."""
+        """Raises ValueError if the probability is outside [0, 1], or if a limit of the stored scans is invalid."""
         _check_probability("min_probability", self.min_probability)
+        if not 0 <= self.keyframe_m < math.inf:
+            raise ValueError(f"expected keyframe_m of 0 or more, found {self.keyframe_m}")
+        if self.max_places is not None and self.max_places < 1:
+            raise ValueError(f"expected max_places of 1 or more, found {self.max_places}")

@@ -25,6 +25,7 @@ def agree(
     odometry: Float[np.ndarray, "n 4 4"],
     others: Sequence[Loop] | None = None,
     *,
+    way: Float[np.ndarray, " n"] | None = None,
     mounting: Mounting | None = None,
     drift: DriftModel = DriftModel(),
     config: ConsistencyConfig = ConsistencyConfig(),
@@ -35,6 +36,7 @@ def agree(
       loops: Loops between LiDAR frames.
       odometry: Pose of the LiDAR at each frame.
       others: Loops to compare with, by default `loops`.
+      way: Travelled distance at each frame in metres, by default computed from the odometry.
       mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
       drift: Drift model of the odometry.
       config: Thresholds.
@@ -42,7 +44,7 @@ def agree(
     Returns:
       Whether loop i of `loops` is consistent with loop j of `others`.
     """
-    way = travelled(odometry)
+    way = travelled(odometry) if way is None else way
     flat = planar_odometry(odometry, mounting)
     a, b = (_columns(each, flat, way, mounting) for each in (loops, loops if others is None else others))
     pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)

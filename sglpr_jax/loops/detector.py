@@ -14,15 +14,15 @@ from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.times import PROOF, doubt, unit_change
 from sglpr_jax.fields import check_value
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.given import DATES, given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
 from sglpr_jax.loops.probability import LoopModel, default_model
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion, agree_in_order
-from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.models.params import Params
 
 RECENT = 8
@@ -64,12 +64,17 @@ class LoopDetector:
         check_value(time_unit, TimeUnit, "time_unit")
         self.time_unit: TimeUnit = time_unit
         self.finder = CandidateFinder(
-            params, config=config.candidates, verification=config.verification, drift=config.drift
+            params,
+            config=config.candidates,
+            verification=config.verification,
+            drift=config.drift,
+            keyframe_m=config.keyframe_m,
+            max_places=config.max_places,
         )
         self.model = default_model(self.finder.index.weights_hash) if model is None else model
         self.config = config
         self.candidates: list[Candidate] = []
-        """All compared pairs."""
+        """All compared pairs or, with `max_places`, that many of the last ones."""
         self.loops: list[Loop] = []
         """All returned loops."""
         self.supported: list[Loop] = []
@@ -82,7 +87,15 @@ class LoopDetector:
 
     def __len__(self) -> int:
         """Number of added frames."""
-        return len(self.finder.index)
+        return len(self.finder)
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes of all frames. The results (`loops`, `supported`, `rejected`, `candidates`) are not counted.
+
+        With `max_places`, only poses and times still grow: 313 bytes a frame, and up to as much in spare capacity.
+        """
+        return self.finder.nbytes
 
     def add(
         self,
@@ -111,7 +124,7 @@ class LoopDetector:
     def _seconds(self, time: Any) -> float | None:
         """Convert a time to seconds. Raises ValueError as soon as the steps show another unit than before or, with
         "auto", than seconds."""
-        seconds, before = given_time(time, unit=self.time_unit), self.finder.index.times
+        seconds, before = given_time(time, unit=self.time_unit), self.finder.times
         if seconds is None or isinstance(time, DATES):
             return seconds
         clock = np.array([seconds]) if before is None else np.append(before[-RECENT:], seconds)
@@ -142,6 +155,8 @@ class LoopDetector:
         """
         candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared)
         self.candidates += candidates
+        if self.config.max_places is not None:
+            del self.candidates[: -self.config.max_places]
         for one in candidates:
             self._consider(one)
         first = len(self) - 1 - self.config.sequence.frames
@@ -152,6 +167,8 @@ class LoopDetector:
         self._waiting = [loop for loop in self._waiting if loop.query >= first]
         new = self._confirmed() if self._waiting else []
         self.loops += new
+        for loop in new:
+            self.finder.stored.close_loop(loop.query, loop.match)
         return new
 
     def _consider(self, one: Candidate) -> None:
@@ -196,11 +213,11 @@ class LoopDetector:
         if not loops:
             return []
         motion, mounting, guessed_m = self.finder.motion, self.finder.mounting, None
-        if self.finder.odometry:
-            poses, drift, reason = np.stack(self.finder.odometry), self.config.drift, "contradicts the odometry"
+        if len(self.finder.odometry):
+            poses, drift, reason = self.finder.odometry.poses, self.config.drift, "contradicts the odometry"
         else:
             poses, drift, reason = motion.odometry(mounting), self.config.motion_drift, "contradicts the motion"
-            guessed_m = np.array(motion.guessed_m)
+            guessed_m = motion.guessed_m
         apart = deviations(loops, poses, drift=drift, mounting=mounting, guessed_m=guessed_m)
         fits = apart <= drift.max_deviation
         self._reject([loop for loop, fit in zip(loops, fits, strict=True) if not fit], reason)
@@ -216,17 +233,26 @@ class LoopDetector:
 
         Loops that were not returned count, too. Otherwise a few early wrong loops would block all true ones.
         """
-        if not self.finder.odometry:
+        odometry = self.finder.odometry
+        if not len(odometry):
             return True
-        odometry = np.stack(self.finder.odometry)
-        way = travelled(odometry)
-        about = [
-            other
-            for other in self.supported
-            if other.query != loop.query
-            and abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match]) <= self.config.near_m
-        ]
-        return not about or bool(agree([loop], odometry, about, **self._rules).mean() >= 0.5)
+        about = self._near(loop, odometry.travelled)
+        if not about:
+            return True
+        return bool(agree([loop], odometry.poses, about, way=odometry.travelled, **self._rules).mean() >= 0.5)
+
+    def _near(self, loop: Loop, way: Float[np.ndarray, " n"]) -> list[Loop]:
+        """Other loops within `near_m` of a loop, by travelled distance `way`. Much earlier loops are not looked at."""
+        near = []
+        for other in reversed(self.supported):
+            # Loops before this one in the list have queries up to `frames` later, because neighbours confirm a loop.
+            last = min(other.query + self.config.sequence.frames, len(way) - 1)
+            if way[loop.query] - way[last] > self.config.near_m:
+                break
+            apart = abs(way[other.query] - way[loop.query]) + abs(way[other.match] - way[loop.match])
+            if other.query != loop.query and apart <= self.config.near_m:
+                near.append(other)
+        return near
 
     def _loop(self, one: Candidate, probability: float) -> Loop:
         mountings = dict.fromkeys(("query_mounting", "match_mounting"), self.finder.mounting)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.add_scans import add_scans
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import check_is, given_poses
@@ -23,6 +24,7 @@ from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.reasons import counted, listed
 from sglpr_jax.loops.registration import check_installed
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
 
@@ -42,7 +44,7 @@ class FoundLoops:
     skipped: tuple[str, ...] = ()
     """Ids of scans that cannot be read."""
     candidates: tuple[Candidate, ...] = ()
-    """All compared pairs."""
+    """All compared pairs or, with `max_places`, that many of the last ones."""
     model: LoopModel | None = None
     """Model of the probabilities."""
     unregistered: int = 0
@@ -130,12 +132,14 @@ def find_loops(
         recording,
         detector.finder,
         functools.partial(_add, detector, recording, odometry),
-        candidates=detector.candidates,
         kept_in=kept_in,
         on_bad_scan=on_bad_scan,
         should_stop=should_stop,
         on_progress=on_progress,
         odometry=odometry,
+        keyframe_m=config.keyframe_m,
+        max_places=config.max_places,
+        acceptance=_acceptance(detector),
     )
     _check_scans(detector.finder, recording)
     loops, rejected = _accepted(detector, recording, odometry, registered=registered, should_stop=should_stop)
@@ -151,8 +155,15 @@ def find_loops(
         model=detector.model,
         unregistered=sum(loop.overlap is None for loop in loops) if registered else 0,
         config=config,
-        empty=sum(detector.finder.empty) - len(missing),
+        empty=int(detector.finder.empty.sum()) - len(missing),
     )
+
+
+def _acceptance(detector: LoopDetector) -> str | None:
+    """Hash of all that decides about loops, if the loops decide which scans are stored."""
+    if detector.config.max_places is None:
+        return None
+    return hashlib.sha256(repr((detector.config, detector.model)).encode()).hexdigest()[:16]
 
 
 def _checked(
@@ -191,7 +202,7 @@ def _add(
 def _check_scans(finder: CandidateFinder, recording: Recording) -> None:
     """Raise ValueError if all scans of a recording are unreadable or almost empty."""
     check_readable(recording, len(recording) - len(finder.missing))
-    if all(finder.empty) and len(finder.index) == len(recording):
+    if finder.empty.all() and len(finder) == len(recording):
         raise ValueError(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )

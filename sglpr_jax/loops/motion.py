@@ -7,9 +7,10 @@ is extrapolated at the last known velocity, and its drift grows fast.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import MotionConfig
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
@@ -17,6 +18,8 @@ from sglpr_jax.loops.upright import upright_from_lidar
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
+NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8"), ("clock", "f8")]
+"""Numbers of a frame beside its pose."""
 
 
 class Motion:
@@ -24,24 +27,45 @@ class Motion:
 
     def __init__(self, config: MotionConfig = MotionConfig()):
         self.config = config
-        self.poses: list[Float[np.ndarray, "4 4"]] = []
-        """Pose of each frame in the frame of the first one. Across segments it is a guess."""
-        self.segments: list[int] = []
-        """Segment of each frame. Relative poses are known within a segment."""
-        self.travelled: list[float] = []
-        """Travelled distance at each frame, from keyframe to keyframe, in metres."""
-        self.guessed_m: list[float] = []
-        """Length of measured path with the same drift as all guesses up to each frame, in metres."""
-        self.clock: list[float] = []
-        """Time at each frame without the time in which the sensor stood still, in seconds."""
         self.keyframe = 0
-        self._times: list[float] = []
+        self._poses = GrowingArray(np.empty((0, 4, 4)))
+        self._numbers = GrowingArray(np.empty(0, NUMBERS))
         self._coasted = 0
         self._m_per_s = 0.0
         """Last known forward speed, in metres per second."""
 
     def __len__(self) -> int:
-        return len(self.poses)
+        return len(self._poses)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Pose of each frame in the frame of the first one. Across segments it is a guess."""
+        return self._poses.rows
+
+    @property
+    def segments(self) -> Int[np.ndarray, " n"]:
+        """Segment of each frame. Relative poses are known within a segment."""
+        return self._numbers.rows["segment"]
+
+    @property
+    def travelled(self) -> Float[np.ndarray, " n"]:
+        """Travelled distance at each frame, from keyframe to keyframe, in metres."""
+        return self._numbers.rows["travelled"]
+
+    @property
+    def guessed_m(self) -> Float[np.ndarray, " n"]:
+        """Length of measured path with the same drift as all guesses up to each frame, in metres."""
+        return self._numbers.rows["guessed_m"]
+
+    @property
+    def clock(self) -> Float[np.ndarray, " n"]:
+        """Time at each frame without the time in which the sensor stood still, in seconds."""
+        return self._numbers.rows["clock"]
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes that the arrays hold."""
+        return self._poses.nbytes + self._numbers.nbytes
 
     def add(self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None) -> None:
         """Add a frame at `time` (seconds), by its `pose` from odometry or its peak `link` over the keyframe."""
@@ -55,16 +79,18 @@ class Motion:
         elif pose is None and self._coasted < self.config.max_coasting:
             pose, coasts = self._expected(time), True
         self._coasted = self._coasted + 1 if coasts else 0
-        if not self.poses:
+        if not len(self):
             self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, clock=0.0, guessed_m=0.0)
         elif pose is None:
             self._guess(time)
         else:
-            moved, rotation = self._moved(key, pose)
+            moved, rotation = self.moved(key, pose)
             clock = self.clock[key] + min(time - self._times[key], self.config.standing_s)
             travelled = self.travelled[key] + moved
             guessed_m = self._drifted_m(time) if coasts else self.guessed_m[key]
-            self._append(time, pose, segment=self.segments[key], travelled=travelled, clock=clock, guessed_m=guessed_m)
+            self._append(
+                time, pose, segment=int(self.segments[key]), travelled=travelled, clock=clock, guessed_m=guessed_m
+            )
             if moved <= self.config.keyframe_m and rotation <= np.radians(self.config.keyframe_deg) and not coasts:
                 return
         self.keyframe = len(self) - 1
@@ -99,7 +125,7 @@ class Motion:
         self._append(
             time,
             self.poses[-1] @ transform(self._m_per_s * seconds, 0.0, 0.0),
-            segment=self.segments[-1] + 1,
+            segment=int(self.segments[-1]) + 1,
             travelled=self.travelled[-1],
             clock=self.clock[-1] + seconds,
             guessed_m=self._drifted_m(time),
@@ -119,37 +145,35 @@ class Motion:
         clock: float,
         guessed_m: float,
     ) -> None:
-        self._times.append(time)
-        self.guessed_m.append(guessed_m)
-        self.poses.append(pose)
-        self.segments.append(segment)
-        self.travelled.append(travelled)
-        self.clock.append(clock)
+        self._poses.append(pose)
+        self._numbers.append((time, segment, travelled, guessed_m, clock))
+
+    @property
+    def _times(self) -> Float[np.ndarray, " n"]:
+        return self._numbers.rows["time"]
 
     def from_frame(self, frame: int, rows: np.ndarray) -> tuple[Float[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
         """Poses of `frame` in the frames of `rows`, and whether each is known."""
-        poses = np.stack([self.poses[row] for row in rows]) if len(rows) else np.zeros((0, 4, 4))
-        return inverse(poses) @ self.poses[frame], self.same(frame, rows)
+        return inverse(self.poses[rows]) @ self.poses[frame], self.same(frame, rows)
 
     def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
         """Whether each frame is less than `seconds` before or after `frame`, without standing time."""
-        clock = np.array(self.clock)
-        return np.abs(clock - clock[frame]) < seconds
+        return np.abs(self.clock - self.clock[frame]) < seconds
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
-        return np.array([self.segments[row] == self.segments[frame] for row in rows], bool)
+        return self.segments[rows] == self.segments[frame]
 
     def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:
         """Poses of the LiDAR, whose frame is tilted by its mounting."""
-        return np.stack(self.poses) @ upright_from_lidar(mounting)
+        return self.poses @ upright_from_lidar(mounting)
 
     def near_last(self, travelled_m: float) -> Bool[np.ndarray, " n"]:
         """Whether each frame is known to be less than `travelled_m` (metres) before the last frame."""
         if not len(self):
             return np.zeros(0, bool)
-        known = np.array(self.segments) == self.segments[-1]
-        return np.asarray(known & (self.travelled[-1] - np.array(self.travelled) < travelled_m))
+        known = self.segments == self.segments[-1]
+        return known & (self.travelled[-1] - self.travelled < travelled_m)
 
     def _is_trusted(self, link: Peak, *, expected: bool) -> bool:
         best, config = float(link.correlation), self.config
@@ -157,7 +181,7 @@ class Motion:
         fits = best >= config.min_correlation and float(link.second) <= most * best
         return fits and float(link.ridge) <= config.max_ridge * best
 
-    def _moved(self, key: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-        """Distance (metres) and rotation (radians) from a keyframe to a pose."""
-        moved = inverse(self.poses[key]) @ pose
+    def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+        """Distance (metres) and rotation (radians) from a frame to a pose."""
+        moved = inverse(self.poses[frame]) @ pose
         return float(np.linalg.norm(moved[:3, 3])), abs(float(yaw_of(moved)))

@@ -28,7 +28,7 @@ class PlaceScans:
             self.done = row
             if self._is_far(row):
                 frame = len(self.looked_at)
-                if frame == len(self._finder.index):  # not seen by an earlier run
+                if frame == len(self._finder):  # not seen by an earlier run
                     yield row
                 if not self._finder.empty[frame]:
                     self.frames.append(frame)

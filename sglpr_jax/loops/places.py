@@ -1,7 +1,7 @@
 """Maps of places for relocalisation: an index of descriptors, with an image and a pose for each place."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.add_scans import add_scans
-from sglpr_jax.loops.candidates import CandidateFinder, Compared, Seen
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig
 from sglpr_jax.loops.given import check_is, given_poses, given_record
@@ -28,6 +28,7 @@ from sglpr_jax.loops.pose_search import Peak, occupied, query_spectra, search_sp
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.relocated import Relocated, with_shared_probability
 from sglpr_jax.loops.rivals import MAP_RIVALS, distance_share, rival_places, rival_share
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import check_level, upright_from_lidar
 from sglpr_jax.loops.verification import refined
@@ -254,8 +255,10 @@ def map_recording(
     check_level(poses, recording.mounting, name=recording.name)
     finder = CandidateFinder(params)
     chosen = PlaceScans(finder, poses[:, :3, 3], spacing_m)
+    seen_scans: list[Seen | None] = []
 
     def add(seen: Seen | None, compared: Compared | None) -> None:
+        seen_scans.append(seen)
         finder.add_seen(seen, compared=Compared([], None))
 
     add_scans(
@@ -276,18 +279,24 @@ def map_recording(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
     skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
-    return Mapped(_places(finder, recording, poses, chosen), chosen.done, skipped)
+    return Mapped(_places(finder.index, recording, poses, chosen, seen_scans), chosen.done, skipped)
 
 
 def _places(
-    finder: CandidateFinder, recording: Recording, poses: Float[np.ndarray, "n 4 4"], chosen: PlaceScans
+    like: Index,
+    recording: Recording,
+    poses: Float[np.ndarray, "n 4 4"],
+    chosen: PlaceScans,
+    seen: Sequence[Seen | None],
 ) -> PlaceMap:
     """Map of the chosen scans of a recording."""
-    index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
+    index = Index.empty(like.width, weights_hash=like.weights_hash)
+    places = [one for one in (seen[frame] for frame in chosen.frames) if one is not None]
     names, rows = place_names(recording), chosen.rows
     ids = [names[row] for row in rows]
-    index.add(finder.index.descriptors[chosen.frames], ids=ids, positions=poses[rows, :3, 3])
-    images = [finder.images[frame] for frame in chosen.frames]
+    descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, like.width)
+    index.add(descriptors, ids=ids, positions=poses[rows, :3, 3])
+    images = [one.image for one in places]
     sensor = recording.mounting or Mounting(MODEL_HEIGHT_M)
     mountings = np.tile([sensor.height_m, *sensor.up], (len(rows), 1))
     return PlaceMap(index, np.stack(images) if images else np.zeros((0, 0, 0), np.uint8), poses[rows], mountings)

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from sglpr_jax.loops.config import RivalConfig
 from sglpr_jax.loops.motion import Motion
@@ -26,9 +26,9 @@ RIVAL_SPACING_M = 8.0
 def rivals(
     descriptor: Float[np.ndarray, " d"],
     descriptors: Float[np.ndarray, "n d"],
+    frames: Int[np.ndarray, " n"],
     match: int,
     motion: Motion,
-    usable: Bool[np.ndarray, " n"],
     *,
     exclude_s: float,
     config: RivalConfig = RivalConfig(),
@@ -37,24 +37,24 @@ def rivals(
 
     Arguments:
       descriptor: Descriptor of the query.
-      descriptors: Descriptors of all earlier frames.
+      descriptors: Descriptors of the stored scans.
+      frames: Frame of each stored scan.
       match: Frame of the match.
       motion: Motion of all earlier frames and the query.
-      usable: Whether each earlier frame is not empty.
       exclude_s: Minimum age of a match, in seconds.
       config: Number and age of the rivals.
 
     Returns:
-      Frames, in order.
+      Rows of stored scans, in order.
     """
-    clock, now = np.array(motion.clock[: len(descriptors)]), motion.clock[len(descriptors)]
+    clock, now = motion.clock[frames], motion.clock[-1]
     youngest, oldest = (share * exclude_s for share in config.age)
-    starts = (now - oldest, clock[match] - oldest, clock[match] + youngest)
+    starts = (now - oldest, motion.clock[match] - oldest, motion.clock[match] + youngest)
     chosen = []
     for start, count in zip(starts, (config.of_query, config.of_match // 2, config.of_match // 2), strict=True):
         edges = np.linspace(start, start + oldest - youngest, count + 1)
         for low, high in itertools.pairwise(edges):
-            pool = np.flatnonzero(usable & (clock >= low) & (clock < high) & (clock <= now - youngest))
+            pool = np.flatnonzero((clock >= low) & (clock < high) & (clock <= now - youngest))
             if len(pool):
                 chosen.append(pool[np.linalg.norm(descriptors[pool] - descriptor, axis=1).argmin()])
     return np.unique(np.array(chosen, np.int64))
@@ -141,6 +141,6 @@ def expected_poses(
     The query's pose is known relative to the scan `frame`.
     """
     poses, known = motion.from_frame(frame, rows)
-    travelled = np.abs(np.array([motion.travelled[row] for row in rows]) - motion.travelled[frame])
+    travelled = np.abs(motion.travelled[rows] - motion.travelled[frame])
     tolerance = np.where(known, config.agree_m + config.agree_share * travelled, np.nan)
     return poses @ frame_from_query, tolerance

@@ -30,16 +30,16 @@ def agree_in_motion(
 ) -> Bool[np.ndarray, "n n"]:
     """Whether each pair of loops agrees with the motion of the sensor and, if it is a guess, in frame numbers."""
     query, match = frames_of(loops)
-    segment = np.array(motion.segments)
+    segment = motion.segments
     known = segment[query][:, None] == segment[query][None]
     known = known & (segment[match][:, None] == segment[match][None])
     fitted, _ = planar_loops(loops, mounting)
-    poses = planar(np.stack(motion.poses)[np.concatenate([query, match])])
+    poses = planar(motion.poses[np.concatenate([query, match])])
     expected = _moved(fitted, poses[: len(loops)], poses[len(loops) :])
     apart = compose(inverted(expected), np.broadcast_to(fitted[None], expected.shape))
     length, guess = (
         sum(np.abs(way[frames][:, None] - way[frames][None]) for frames in (query, match))
-        for way in (np.array(motion.travelled), np.array(motion.guessed_m))
+        for way in (motion.travelled, motion.guessed_m)
     )
     metres = config.agree_m + config.agree_share * length + config.guess_share * guess
     close = np.hypot(apart[..., 0], apart[..., 1]) <= metres

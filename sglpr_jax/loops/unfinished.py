@@ -21,9 +21,10 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import alone_in, read_json, replacing, write_json, writing
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared, Seen
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import fingerprint
@@ -51,7 +52,9 @@ FRAMES = 50
 """Number of frames in a file."""
 
 
-def settings(recording: Recording, finder: CandidateFinder, **given: np.ndarray | float | None) -> dict[str, Any]:
+def settings(
+    recording: Recording, finder: CandidateFinder, **given: np.ndarray | int | float | str | None
+) -> dict[str, Any]:
     """Settings that determine the content of a checkpoint, as JSON values. `given` are further arguments of the run."""
     found = {
         "format": FORMAT,
@@ -104,6 +107,8 @@ class Unfinished:
     """Settings that determine the content."""
     kept: int = 0
     """Number of stored frames that have been read or written."""
+    new: list[tuple[Seen | None, Compared]] = dataclasses.field(default_factory=list)
+    """Frames that are not written yet, with their comparisons."""
 
     @classmethod
     def opened(cls, folder: Path, wanted: dict[str, Any]) -> "Unfinished":
@@ -153,24 +158,29 @@ class Unfinished:
                 if seen is None and not missing:
                     return
                 add(seen, compared)
-            self.kept = len(finder.index)
+            self.kept = len(finder)
 
-    def keep(self, finder: CandidateFinder, candidates: Sequence[Candidate] = (), *, all: bool = False) -> None:
-        """Write the new frames if they fill a file or, with `all`, in any case. Raises WriteError."""
-        first, end = self.kept, len(finder.index)
-        if end - first < (1 if all else FRAMES):
+    def keep(self, seen: Seen | None, compared: Compared, *, index: Index) -> None:
+        """Take the next frame, and write a file if it is full. Arguments and errors are those of `write`."""
+        self.new.append((seen, compared))
+        if len(self.new) >= FRAMES:
+            self.write(index)
+
+    def write(self, index: Index) -> None:
+        """Write the new frames, if there are any. `index` has the same width and weights. Raises WriteError."""
+        if not self.new:
             return
-        frames = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash)
-        frames.add(finder.index.descriptors[first:end])
-        shown = sorted(set(range(first, end)) - set(finder.missing))
-        images = [finder.images[row] for row in shown]
+        first, end = self.kept, self.kept + len(self.new)
+        frames = Index.empty(index.width, weights_hash=index.weights_hash)
+        frames.add(np.stack([np.zeros(index.width) if seen is None else seen.descriptor for seen, _ in self.new]))
+        shown = [row for row, (seen, _) in zip(range(first, end), self.new, strict=True) if seen is not None]
+        images = [seen.image for seen, _ in self.new if seen is not None]
         stacked = np.stack(images) if images else np.zeros((0, 0, 0), np.uint8)
         more = {"made_from": self._made_from, "shown": np.array(shown, np.int64), "images": stacked}
-        new = [one for one in candidates if one.query >= first]
-        content = frames.to_bytes(more | columns(new, finder.links[first:end]))
+        content = frames.to_bytes(more | columns([compared for _, compared in self.new]))
         with replacing(self._path) as temporary:
             temporary.write_bytes(content)
-        self.kept = end
+        self.kept, self.new = end, []
 
     def _check(self, frames: Index, more: dict[str, np.ndarray], *, width: int) -> None:
         """Raise ValueError if the content of the next file is invalid or was made from something else."""
@@ -263,15 +273,16 @@ def _is_own(path: Path) -> bool:
     return OWN.fullmatch(path.name) is not None and path.is_file()
 
 
-def columns(candidates: Sequence[Candidate], links: Sequence[Peak | None]) -> dict[str, np.ndarray]:
+def columns(compared: Sequence[Compared]) -> dict[str, np.ndarray]:
     """Convert the comparisons of some frames to arrays: their candidates, in order, and the link of each frame."""
+    candidates = [one for frame in compared for one in frame.candidates]
     alignments = [np.concatenate([np.reshape(value, -1) for value in one.alignment]) for one in candidates]
-    missing = [np.nan] * len(Peak._fields)
+    links = [[np.nan] * len(Peak._fields) if link is None else [float(value) for value in link] for _, link in compared]
     return {
         "pairs": np.array([(one.query, one.match) for one in candidates], np.int64).reshape(-1, 2),
         "alignments": np.array(alignments, np.float64).reshape(-1, ALIGNMENT_NUMBERS),
         "evidence": np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(Evidence._fields)),
-        "links": np.array([missing if link is None else [float(value) for value in link] for link in links]),
+        "links": np.array(links),
     }
 
 

@@ -1,7 +1,7 @@
 """An index of places: descriptors are added over time, searched for the nearest, and saved in a file.
 
 The answers are exact: a float32 product selects a few additional rows, and their distances are recomputed in float64.
-The capacity doubles when it is reached, so that adding stays cheap and nothing is compiled.
+A query takes time in proportion to the number of places; adding a place does not, and nothing is compiled.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.fields import Size
 from sglpr_jax.files import in_short, naming, parse_json, replacing
+from sglpr_jax.growing import GrowingArray
 from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function, smallest
 from sglpr_jax.retrieval.index_rows import (
@@ -40,8 +41,6 @@ ABOUT = {"width": Size, "weights_hash": str, "distance": str, "ids": list}
 """JSON values in the header of every file."""
 TYPES = ("F32", "F64", "U8", "I64")
 """Types of arrays in every file, also of the additional arrays of `to_bytes`, in the terms of safetensors."""
-FIRST_ROOM = 256
-"""Number of rows that an empty index has capacity for."""
 SPARE = 16
 """Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
 BLOCK = 64
@@ -67,8 +66,10 @@ class Index:
     """Name in `retrieval.distances` of the function that compares two descriptors."""
     ids: list[str]
     """Names of the places."""
-    _columns: dict[str, np.ndarray]
-    _lengths: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, np.float32), repr=False)
+    _columns: dict[str, GrowingArray]
+    _lengths: GrowingArray = dataclasses.field(
+        default_factory=lambda: GrowingArray(np.empty(0, np.float32)), repr=False
+    )
     """Squared lengths of the descriptors, up to the last query."""
 
     @classmethod
@@ -77,7 +78,7 @@ class Index:
         distance_function(distance)
         if width < 1:
             raise ValueError(f"expected a descriptor width of 1 or more, found {width}")
-        return cls(width, weights_hash, distance, [], {"descriptors": np.empty((FIRST_ROOM, width), np.float32)})
+        return cls(width, weights_hash, distance, [], {"descriptors": GrowingArray(np.empty((0, width), np.float32))})
 
     @classmethod
     def of(cls, file: DescriptorFile) -> "Index":
@@ -92,17 +93,22 @@ class Index:
     @property
     def descriptors(self) -> Float[np.ndarray, "n d"]:
         """Descriptors of all places, float32. This is a view and must not be changed."""
-        return self._columns["descriptors"][: len(self)]
+        return self._columns["descriptors"].rows
 
     @property
     def times(self) -> Float[np.ndarray, " n"] | None:
         """Times of all places in seconds, or None if they have no times."""
-        return self._columns["times"][: len(self)] if "times" in self._columns else None
+        return self._columns["times"].rows if "times" in self._columns else None
 
     @property
     def positions(self) -> Float[np.ndarray, "n 3"] | None:
         """Positions of all places in metres, z up, or None if they have no positions."""
-        return self._columns["positions"][: len(self)] if "positions" in self._columns else None
+        return self._columns["positions"].rows if "positions" in self._columns else None
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes of the arrays, with their spare capacity."""
+        return self._lengths.nbytes + sum(values.nbytes for values in self._columns.values())
 
     def add(
         self,
@@ -132,8 +138,15 @@ class Index:
         n, about = len(self), {"ids": ids, "times": times, "positions": positions}
         names, new = new_places(descriptors, width=self.width, first=n, before=list(self._columns), **about)
         for name, values in new.items():
-            self._columns[name] = _appended(self._columns.get(name), values, n)
+            self._columns.setdefault(name, GrowingArray(values[:0])).extend(values)
         self.ids += names
+
+    def keep(self, flags: Bool[np.ndarray, " n"]) -> None:
+        """Remove the places without a flag. The others stay in order, with new rows."""
+        self._squares()
+        for column in (self._lengths, *self._columns.values()):
+            column.keep(flags)
+        self.ids = [name for name, kept in zip(self.ids, flags, strict=True) if kept]
 
     def add_file(self, file: DescriptorFile) -> None:
         """Add the places of a descriptor file. Raises ValueError if another model or method made it."""
@@ -192,7 +205,7 @@ class Index:
 
     def to_bytes(self, more: Mapping[str, np.ndarray] | None = None) -> bytes:
         """Return the content of the file that `save` writes, with additional arrays that `load_with` returns."""
-        arrays = {name: values[: len(self)] for name, values in self._columns.items()} | dict(more or {})
+        arrays = {name: values.rows for name, values in self._columns.items()} | dict(more or {})
         about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash, "distance": self.distance}
         text = json.dumps({**about, "ids": self.ids})
         arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -217,7 +230,7 @@ class Index:
         """Read the output of `to_bytes`: the index, and the additional arrays. Errors are those of `load`."""
         path = Path(path)
         about, arrays = _read(path)
-        columns = {name: arrays.pop(name) for name in COLUMNS if name in arrays}
+        columns = {name: GrowingArray(arrays.pop(name)) for name in COLUMNS if name in arrays}
         index = cls(about["width"], about["weights_hash"], about["distance"], about["ids"], columns)
         with naming(path):
             check_weights(index.weights_hash, weights_hash)
@@ -243,21 +256,8 @@ class Index:
         """Return the squared lengths of all descriptors, after computing those of new places."""
         new = self.descriptors[len(self._lengths) :]
         if len(new):
-            self._lengths = np.concatenate([self._lengths, np.einsum("nd,nd->n", new, new)])
-        return self._lengths
-
-
-def _appended(old: np.ndarray | None, new: np.ndarray, n: int) -> np.ndarray:
-    """Return a column with spare capacity, with the new rows from row `n` on."""
-    room = FIRST_ROOM if old is None else max(len(old), FIRST_ROOM)
-    while room < n + len(new):
-        room *= 2
-    if old is None or room > len(old):
-        grown = np.empty((room, *new.shape[1:]), new.dtype)
-        grown[:n] = old[:n] if old is not None else 0
-        old = grown
-    old[n : n + len(new)] = new
-    return old
+            self._lengths.extend(np.einsum("nd,nd->n", new, new))
+        return self._lengths.rows
 
 
 def _checksum(about: str, arrays: dict[str, np.ndarray]) -> str:

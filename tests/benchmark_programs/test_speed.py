@@ -162,3 +162,17 @@ def test_growth_tells_the_exponent_of_everything():
     rows = table(printed("speed.growth", "--preset", "tiny", "--sectors", 0, "--largest", 1, "--repeats", 1))
     assert len(rows) == 5 and rows[0][:3] == ["points of a scan, point counts", "15,000", "30,000"]
     assert all(np.isfinite(float(row[5])) for row in rows)
+
+
+@pytest.mark.parametrize("odometry", [(), ("--odometry",)])
+def test_a_long_drive_tells_memory_and_time_a_frame(odometry):
+    rows = table(printed("speed.long_drive", "--frames", 40, 340, "--lap", 305, "--window", 20, *odometry))
+    assert [row[0] for row in rows] == ["40", "340"]
+    assert all(int(row[2].replace(",", "")) > 1000 and float(row[3]) > 0 for row in rows)
+    assert int(rows[0][4]) == 0 < int(rows[1][4])
+
+
+def test_bytes_are_counted_once_and_not_those_of_code():
+    held_bytes = importlib.import_module("benchmarks.speed.long_drive").held_bytes
+    array = np.zeros(1000)
+    assert 8000 < held_bytes([array, array[1:], array[2:], np.zeros]) < 8500

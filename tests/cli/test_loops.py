@@ -103,6 +103,9 @@ def test_every_setting_of_the_detector_is_a_flag():
     flags = ["--candidates.candidates", "10", "--sequence.support", "3", "--candidates.rivals.of-query", "4"]
     changed = loops._config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
     assert (changed.candidates.candidates, changed.sequence.support, changed.candidates.rivals.of_query) == (10, 3, 4)
+    flags = ["--keyframe-m", "1.5", "--max-places", "100"]
+    limited = loops._config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
+    assert (limited.keyframe_m, limited.max_places) == (1.5, 100)
 
 
 def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):

@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from loops.kept import WANTED, fake_candidates, fake_finder, recalled
+from loops.kept import WANTED, keep, recalled
 from recordings import of_scans
 
 from sglpr_jax.data.corruption.corruptions import CLEAN
-from sglpr_jax.loops.unfinished import ENDING, Unfinished
+from sglpr_jax.loops.unfinished import ENDING
 from sglpr_jax.methods.method import ScanMethod
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.reuse import SETTINGS, _settings, embed_or_reuse
@@ -41,9 +41,7 @@ def files_of(write: Callable[[Path], Any]) -> Callable[[], Mapping[str, bytes]]:
 
 def stop_twice(folder: Path) -> None:
     """A search that was stopped after five frames, and after ten."""
-    kept = Unfinished.opened(folder, WANTED)
-    kept.keep(fake_finder(), fake_candidates(), all=True)
-    kept.keep(fake_finder(frames=10), all=True)
+    keep(folder, WANTED, stops=(5, 10))
 
 
 def frames_of(folder: Path) -> Any:

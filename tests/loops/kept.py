@@ -1,35 +1,42 @@
 """Frames of a search without a network, for its checkpoint directory."""
 
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from sglpr_jax.loops import unfinished
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder
+from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 
 WANTED = {"format": unfinished.FORMAT, "name": "08", "recording": "a"}
+EMPTY = Index.empty(4, weights_hash="w")
 
 
-def finder_of(**stored: Any) -> CandidateFinder:
-    """A finder without a network."""
-    finder = object.__new__(CandidateFinder)
-    vars(finder).update(stored)
-    return finder
+class FakeFinder(CandidateFinder):
+    """A finder without a network that counts frames."""
+
+    def __init__(self):
+        self.stored, self.frames = StoredScans(EMPTY), 0
+
+    def __len__(self) -> int:
+        return self.frames
 
 
-def fake_finder(seed: int = 0, frames: int = 5) -> CandidateFinder:
-    """What a finder stores of some frames, drawn at random; the second frame has no scan."""
-    draw, index = np.random.default_rng(seed), Index.empty(4, weights_hash="w")
-    index.add(draw.normal(size=(frames, 4)))
-    images = list(draw.integers(0, 255, (frames, 6, 6), np.uint8))
-    links = [None, *(Peak(*draw.normal(size=6)) for _ in range(frames - 1))]
-    return finder_of(index=index, images=images, missing=[1], links=links)
+def fake_frames(seed: int = 0, frames: int = 5) -> list[tuple[Seen | None, Compared]]:
+    """Frames with their comparisons, drawn at random. The second frame has no scan."""
+    draw, found = np.random.default_rng(seed), []
+    for frame in range(frames):
+        seen = Seen(draw.normal(size=4).astype(np.float32), draw.integers(0, 255, (6, 6), np.uint8), None)
+        link = Peak(*map(np.asarray, draw.normal(size=6))) if frame else None
+        pairs = fake_candidates(seed) if frame == 4 else []
+        found.append((None if frame == 1 else seen, Compared(pairs, link)))
+    return found
 
 
 def fake_candidates(seed: int = 0) -> list[Candidate]:
@@ -41,17 +48,22 @@ def fake_candidates(seed: int = 0) -> list[Candidate]:
 
 def recalled(folder: Path, wanted: dict) -> list:
     """The frames that a checkpoint directory gives back."""
-    finder, found = finder_of(index=Index.empty(4, weights_hash="w")), []
+    finder, found = FakeFinder(), []
 
     def add(seen, compared):
         found.append((seen, compared))
-        finder.index.add(np.zeros(4) if seen is None else seen.descriptor)
+        finder.frames += 1
 
     kept = unfinished.Unfinished.opened(folder, wanted)
     kept.recall(finder, None, add, missing=True)
     return found
 
 
-def keep(folder: Path, wanted: dict, seed: int = 0) -> Path:
-    unfinished.Unfinished.opened(folder, wanted).keep(fake_finder(seed), fake_candidates(seed), all=True)
+def keep(folder: Path, wanted: dict, *, seed: int = 0, stops: tuple[int, ...] = (5,)) -> Path:
+    """Keep frames in a folder, with a file for the frames before each stop. Returns the first file."""
+    kept = unfinished.Unfinished.opened(folder, wanted)
+    for frame, (seen, compared) in enumerate(fake_frames(seed, frames=stops[-1]), start=1):
+        kept.keep(seen, compared, index=EMPTY)
+        if frame in stops:
+            kept.write(EMPTY)
     return folder / "000000.safetensors"

@@ -4,8 +4,9 @@ import numpy as np
 
 import sglpr_jax
 from sglpr_jax.loops.background import Background
-from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.models.params import Params
 
 CELLS, CELL_M, RINGS_M = 152, 0.4, (4.0, 6.0, 9.0, 13.0)

@@ -13,11 +13,12 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find
-from sglpr_jax.loops.candidates import Candidate, Compared, Seen
+from sglpr_jax.loops.candidates import Candidate, Compared
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import check_odometry
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.loops.verification import Alignment

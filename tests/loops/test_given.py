@@ -13,11 +13,12 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.candidates import CandidateFinder, Seen
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.given import check_is, given_pose, given_poses, given_record, given_time
 from sglpr_jax.loops.places import PlaceMap, map_recording
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash

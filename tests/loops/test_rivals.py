@@ -25,13 +25,14 @@ def test_rivals_come_from_before_the_query_and_around_the_match():
     motion, descriptors = straight(201), np.zeros((200, 2))
     descriptors[:, 0] = 1.0
     descriptors[[180, 192], 0] = 0.1  # the nearest of its stretch, and one that is too young
-    usable = np.ones(200, bool)
-    found = rivals(np.zeros(2), descriptors, 60, motion, usable, exclude_s=30.0)
+    frames = np.arange(200)
+    found = rivals(np.zeros(2), descriptors, frames, 60, motion, exclude_s=30.0)
     age, around = 200 - found[found > 100], np.abs(found[found < 100] - 60)
     assert len(age) == 6 and len(around) == 4 and 180 in found and 192 not in found
     assert age.min() >= 8 and age.max() <= 29.2 and around.min() >= 8 and around.max() <= 29.2
-    usable[:] = False
-    assert len(rivals(np.zeros(2), descriptors, 60, motion, usable, exclude_s=30.0)) == 0
+    stored = frames[frames % 3 == 0]
+    assert set(stored[rivals(np.zeros(2), descriptors[stored], stored, 60, motion, exclude_s=30.0)] % 3) == {0}
+    assert len(rivals(np.zeros(2), descriptors[:0], frames[:0], 60, motion, exclude_s=30.0)) == 0
 
 
 def test_a_rival_that_fits_as_well_is_evidence_against():

@@ -17,13 +17,14 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.candidates import Candidate, Compared, Seen
+from sglpr_jax.loops.candidates import Candidate, Compared
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.explanation import why_few_queries
 from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.loops.odometry import at_scans, read_odometry
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.loops.verification import Alignment
 
@@ -50,8 +51,8 @@ def detector_of(params, **options) -> LoopDetector:
     seen = Seen(np.zeros(finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
 
     def compared(seen, time, position, pose, clock):
-        query = len(finder.index)
-        rows = np.flatnonzero(~finder._excluded(time, position))
+        query = len(finder)
+        rows = finder.stored.frames[~finder._excluded(time, position)]
         finder.motion.add(clock, pose=POSES[query])
         apart = np.linalg.norm(POSES[rows, :2, 3] - POSES[query, :2, 3], axis=1)
         if not len(rows) or apart.min() > 15:

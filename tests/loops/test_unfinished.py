@@ -21,7 +21,7 @@ from sglpr_jax.loops.probability import Curve, LoopModel
 from sglpr_jax.loops.registration import Registration
 from sglpr_jax.retrieval.index import Index
 
-from .kept import WANTED, fake_finder, keep, recalled
+from .kept import WANTED, fake_frames, keep, recalled
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
@@ -29,6 +29,7 @@ ALWAYS = LoopModel({"distance": Curve((0.0,), (0.0,))}, 10.0, "everything")
 find_loops = functools.partial(find.find_loops, model=ALWAYS)
 """Every candidate is probable, so that the loops depend on nothing but what is kept."""
 CONFIG = DetectorConfig(candidates=CandidateConfig(exclude_frames=8, exclude_s=0.5))
+EMPTY = Index.empty(4, weights_hash="w")
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,21 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
     (tmp_path / "kept" / f".000024.safetensors.{32 * 'a'}.tmp").write_bytes(b"half")
     unfinished.remove(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
+
+
+@pytest.mark.slow
+def test_a_run_that_forgets_scans_goes_on_too_and_other_limits_are_other_settings(twice, params, tmp_path):
+    recording, odometry = twice
+    config = dataclasses.replace(CONFIG, keyframe_m=1.0, max_places=14)
+    whole = find_loops(recording, params, odometry=odometry, config=config)
+    assert len(whole.loops) >= 4
+    options = {"odometry": odometry, "kept_in": tmp_path / "kept"}
+    for frames in (13, 6, 100):
+        found = find_loops(recording, params, **options, config=config, should_stop=stopping_after(frames, []))
+    assert found.whole and contents(found, tmp_path / "found") == contents(whole, tmp_path / "whole")
+    other = dataclasses.replace(config, max_places=13)
+    with pytest.warns(DataWarning, match="found another max_places, acceptance"):
+        find_loops(recording, params, **options, config=other, should_stop=stopping_after(1, []))
 
 
 @pytest.mark.slow
@@ -215,11 +231,12 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
 
 def test_frames_come_back_as_they_were_kept(tmp_path):
     keep(tmp_path, WANTED)
-    found, finder = recalled(tmp_path, WANTED), fake_finder()
+    found, kept = recalled(tmp_path, WANTED), fake_frames()
     assert [seen is None for seen, _ in found] == [False, True, False, False, False]
-    np.testing.assert_array_equal(found[4][0].image, finder.images[4])
-    np.testing.assert_array_equal(found[4][0].descriptor, finder.index.descriptors[4])
-    assert found[0][1].link is None and found[3][1].link == pytest.approx(finder.links[3])
+    for one, other in zip(found[4][0], kept[4][0] or (), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert found[0][1].link is None
+    np.testing.assert_allclose(np.array(found[3][1].link), np.array(kept[3][1].link))
     assert [len(compared.candidates) for _, compared in found] == [0, 0, 0, 0, 1]
 
 

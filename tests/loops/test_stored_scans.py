@@ -1,0 +1,34 @@
+"""Images that were compressed come back, in less memory."""
+
+import numpy as np
+import pytest
+
+from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.retrieval.index import Index
+
+from .scenes import place, seen_from
+
+
+def images(count: int) -> list[np.ndarray]:
+    """Sparse images of one place."""
+    return [seen_from(place(), (0.1 * k, 0.0, 0.0), seed=k).astype(np.uint8) for k in range(count)]
+
+
+def test_images_come_back_in_a_fraction_of_the_memory():
+    stored, given = StoredScans(Index.empty(4)), images(40)
+    for k, image in enumerate(given):
+        stored.add(10 * k, np.full(4, k, np.float32), image)
+    for k, image in enumerate(given):
+        np.testing.assert_array_equal(stored.image(k), image)
+    assert len(stored) == 40 and stored.frames.tolist() == list(range(0, 400, 10))
+    empty = StoredScans(Index.empty(4))
+    empty.add(0, np.zeros(4, np.float32), given[0])
+    assert stored.nbytes - empty.nbytes < 40 * given[0].nbytes / 3
+
+
+def test_an_image_of_another_size_is_one_clear_error():
+    stored = StoredScans(Index.empty(4))
+    stored.add(0, np.zeros(4, np.float32), images(1)[0])
+    with pytest.raises(ValueError, match=r"frame 3: expected an image of \(64, 64\) cells, found \(8, 8\)"):
+        stored.add(3, np.zeros(4, np.float32), np.zeros((8, 8), np.uint8))
+    assert len(stored) == 1 == len(stored.index)
