@@ -42,9 +42,9 @@ def main(*, preset: str = "circular", repeats: int = 10, steps: int = 2, points:
     plain, kept = (_contender(name, tunables, config, steps, points, threads) for name, tunables in _SETTINGS.items())
     for contender in (plain, kept):
         contender.run()  # compiles
-    before = [contender.run()[0] for contender in (plain, kept)]
+    before = [Used(*contender.run()[0]) for contender in (plain, kept)]
     seconds = alternate((plain, kept), repeats=repeats)
-    after = [contender.run()[0] for contender in (plain, kept)]
+    after = [Used(*contender.run()[0]) for contender in (plain, kept)]
     made = (repeats + 1) * steps
     report(
         f"training steps of {preset}",
@@ -71,13 +71,13 @@ def _contender(name: str, tunables: str, config: TrainConfig, steps: int, points
 def _job(config: TrainConfig, steps: int, points: int) -> Job:
     state, batch = new_state(config), jax.device_put(random_batch(config, points))
 
-    def make_steps() -> Used:
+    def make_steps() -> tuple[float, int, float]:
         nonlocal state
         for _ in range(steps):
             state, metrics = train_step(state, batch, config=config)
         assert np.isfinite(float(metrics["loss"]))
         used = resource.getrusage(resource.RUSAGE_SELF)
-        return Used(used.ru_utime + used.ru_stime, used.ru_minflt, used.ru_maxrss / 1e6)
+        return used.ru_utime + used.ru_stime, used.ru_minflt, used.ru_maxrss / 1e6
 
     return make_steps
 

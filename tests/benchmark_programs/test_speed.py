@@ -175,4 +175,4 @@ def test_a_long_drive_tells_memory_and_time_a_frame(odometry):
 def test_bytes_are_counted_once_and_not_those_of_code():
     held_bytes = importlib.import_module("benchmarks.speed.long_drive").held_bytes
     array = np.zeros(1000)
-    assert 8000 < held_bytes([array, array[1:], array[2:], np.zeros]) < 8500
+    assert 8000 < held_bytes([array, array[1:], array[2:], np.zeros]) < 9000

@@ -282,7 +282,9 @@ def test_weights_of_another_type_are_refused_on_load_and_on_export(params, tmp_p
     flat = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
     other = flat["segmentation_head/kernel"].astype(dtype)
     safetensors.numpy.save_file({**flat, "segmentation_head/kernel": other}, folder / WEIGHTS_FILE)
-    with pytest.raises(ValueError, match=rf"{WEIGHTS_FILE}: expected segmentation_head/kernel as F32 or F16 with values, found "):
+    with pytest.raises(
+        ValueError, match=rf"{WEIGHTS_FILE}: expected segmentation_head/kernel as F32 or F16 with values, found "
+    ):
         load(folder)
     weights = {**params.weights, "segmentation_head": {"kernel": other}}
     with pytest.raises(ValueError, match="new: expected segmentation_head/kernel as float32, found "):
