@@ -53,7 +53,7 @@ class Compared(NamedTuple):
 class CandidateFinder:
     """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
 
-    A frame takes constant time, with two exceptions: the search for the nearest descriptor (a matrix product) is
+    The time of a frame is constant, with two exceptions. The search for the nearest descriptor (a matrix product) is
     proportional to the number of stored scans, and the drift of the odometry to the number of frames.
     """
 
