@@ -68,17 +68,17 @@ def with_flag_values(
       ValueError: If a flag does not exist or a value does not fit it. The message names `source`, the flag, the
         expected and the found value.
     """
+    from sglpr_jax.files import naming  # slow import, not needed for --help
+
     known = []
 
     def read(flag: str, annotation: Any, value: Any) -> Any:
         known.append(flag)
         return read_value(values[flag], annotation, flag) if flag in values else value
 
-    try:
+    with naming(source):
         changed = _visit(command, fields, read)
         _check_known(values, known)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
     return changed
 
 

@@ -62,7 +62,7 @@ def _default(field: dataclasses.Field) -> Any:
 
 def _preset_in_file(preset: Any, load_preset: Callable[[str], Any], *, source: Path | None) -> Any:
     """Load the preset that a file of --config names. The message of an error names the file."""
-    try:
+    from sglpr_jax.files import naming  # slow import, not needed for --help
+
+    with naming(f"{source}: preset"):
         return load_preset(read_value(preset, str, ""))
-    except ValueError as error:
-        raise ValueError(f"{source}: preset: {error}") from error

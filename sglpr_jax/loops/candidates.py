@@ -53,8 +53,8 @@ class Compared(NamedTuple):
 class CandidateFinder:
     """Finds candidates in a stream of scans. Stores descriptor and compressed image of each scan that is not empty.
 
-    The time of a frame is constant, with two exceptions. The search for the nearest descriptor (a matrix product) is
-    proportional to the number of stored scans, and the drift of the odometry to the number of frames.
+    The number of image comparisons for a frame is constant. The search for the nearest descriptor (a matrix product) is
+    proportional to the number of stored scans. Times, motion and drift are compared with those of all frames.
     """
 
     def __init__(
