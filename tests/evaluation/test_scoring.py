@@ -43,7 +43,7 @@ def test_arrays_of_jax_and_lists_are_taken(file):
     assert scores(jnp.asarray(file.descriptors), **where) == scores(file)
     as_lists = {name: values.tolist() for name, values in where.items()}
     assert scores(file.descriptors.tolist(), **as_lists) == scores(file)
-    with pytest.raises(ValueError, match=r"descriptors \(n, d\), found \(3,\)"):
+    with pytest.raises(ValueError, match=r"descriptors \(n, d\), found an array of shape \(3,\)"):
         evaluate(np.zeros(3), **where)
 
 
