@@ -19,6 +19,7 @@ from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, occupied, query_spectra,
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.seen import Seen, described
+from sglpr_jax.loops.shortlist import shortlist
 from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.loops.trajectory import Trajectory
 from sglpr_jax.loops.transforms import inverse, transform
@@ -211,7 +212,8 @@ class CandidateFinder:
         if self.is_empty(seen.image):
             self.motion.add(clock, pose=pose)
             return Compared([], None)
-        rows = self._rows(seen.descriptor, self._excluded(time, position))
+        excluded = self._excluded(time, position)
+        rows = self._rows(seen.descriptor, excluded)
         key = self.motion.keyframe
         linked = pose is None and len(self) > 0 and not self.empty[key]
         matches = [self.stored.image(row) for row in rows.tolist()] + 2 * linked * [self._keyframe]
@@ -224,8 +226,9 @@ class CandidateFinder:
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
             return Compared([], link)
-        best = int(np.argmax(peaks.correlation[: len(rows)]))
-        return Compared([self._candidate(seen, spectra, rows, peaks.some(slice(len(rows))), best)], link)
+        rows, found = self._with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded)
+        best = int(np.argmax(found.correlation))
+        return Compared([self._candidate(seen, spectra, rows, found, best)], link)
 
     def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
         """Stored scans with the nearest descriptors, and those with the nearest ones at other times than the first."""
@@ -235,6 +238,25 @@ class CandidateFinder:
         excluded = excluded | self._about(int(rows[0]))
         return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
 
+    def _with_further(
+        self,
+        seen: Seen,
+        spectra: Complex[Array, "s t f"],
+        rows: Int[np.ndarray, " k"],
+        found: Peak,
+        excluded: Bool[np.ndarray, " n"],
+    ) -> tuple[Int[np.ndarray, " j"], Peak]:
+        """Compared scans and their peaks, with further scans if none of the compared ones fits well."""
+        config = self.config
+        if found.correlation.max() >= config.good_correlation:
+            return rows, found
+        pool = self.nearest(seen.descriptor, config.further, excluded)
+        pool = pool[~np.isin(pool, rows)]
+        images = [self.stored.image(row) for row in pool.tolist()]
+        chosen = pool[shortlist(seen.image, images, config.candidates, size=config.further, config=self.verification)]
+        more = self.search(spectra, [self.stored.image(row) for row in chosen.tolist()], config.candidates)
+        return np.concatenate([rows, chosen]), Peak(*map(np.concatenate, zip(found, more, strict=True)))
+
     def _about(self, row: int) -> Bool[np.ndarray, " n"]:
         """Whether each stored scan was recorded at about the same time as one of them."""
         frames = self.stored.frames
@@ -243,7 +265,9 @@ class CandidateFinder:
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k stored scans with the nearest descriptors, nearest first."""
+        """Up to k (0 or more) stored scans with the nearest descriptors, nearest first."""
+        if not k:
+            return np.zeros(0, np.int64)
         rows = self.index.query(descriptor, k, exclude=excluded).rows
         return rows[rows >= 0]
 

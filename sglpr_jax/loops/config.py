@@ -101,6 +101,10 @@ class CandidateConfig:
     elsewhere: PlaceCountOrNone = 2
     """Number of nearest descriptors from other times (`rivals.age`) whose images are compared. The best fit of all
     compared frames is the candidate."""
+    good_correlation: float = 0.6
+    further: PlaceCountOrNone = 25
+    """If no compared image has this correlation, more of the nearest descriptors are compared, `further` altogether:
+    first on coarse cells, then the best `candidates` of them like the others."""
     exclude_s: float = EXCLUDED_S
     exclude_frames: int = EXCLUDED_FRAMES
     """Minimum age of a match in seconds, or in frames if there are no times."""

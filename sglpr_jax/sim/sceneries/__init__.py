@@ -8,6 +8,7 @@ import numpy as np
 from sglpr_jax.sim.sceneries.car_park import car_park
 from sglpr_jax.sim.sceneries.corridor import corridor
 from sglpr_jax.sim.sceneries.field import field
+from sglpr_jax.sim.sceneries.forest import forest
 from sglpr_jax.sim.sceneries.garage import garage
 from sglpr_jax.sim.sceneries.highway import LANE_M, highway
 from sglpr_jax.sim.sceneries.orchard import orchard
@@ -61,5 +62,6 @@ REPEATING = {
     "vineyard": Repeating(vineyard, (3.5, 6.0), clearance_m=0.8, right_m=0.2, sway_m=0.15),
     "row_houses": Repeating(row_houses, (6.0, 9.0), right_m=0.2, sway_m=0.2),
     "field": Repeating(field, (7.0, 12.0)),
+    "forest": Repeating(forest, (1.0, 1.6), rate_hz=1.0, clearance_m=0.6, right_m=0.2, sway_m=0.3, height_m=1.6),
 }
 """Sceneries by the names that `simulate_repeating` accepts."""
