@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Complex, Float, UInt8
+from jaxtyping import Array, Complex, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
@@ -29,6 +29,7 @@ from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.relocated import Relocated, with_shared_probability
 from sglpr_jax.loops.rivals import MAP_RIVALS, distance_share, rival_places, rival_share
 from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.shortlist import shortlist
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import check_level, upright_from_lidar
 from sglpr_jax.loops.verification import refined
@@ -129,10 +130,11 @@ class PlaceMap:
           record: A record, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that
             of the last place (`mounting`). For another mounting pass a record.
           model: Model of the probabilities, by default the one shipped for the weights.
-          candidates: Number of nearest places that the query is compared with.
+          candidates: Maximum number of poses, and number of nearest places that the query is compared with. If it fits
+            none of them well, as many others of the nearest 25 are compared, chosen by a coarse comparison.
 
         Returns:
-          One pose for each of the nearest places, the most probable first. Empty if the scan is almost empty.
+          One pose for each compared place, the most probable first. Empty if the scan is almost empty.
 
         Raises:
           ValueError: If other weights made the map, if an array has another shape, or if `candidates` is not from 1 to
@@ -146,18 +148,19 @@ class PlaceMap:
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
         exclude = np.full(len(self), finder.is_empty(image))
-        found = self.index.query(seen.descriptor, candidates, exclude=exclude, weights_hash=finder.index.weights_hash)
-        rows, distances = (values[found.rows >= 0].tolist() for values in found)
-        if not rows:
+        nearest = max(candidates, CandidateConfig().further)
+        found = self.index.query(seen.descriptor, nearest, exclude=exclude, weights_hash=finder.index.weights_hash)
+        rows, distances = (values[found.rows >= 0] for values in found)
+        if not len(rows):
             return []
         model = default_model(self.index.weights_hash) if model is None else model
         spectra = query_spectra(image)
-        peaks = jax.device_get(search_spectra(spectra, self.images[rows]))
+        chosen, peaks = self._compared(image, spectra, rows, candidates)
         answers = [
-            self._answer(seen, spectra, row, distance, peaks.one(k), model)
-            for k, (row, distance) in enumerate(zip(rows, distances, strict=True))
+            self._answer(seen, spectra, int(rows[k]), float(distances[k]), peaks.one(i), model)
+            for i, k in enumerate(chosen.tolist())
         ]
-        return with_shared_probability(answers)
+        return with_shared_probability(answers)[:candidates]
 
     def save(self, path: Path | str) -> None:
         """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
@@ -173,6 +176,20 @@ class PlaceMap:
         """Descriptor and pose of each place, as bytes."""
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
             yield descriptor.tobytes(), pose.tobytes()
+
+    def _compared(
+        self, image: UInt8[np.ndarray, "h w"], spectra: Complex[Array, "s t f"], rows: Int[np.ndarray, " n"], count: int
+    ) -> tuple[Int[np.ndarray, " k"], Peak]:
+        """Indices of the compared places in `rows`, the nearest first, and their peaks. If none of the first `count`
+        fits well, as many others are chosen by a coarse comparison."""
+        first, others = np.arange(len(rows))[:count], np.arange(len(rows))[count:]
+        peaks = jax.device_get(search_spectra(spectra, self.images[rows[first]]))
+        if not len(others) or peaks.correlation.max() >= CandidateConfig().good_correlation:
+            return first, peaks
+        images = list(self.images[rows[others]])
+        more = others[shortlist(image, images, count, size=len(others))]
+        found = jax.device_get(search_spectra(spectra, self.images[rows[more]]))
+        return np.concatenate([first, more]), Peak(*map(np.concatenate, zip(peaks, found, strict=True)))
 
     def _answer(
         self, seen: Seen, spectra: Complex[Array, "s t f"], row: int, distance: float, peak: Peak, model: LoopModel

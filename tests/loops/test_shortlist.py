@@ -1,0 +1,45 @@
+"""The coarse comparison finds a place where descriptors do not."""
+
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.shortlist import shortlist
+
+from .scenes import place, seen_from
+
+PLACES, TRUE = 12, 7
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Images of different places, with the sensor at the centre."""
+    return [seen_from(place(seed), (0.0, 0.0, 0.0)).astype(np.uint8) for seed in range(PLACES)]
+
+
+@pytest.fixture(scope="module")
+def query():
+    """One of the places, from another position and rotated."""
+    return seen_from(place(TRUE), (1.2, -0.8, 2.5)).astype(np.uint8)
+
+
+def test_the_true_place_comes_first_whatever_the_size_of_the_batch(images, query):
+    assert shortlist(query, images, 3, size=PLACES)[0] == TRUE
+    assert np.array_equal(shortlist(query, images, 3, size=PLACES), shortlist(query, images, 3, size=20))
+    assert len(shortlist(query, images[:2], 3, size=PLACES)) == 2
+    assert not len(shortlist(query, [], 3, size=PLACES))
+
+
+@pytest.mark.parametrize(("further", "found"), [(0, False), (PLACES, True)])
+def test_places_with_distant_descriptors_are_found_by_further_comparisons(images, query, further, found):
+    config = CandidateConfig(candidates=1, elsewhere=0, further=further, exclude_frames=1, min_travelled_m=0.0)
+    finder = CandidateFinder(sglpr_jax.load("circular"), config=config)
+    descriptors = np.eye(PLACES + 1, finder.index.width, dtype=np.float32)
+    for image, descriptor in zip(images, descriptors, strict=False):
+        finder.add_seen(Seen(descriptor, image, None))
+    wrong = (descriptors[0] + 0.1 * descriptors[-1]).astype(np.float32)
+    [candidate] = finder.add_seen(Seen(wrong / np.linalg.norm(wrong), query, None))
+    assert (candidate.match == TRUE) == found
