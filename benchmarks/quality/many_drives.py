@@ -33,7 +33,9 @@ FAR_M = 10_000.0
 NEAREST = (1, 3, 10, 25)
 
 
-def main(drives: tyro.conf.Positional[tuple[Path, ...]], *, further: tuple[int, ...] = (0, 25), noise: float = 0.0) -> None:
+def main(
+    drives: tyro.conf.Positional[tuple[Path, ...]], *, further: tuple[int, ...] = (0, 25), noise: float = 0.0
+) -> None:
     """Search the drives, once for each value.
 
     Args:

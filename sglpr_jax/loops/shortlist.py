@@ -43,6 +43,6 @@ def shortlist(
     """
     if not images:
         return np.zeros(0, np.int64)
-    padded = np.stack([images[k] for k in np.arange(size) % len(images)])
+    padded = np.stack([images[k] for k in (np.arange(size) % len(images)).tolist()])
     peaks = jax.device_get(search(query, padded, config=coarser(config)))
     return np.argsort(-peaks.correlation[: len(images)], kind="stable")[:count]
