@@ -11,7 +11,14 @@ from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.warning import warn
-from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, Degenerate, OdometryFormat
+from sglpr_jax.loops.choices import (
+    DRIFT_DEG_PER_100M,
+    DRIFT_HEIGHT_PERCENT,
+    DRIFT_PERCENT,
+    MIN_PROBABILITY,
+    Degenerate,
+    OdometryFormat,
+)
 from sglpr_jax.loops.config import (
     CandidateConfig,
     ConsistencyConfig,
@@ -58,6 +65,9 @@ class LoopsCommand:
     more than four standard deviations are rejected."""
     drift_deg_per_100m: float = DRIFT_DEG_PER_100M
     """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
+    drift_height_percent: float = DRIFT_HEIGHT_PERCENT
+    """Height drift of the odometry: one standard deviation, in percent of the travelled distance. A loop with another
+    floor is rejected if four standard deviations are less than the difference in height."""
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
@@ -102,7 +112,15 @@ def _config(command: LoopsCommand) -> DetectorConfig:
         for field in dataclasses.fields(DetectorConfig)
         if field.name != "drift"
     }
-    return DetectorConfig(drift=DriftModel(command.drift_percent / 100, command.drift_deg_per_100m / 100), **same)
+    return DetectorConfig(drift=_drift(command), **same)
+
+
+def _drift(command: LoopsCommand) -> DriftModel:
+    return DriftModel(
+        metres_per_metre=command.drift_percent / 100,
+        degrees_per_metre=command.drift_deg_per_100m / 100,
+        height_per_metre=command.drift_height_percent / 100,
+    )
 
 
 def _check(command: LoopsCommand) -> None:

@@ -26,3 +26,5 @@ DRIFT_PERCENT = 1.0
 """Position drift of odometry: one standard deviation, in percent of the travelled distance."""
 DRIFT_DEG_PER_100M = 0.5
 """Heading drift of odometry: one standard deviation, in degrees per 100 m of travelled distance."""
+DRIFT_HEIGHT_PERCENT = 0.3
+"""Height drift of odometry: one standard deviation, in percent of the travelled distance."""

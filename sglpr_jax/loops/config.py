@@ -5,7 +5,14 @@ import math
 
 from sglpr_jax.data.density_grid import RESOLUTION_M
 from sglpr_jax.fields import check_fields
-from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_PERCENT, MIN_PROBABILITY, PlaceCount, PlaceCountOrNone
+from sglpr_jax.loops.choices import (
+    DRIFT_DEG_PER_100M,
+    DRIFT_HEIGHT_PERCENT,
+    DRIFT_PERCENT,
+    MIN_PROBABILITY,
+    PlaceCount,
+    PlaceCountOrNone,
+)
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
 
@@ -24,7 +31,10 @@ class DriftModel:
     """Heading drift. It rotates the rest of the path and so moves the position, too."""
     sideways: float = 0.25
     """Position drift across the direction of travel, as a fraction of the drift along it."""
+    height_per_metre: float = DRIFT_HEIGHT_PERCENT / 100
+    """Height drift. A place on another floor of a building contradicts the odometry if this is small enough."""
     position_m: float = 0.5
+    height_m: float = 0.3
     yaw_deg: float = 1.5
     """Standard deviations of the comparison itself, independent of the distance, in metres and degrees."""
     max_deviation: float = 4.0
@@ -33,14 +43,14 @@ class DriftModel:
     def __post_init__(self):
         """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
         for name, value in dataclasses.asdict(self).items():
-            positive = name in ("position_m", "yaw_deg", "max_deviation")
+            positive = name in ("position_m", "height_m", "yaw_deg", "max_deviation")
             if not math.isfinite(value) or value < 0 or (positive and value == 0):
                 raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
 
     def scaled(self, factor: float) -> "DriftModel":
         """The same model with `factor` times the drift per metre."""
-        metres, degrees = factor * self.metres_per_metre, factor * self.degrees_per_metre
-        return dataclasses.replace(self, metres_per_metre=metres, degrees_per_metre=degrees)
+        names = ("metres_per_metre", "degrees_per_metre", "height_per_metre")
+        return dataclasses.replace(self, **{name: factor * getattr(self, name) for name in names})
 
     def __str__(self) -> str:
         return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"

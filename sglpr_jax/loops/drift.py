@@ -11,6 +11,7 @@ from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
 from sglpr_jax.loops.transforms import travelled
+from sglpr_jax.loops.upright import upright_odometry, upright_poses
 
 GRAPH_M = 100.0
 """Travelled distance at which the drift of a pose graph equals that of the model, in metres."""
@@ -35,6 +36,9 @@ def deviations(
     multiple of the model's drift. If position and heading drift at constant rates, f and g times those of the model,
     the distance is at most `sqrt(f^2 + g^2)`.
 
+    If the deviation in height alone is larger (`height_deviations`), it is returned instead. Floors of a building look
+    alike, so a difference in height must not be outweighed by a good fit in the plane.
+
     Arguments:
       loops: Loops between frames of the odometry.
       odometry: Pose of the LiDAR at each frame.
@@ -50,7 +54,26 @@ def deviations(
     error[:, 2] = wrapped(error[:, 2])
     spread = _drifted(flat, match, query, drift, guessed_m) + _turned(covariances, by_loop[:, 2])
     spread += np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
-    return np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+    in_plane = np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+    return np.maximum(in_plane, height_deviations(loops, odometry, drift=drift, mounting=mounting))
+
+
+def height_deviations(
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"],
+    *,
+    drift: DriftModel = DriftModel(),
+    mounting: Mounting | None = None,
+) -> Float[np.ndarray, " k"]:
+    """Deviation of each loop from the odometry in height, in standard deviations. The arguments are those of
+    `deviations`."""
+    query, match = frames_of(loops)
+    world = upright_odometry(odometry, mounting)
+    poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
+    by_loop = world[match] @ upright_poses(poses, mounting)
+    variance, way = np.array([loop.covariance[2, 2] for loop in loops]), travelled(odometry)
+    spread = np.sqrt(drift.height_m**2 + (drift.height_per_metre * (way[query] - way[match])) ** 2 + variance)
+    return np.abs(by_loop[:, 2, 3] - world[query, 2, 3]) / spread
 
 
 def position_deviations(

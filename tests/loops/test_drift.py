@@ -118,3 +118,30 @@ def test_an_impossible_drift_is_an_error(name, value):
     with pytest.raises(ValueError, match=f"expected {name} >=? ?0, found"):
         DriftModel(**{name: value})
     assert str(DriftModel(0.1, 0.05)) == "10 % and 5 degrees per 100 m"
+
+
+def ramp(laps: int, rise_m: float) -> np.ndarray:
+    """Poses every metre along a ring of 100 m that rises by `rise_m` in each lap."""
+    angle = 2 * np.pi * np.arange(100 * laps) / 100
+    poses = np.stack([transform(*(100 / (2 * np.pi) * np.array([np.sin(a), -np.cos(a)])), a) for a in angle])
+    poses[:, 2, 3] = rise_m * angle / (2 * np.pi)
+    return poses
+
+
+@pytest.mark.parametrize("tilt", [None, Mounting(2.0, (0.5, 0.0, np.sqrt(0.75)))])
+def test_floors_that_look_alike_are_apart_in_height(tilt):
+    """Four laps of a ramp: each loop between two of them fits in the plane, and none fits in height."""
+    lidar = inverse(upright_from_lidar(tilt))
+    flat, rising = ramp(4, 0.0) @ inverse(lidar), ramp(4, 3.5) @ inverse(lidar)
+    loops = [exact(flat, query, match) for query in (150, 250, 399) for match in range(query % 100, query - 99, 100)]
+    assert deviations(loops, flat, mounting=tilt).max() < 1e-6
+    assert deviations(loops, rising, mounting=tilt).min() > DriftModel().max_deviation
+    unsure = dataclasses.replace(DriftModel(), height_per_metre=0.01)
+    assert deviations(loops, rising, mounting=tilt, drift=unsure).max() < DriftModel().max_deviation
+
+
+def test_height_by_hand():
+    odometry = along([(0, 0), (101, 0)])
+    above = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, 0.0), np.diag([0, 0, 0.16, 0, 0, 0]), 1.0)
+    above.match_from_query[2, 3] = 2.0
+    np.testing.assert_allclose(deviations([above], odometry), 2 / np.sqrt(0.3**2 + 0.3**2 + 0.16), rtol=1e-6)
