@@ -31,6 +31,7 @@ from .data import (
     recording_names as recording_names,
 )
 from .data.density_image import density_bev as density_bev
+from .data.gravity import GroundFilter as GroundFilter
 from .data.mounting import Mounting as Mounting
 from .data.mounting import estimate_mounting as estimate_mounting
 from .evaluation.scoring import Evaluation as Evaluation

@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -29,6 +29,9 @@ from sglpr_jax.loops.config import (
 )
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
+if TYPE_CHECKING:
+    from sglpr_jax.data import Recording
+
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""
 
@@ -46,7 +49,7 @@ class LoopsCommand:
       bin/loops my_scans --out found
       bin/loops my_scans --odometry odometry.tum --out found
       bin/loops drive.mcap --odometry drive.mcap --out found
-      bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found --register
+      bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found
       bin/loops my_scans --odometry odometry.tum --optimize --out found
     """
 
@@ -71,8 +74,9 @@ class LoopsCommand:
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
-    register: bool = False
-    """Register the full scans in 6 degrees of freedom and check their overlap (extra slam)."""
+    register: bool = True
+    """Register the full scans of loops in 6 degrees of freedom and check their overlap (extra slam). Images are not
+    registered."""
     optimize: bool = False
     """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti. The correction of thousands
     of frames takes minutes."""
@@ -143,7 +147,7 @@ def _check(command: LoopsCommand) -> None:
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
     from sglpr_jax.loops.explanation import why_few_queries, why_none
-    from sglpr_jax.loops.find import find_loops
+    from sglpr_jax.loops.find import can_register, find_loops
     from sglpr_jax.loops.folder import write_found
     from sglpr_jax.loops.optimization import optimize_trajectory
     from sglpr_jax.loops.reasons import why_rejected
@@ -156,6 +160,9 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         recording, odometry = source.open(command.recording), None
     else:
         recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
+    register = command.register and can_register(recording)
+    if command.register and not register:
+        print(f"{recording.name}: loops are not registered, {_why_not(recording)}", file=sys.stderr)
     if too_recent := why_few_queries(recording, config.candidates):
         warn(f"{recording.name}: {too_recent}")
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
@@ -164,7 +171,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
             params,
             odometry=odometry,
             config=config,
-            registered=command.register,
+            registered=register,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=command.out / UNFINISHED,
             should_stop=stop,
@@ -185,6 +192,13 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         return stop.exit_status
     remove(command.out / UNFINISHED)
     return 0
+
+
+def _why_not(recording: "Recording") -> str:
+    """Why the scans of a recording cannot be registered."""
+    if recording.has_images:
+        return "because they are ready-made images"
+    return "because small-gicp is not installed: pip install 'sglpr-jax[slam]'"
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
+from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +28,9 @@ class RecordingOptions:
     sensor_height: SensorHeight = "auto"
     """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scans.
     `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
+    gravity: Gravity = dataclasses.field(default="auto", kw_only=True)
+    """`recording`: one height and tilt for all scans. `scan`: height and tilt of each scan, for a sensor in a hand.
+    `auto` chooses by the tilt of some scans, or `recording` if the layout or --sensor-height defines the mounting."""
     pose_topic: str | None = None
     """Pose topic of a bag that has several, for example /odom."""
     time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)

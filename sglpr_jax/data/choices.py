@@ -28,6 +28,9 @@ PoseChoice = Literal["auto", "semantickitti", "kitti"]
 SensorHeight = float | Literal["auto", "estimate"]
 """Height of the sensor above the ground, in metres. "estimate" estimates the height and the tilt from the scans. "auto"
 estimates them only if the layout does not define the sensor mounting."""
+Gravity = Literal["auto", "recording", "scan"]
+"""Mounting of the sensor: one for the recording, or height and tilt of each scan. "auto" estimates each scan if the
+layout does not define the mounting and the sensor tilts, as in a hand."""
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 """Unit of times in text files and from Python. "auto" expects seconds and rejects times whose steps contradict this. It
 ignores row numbers (0, 1, 2, ...)."""

@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from sglpr_jax.data.choices import SensorHeight
+from sglpr_jax.data.choices import Gravity, SensorHeight
+from sglpr_jax.data.gravity import tilts, with_gravity
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
-from sglpr_jax.fields import require
+from sglpr_jax.fields import check_value, require
 
 SCANS = 11
 """Number of scans for estimating the mounting, spread over the recording."""
@@ -18,7 +19,7 @@ ELSEWHERE_M, ELSEWHERE_DEG = 0.4, 10.0
 """Maximum height difference, in metres, and maximum tilt, in degrees, of a sensor that fits its layout."""
 
 
-def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recording:
+def mounted(recording: Recording, height: SensorHeight, *, gravity: Gravity = "auto", known: bool) -> Recording:
     """Return the recording with its sensor mounting, and a description of the mounting in `Recording.found`.
 
     Recordings of images are returned unchanged. If the ground does not show the mounting, it stays unknown, and
@@ -28,21 +29,26 @@ def mounted(recording: Recording, height: SensorHeight, *, known: bool) -> Recor
       recording: Recording of scans or images.
       height: Height above the ground in metres, "estimate" or "auto". "auto" estimates the mounting only if the layout
         does not define it.
+      gravity: "recording" uses one mounting for all scans, "scan" estimates height and up of each scan. "auto" does so
+        if the mounting is estimated and the sensor tilts (`gravity.tilts`).
       known: Whether the layout defines the mounting. If the scans contradict it, "auto" issues a `DataWarning`.
     """
     if recording.has_images:
         return recording
+    check_value(gravity, Gravity, "gravity")
     if height == "auto" and known:
         _check_layout(recording)
-        return recording
-    if height in ("auto", "estimate"):
-        return _estimated(recording)
-    require(height, not isinstance(height, str), "metres above the ground, 'auto' or 'estimate'", "sensor_height")
-    mounting = Mounting(float(height))
-    return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, f"sensor: {mounting}, as given"))
+    elif height in ("auto", "estimate"):
+        return _estimated(recording, gravity)
+    else:
+        require(height, not isinstance(height, str), "metres above the ground, 'auto' or 'estimate'", "sensor_height")
+        mounting = Mounting(float(height))
+        found = f"sensor: {mounting}, as given"
+        recording = dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+    return with_gravity(recording, recording.mounting or Mounting(MODEL_HEIGHT_M)) if gravity == "scan" else recording
 
 
-def _estimated(recording: Recording) -> Recording:
+def _estimated(recording: Recording, gravity: Gravity) -> Recording:
     each = _of_scans(recording, SCANS)
     mounting = common_mounting(each)
     hanging = [scan.up[2] < 0 for scan in each if scan is not None]
@@ -53,7 +59,10 @@ def _estimated(recording: Recording) -> Recording:
     else:
         agreed = hanging.count(mounting.up[2] < 0)
         found = f"sensor: {mounting}, estimated from the ground in {agreed} of {len(each)} scans"
-    return dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+    recording = dataclasses.replace(recording, mounting=mounting, found=(*recording.found, found))
+    if gravity == "scan" or (gravity == "auto" and tilts(each, mounting)):
+        return with_gravity(recording, mounting or Mounting(MODEL_HEIGHT_M))
+    return recording
 
 
 def _unclear(hanging: list[bool], scans: int) -> str:

@@ -7,6 +7,7 @@ sensors are rotated to be gravity-aligned and shifted to this height.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -37,6 +38,8 @@ MOST_POINTS = 6000
 """Maximum number of points for the search. Larger clouds are subsampled."""
 TRIALS = 400
 """Number of point triples that RANSAC samples."""
+NEAR_TRIALS, NEAR_POINTS = 150, 2000
+"""Number of point triples, and of points that they are compared with, if the mounting is known approximately."""
 UPSIDE_DOWN = 2.0
 """Minimum ratio of ground points above a sensor to those below if it hangs upside down. It exceeds 1 because rooms have
 ceilings."""
@@ -50,10 +53,19 @@ class Mounting:
     """Height above the ground, in metres."""
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction of up in the sensor frame, a unit vector."""
+    height_deviation_m: float | None = None
+    tilt_deviation_deg: float | None = None
+    """Standard deviation of the height in metres, and of up about each horizontal axis in degrees. None for a sensor
+    that is fixed to a vehicle."""
 
     def __post_init__(self):
         if not (math.isfinite(self.height_m) and -1 < self.height_m < 100):
             raise ValueError(f"expected the sensor's height above the ground in metres, found {self.height_m}")
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Values that are known, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
     def tilt_deg(self) -> float:
@@ -85,7 +97,7 @@ class Mounting:
         return ", ".join([*parts, *([f"tilted by {tilt:.0f} degrees"] if tilt >= LEVEL_DEG else [])])
 
 
-def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
+def estimate_mounting(points: Float32[np.ndarray, "n 3"], *, near: Mounting | None = None) -> Mounting | None:
     """Estimate the mounting of a sensor from the ground in one scan.
 
     RANSAC searches for the plane with the most points and almost no points below it. A least-squares fit to the ground
@@ -94,6 +106,8 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
 
     Arguments:
       points: Points in the LiDAR frame, in metres.
+      near: Mounting of other scans of the sensor. The ground is searched on the same side of the sensor, with fewer
+        trials.
 
     Returns:
       The mounting, or None if no ground is found.
@@ -101,21 +115,26 @@ def estimate_mounting(points: Float32[np.ndarray, "n 3"]) -> Mounting | None:
     Example:
       mounting = estimate_mounting(recording.points(0))
     """
-    near = _thinned(points)
-    near = near[:: len(near) // MOST_POINTS + 1]
-    if len(near) < LEAST_POINTS:
+    cloud = _thinned(points)
+    cloud = cloud[:: len(cloud) // MOST_POINTS + 1]
+    few = cloud if near is None else cloud[:: len(cloud) // NEAR_POINTS + 1]
+    if len(few) < LEAST_POINTS:
         return None
-    normals, heights = _planes(near)
+    normals, heights = _planes(few, trials=TRIALS if near is None else NEAR_TRIALS)
+    if near is not None:
+        same_side = normals @ np.array(near.up) > 0
+        normals, heights = normals[same_side], heights[same_side]
     if not len(heights):
         return None
-    distances = near @ normals.T + heights
+    distances = few @ normals.T + heights
     ground = np.abs(distances) < THICK_M
     score = np.where((distances < -2 * THICK_M).mean(axis=0) <= MOST_BELOW, ground.sum(axis=0), 0)
     score = np.where(normals[:, 2] > 0, UPSIDE_DOWN * score, score)
     best = int(np.argmax(score))
     if score[best] == 0:
         return None
-    return _fitted(near, ground[:, best], normals[best])
+    on_plane = ground[:, best] if near is None else np.abs(cloud @ normals[best] + heights[best]) < THICK_M
+    return _fitted(cloud, on_plane, normals[best])
 
 
 def common_mounting(found: Iterable[Mounting | None]) -> Mounting | None:
@@ -164,12 +183,14 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     return near[np.sort(first)]
 
 
-def _planes(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
+def _planes(
+    points: Float[np.ndarray, "n 3"], *, trials: int = TRIALS
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
     """Sample planes that may be the ground. Returns normals that point up, and heights of the sensor above the
     planes."""
     rng = np.random.default_rng(0)
-    first = rng.integers(len(points), size=TRIALS)
-    near = rng.normal(scale=len(points) / 8, size=(2, TRIALS)).astype(int) + first  # often neighbours in the file
+    first = rng.integers(len(points), size=trials)
+    near = rng.normal(scale=len(points) / 8, size=(2, trials)).astype(int) + first  # often neighbours in the file
     a, b, c = (points[index % len(points)] for index in (first, *near))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)

@@ -43,6 +43,8 @@ class Recording:
     """Whether `read` returns the content of the files. False for packed, corrupted and simulated recordings."""
     mounting: Mounting | None = None
     """Height and tilt of the sensor. None means gravity-aligned, 1.73 m above the ground."""
+    mountings: tuple[Mounting, ...] | None = None
+    """Mounting at each scan of a sensor that tilts. None means that `mounting` holds for all scans."""
     world_from_lidar: Float[np.ndarray, "n 4 4"] | None = None
     """Poses of the LiDAR in the frame of a bag's messages, if these contain rotations. None for other layouts."""
     found: tuple[str, ...] = ()
@@ -57,7 +59,7 @@ class Recording:
         if len(set(self.ids)) < len(self.ids):
             twice = next(name for name in self.ids if self.ids.count(name) > 1)
             raise ValueError(f"sequence {self.name}: expected a unique id for each scan, found {twice!r} twice")
-        for name in ("paths", "positions", "times", "label_paths", "world_from_lidar", "rows"):
+        for name in ("paths", "positions", "times", "label_paths", "world_from_lidar", "rows", "mountings"):
             values = getattr(self, name)
             if values is not None and len(values) != len(self) and not (name == "label_paths" and not values):
                 raise ValueError(
@@ -129,8 +131,12 @@ class Recording:
             name=f"scan {self.ids[i]} of sequence {self.name}",
             position=None if self.positions is None else self.positions[i],
             time=None if self.times is None else float(self.times[i]),
-            mounting=self.mounting,
+            mounting=self.mounting_of(i),
         )
+
+    def mounting_of(self, i: int) -> Mounting | None:
+        """Mounting of the sensor at scan `i`."""
+        return self.mounting if self.mountings is None else self.mountings[i]
 
     def points(self, i: int) -> Float32[np.ndarray, "n 3"]:
         """Read the points of scan `i`. Raises ValueError if the recording contains images."""

@@ -43,7 +43,8 @@ def add_scans(
     """
     kept = None if kept_in is None else Unfinished.opened(Path(kept_in), settings(recording, finder, **given))
     if kept is not None:
-        kept.recall(finder, recording.mounting, add, missing=on_bad_scan is not None)
+        mounting_of = recording.mounting_of if rows is None else lambda frame: recording.mounting  # unused by a map
+        kept.recall(finder, mounting_of, add, missing=on_bad_scan is not None)
     if len(finder):
         on_progress(len(finder))
     left = range(len(finder), len(recording)) if rows is None else rows

@@ -15,6 +15,7 @@ from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConf
 from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
 from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, occupied, query_spectra, search_spectra, within_reach
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals
@@ -23,7 +24,6 @@ from sglpr_jax.loops.shortlist import shortlist
 from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.loops.trajectory import Trajectory
 from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.upright import upright_from_lidar
 from sglpr_jax.loops.verification import Alignment, refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
@@ -80,8 +80,8 @@ class CandidateFinder:
         """Comparisons of the last frame."""
         self.odometry = Trajectory()
         """Poses of all frames from odometry. Empty if there is no odometry."""
-        self.mounting: Mounting | None = None
-        """Mounting of the sensor, the same for all frames."""
+        self.mountings = Mountings()
+        """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
         self.motion = Motion(config.motion)
         self.background = Background(frames=config.background_frames, least=config.min_background_frames)
@@ -106,6 +106,10 @@ class CandidateFinder:
         return self._times.rows if len(self._times) else None
 
     @property
+    def _last_mounting(self) -> Mounting | None:
+        return self.mountings[len(self) - 1] if len(self) else None
+
+    @property
     def empty(self) -> Bool[np.ndarray, " n"]:
         """Whether each frame is almost empty (`is_empty`)."""
         return self._empty.rows
@@ -113,7 +117,7 @@ class CandidateFinder:
     @property
     def nbytes(self) -> int:
         """Number of bytes of all frames: descriptors, compressed images, poses and times."""
-        arrays = self.stored, self.motion, self.odometry, self._times, self._empty
+        arrays = self.stored, self.motion, self.odometry, self._times, self._empty, self.mountings
         return sum(one.nbytes for one in arrays)
 
     def add(
@@ -127,7 +131,7 @@ class CandidateFinder:
           odometry: Pose of the LiDAR in any fixed frame.
 
         Raises:
-          ValueError: If only some frames have a time or a pose, if times decrease, or if the mounting changes.
+          ValueError: If only some frames have a time or a pose, or if times decrease.
         """
         return self.add_seen(self.seen(record), time=time, odometry=odometry)
 
@@ -151,7 +155,7 @@ class CandidateFinder:
         frame = len(self)
         if seen is None:
             self.missing.append(frame)
-            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self.mounting)
+            seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self._last_mounting)
         pose = None if odometry is None else np.asarray(odometry, np.float64)
         clock = frame * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
         upright = None if pose is None else pose @ inverse(upright_from_lidar(seen.mounting))
@@ -186,7 +190,7 @@ class CandidateFinder:
         if not empty and self.stored.is_new_place(frame, self.motion):
             self.stored.add(frame, seen.descriptor, detail)
         self._empty.append(empty)
-        self.mounting = seen.mounting
+        self.mountings.append(seen.mounting)
         if time is not None:
             self._times.append(time)
         if pose is not None:
@@ -334,8 +338,6 @@ class CandidateFinder:
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self):
             return
-        if seen is not None and seen.mounting != self.mounting and len(self.missing) < len(self):
-            raise ValueError(f"expected one sensor mounting for all frames, {self.mounting}, found {seen.mounting}")
         for name, given, known in (
             ("a time", time is not None, self.times is not None),
             ("odometry", odometry is not None, len(self.odometry) > 0),

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import ConsistencyConfig, DriftModel
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.mountings import AnyMounting
 from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar_loops, planar_odometry, relative
 from sglpr_jax.loops.transforms import travelled
 
@@ -26,7 +26,7 @@ def agree(
     others: Sequence[Loop] | None = None,
     *,
     way: Float[np.ndarray, " n"] | None = None,
-    mounting: Mounting | None = None,
+    mounting: AnyMounting = None,
     drift: DriftModel = DriftModel(),
     config: ConsistencyConfig = ConsistencyConfig(),
 ) -> Bool[np.ndarray, "a b"]:
@@ -37,7 +37,7 @@ def agree(
       odometry: Pose of the LiDAR at each frame.
       others: Loops to compare with, by default `loops`.
       way: Travelled distance at each frame in metres, by default computed from the odometry.
-      mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
+      mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       drift: Drift model of the odometry.
       config: Thresholds.
 
@@ -88,7 +88,7 @@ def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[
 
 
 def _columns(
-    loops: Sequence[Loop], flat: Planar, way: Float[np.ndarray, " n"], mounting: Mounting | None
+    loops: Sequence[Loop], flat: Planar, way: Float[np.ndarray, " n"], mounting: AnyMounting
 ) -> dict[str, np.ndarray]:
     query, match = frames_of(loops)
     poses, covariances = planar_loops(loops, mounting)

@@ -188,7 +188,7 @@ class LoopDetector:
         """Loops of the last frames that pass the sequential test, the drift test and, with odometry, other loops."""
         rules, motion = self.config.sequence, self.finder.motion
         self.by_scans |= {loop.query for loop in self._accepted(agree_in_order(self._waiting, config=rules))}
-        found = self._accepted(agree_in_motion(self._waiting, motion, self.finder.mounting, config=rules))
+        found = self._accepted(agree_in_motion(self._waiting, motion, self.finder.mountings, config=rules))
         recent = 2 * rules.frames
         done = {loop.query for loop in self.loops[-recent:]}
         found = self._within_drift([loop for loop in found if loop.query not in done])
@@ -212,7 +212,7 @@ class LoopDetector:
         """Loops within the drift of the odometry or, without odometry, of the motion. The others are rejected."""
         if not loops:
             return []
-        motion, mounting, guessed_m = self.finder.motion, self.finder.mounting, None
+        motion, mounting, guessed_m = self.finder.motion, self.finder.mountings, None
         if len(self.finder.odometry):
             poses, drift, reason = self.finder.odometry.poses, self.config.drift, "contradicts the odometry"
         else:
@@ -226,7 +226,7 @@ class LoopDetector:
     @property
     def _rules(self) -> dict[str, Any]:
         config = self.config
-        return {"mounting": self.finder.mounting, "drift": config.drift, "config": config.consistency}
+        return {"mounting": self.finder.mountings, "drift": config.drift, "config": config.consistency}
 
     def _agrees(self, loop: Loop) -> bool:
         """Whether a loop is consistent with at least half of the loops nearby. True without odometry.
@@ -255,5 +255,6 @@ class LoopDetector:
         return near
 
     def _loop(self, one: Candidate, probability: float) -> Loop:
-        mountings = dict.fromkeys(("query_mounting", "match_mounting"), self.finder.mounting)
+        each = self.finder.mountings
+        mountings = {"query_mounting": each[one.query], "match_mounting": each[one.match]}
         return planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.mountings import AnyMounting
 from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.upright import upright_odometry, upright_poses
@@ -24,7 +24,7 @@ def deviations(
     odometry: Float[np.ndarray, "n 4 4"],
     *,
     drift: DriftModel = DriftModel(),
-    mounting: Mounting | None = None,
+    mounting: AnyMounting = None,
     guessed_m: Float[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, " k"]:
     """Mahalanobis distance of each loop from the odometry between its frames.
@@ -43,7 +43,7 @@ def deviations(
       loops: Loops between frames of the odometry.
       odometry: Pose of the LiDAR at each frame.
       drift: Drift model.
-      mounting: Mounting of the LiDAR. The comparison is made in the plane of the ground.
+      mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
     """
     flat = planar_odometry(odometry, mounting)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.times import doubt
@@ -21,9 +22,10 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import check_is, given_poses
 from sglpr_jax.loops.joint import check_odometry, settled
 from sglpr_jax.loops.loop import Loop, Rejected
+from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.reasons import counted, listed
-from sglpr_jax.loops.registration import check_installed
+from sglpr_jax.loops.registration import check_installed, is_installed
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
@@ -89,7 +91,7 @@ def find_loops(
     odometry: ArrayLike | None = None,
     model: LoopModel | None = None,
     config: DetectorConfig = DetectorConfig(),
-    registered: bool = False,
+    registered: bool | None = None,
     on_bad_scan: OnBadScan | None = None,
     kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -108,7 +110,7 @@ def find_loops(
       model: Model of the probabilities, by default the one shipped for the weights.
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom (extra `slam`). Loops with little overlap
-        are rejected.
+        are rejected. None registers scans, not images, if the extra is installed.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
       kept_in: Checkpoint directory. If recording, odometry, weights and settings are the same, the search resumes from
@@ -126,7 +128,9 @@ def find_loops(
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))
     """
     check_is(recording, Recording, by="open_recording")
+    registered = can_register(recording) if registered is None else registered
     odometry = _checked(recording, odometry, registered=registered)
+    recording = recording if odometry is None else with_odometry(recording, odometry)
     detector = LoopDetector(params, model=model, config=config)
     add_scans(
         recording,
@@ -159,6 +163,11 @@ def find_loops(
     )
 
 
+def can_register(recording: Recording) -> bool:
+    """Whether the scans of a recording can be registered: it has scans, not images, and the extra is installed."""
+    return not recording.has_images and is_installed()
+
+
 def _acceptance(detector: LoopDetector) -> str | None:
     """Hash of all that decides about loops, if the loops decide which scans are stored."""
     if detector.config.max_places is None:
@@ -182,7 +191,7 @@ def _checked(
     if registered:
         check_installed()
     if poses is not None:
-        check_level(poses, recording.mounting, name=recording.name)
+        check_level(poses, mountings_of(recording), name=recording.name)
     return poses
 
 
@@ -224,7 +233,7 @@ def _accepted(
     supported = {loop.query for loop in detector.supported}  # `settled` accepted or rejected these
     rejected = _in_order([*rejected, *(one for one in detector.rejected if one.loop.query not in supported)])
     if odometry is not None:
-        name, mounting = recording.name, recording.mounting
+        name, mounting = recording.name, mountings_of(recording)
         check_odometry(name, detector.by_scans, loops, rejected, odometry, config, mounting=mounting)
     return tuple(loops), rejected
 

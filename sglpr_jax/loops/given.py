@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.files import in_short
@@ -27,8 +26,8 @@ def check_is(value: Any, kind: type, *, by: str) -> None:
         raise TypeError(f"expected a {kind.__name__}, found {_said(value)}; sglpr_jax.{by} returns one")
 
 
-def given_record(scan: Any, *, mounting: Mounting | None = None) -> Record:
-    """Convert points (n, 3) of a sensor with this `mounting`, or an image (h, w), to a record. Accepts records, too."""
+def given_record(scan: Any) -> Record:
+    """Convert points (n, 3) or an image (h, w) to a record. Accepts records, too."""
     if isinstance(scan, Record):
         return scan
     expected = "points (n, 3) or an image (h, w)"
@@ -37,7 +36,7 @@ def given_record(scan: Any, *, mounting: Mounting | None = None) -> Record:
         raise ValueError(f"expected {expected}, found an array of shape {values.shape}")
     if 3 < values.shape[1] <= MOST_COLUMNS:
         raise ValueError(f"expected points (n, 3) of x, y and z only, found an array of shape {values.shape}")
-    return Record(points=values, mounting=mounting) if values.shape[1] == 3 else Record(image=values)
+    return Record(points=values) if values.shape[1] == 3 else Record(image=values)
 
 
 def given_pose(odometry: Any) -> Float[np.ndarray, "4 4"] | None:

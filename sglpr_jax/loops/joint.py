@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig, DriftModel
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.loop import Loop, Reason, Rejected
+from sglpr_jax.loops.mountings import AnyMounting, mountings_of
 from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.registration import register
 from sglpr_jax.loops.transforms import travelled
@@ -29,7 +29,7 @@ def accepted(
     loops: Sequence[Loop],
     odometry: Float[np.ndarray, "n 4 4"],
     *,
-    mounting: Mounting | None = None,
+    mounting: AnyMounting = None,
     drift: DriftModel = DriftModel(),
     config: ConsistencyConfig = ConsistencyConfig(),
 ) -> tuple[list[Loop], list[Rejected]]:
@@ -67,7 +67,7 @@ def check_odometry(
     rejected: Sequence[Rejected],
     odometry: Float[np.ndarray, "n 4 4"],
     config: DetectorConfig,
-    mounting: Mounting | None = None,
+    mounting: AnyMounting = None,
 ) -> None:
     """Warns if the odometry contradicts most of the frames that have a loop.
 
@@ -80,7 +80,7 @@ def check_odometry(
       rejected: Rejected loops.
       odometry: Pose of the LiDAR at each frame.
       config: Settings of the detector.
-      mounting: Mounting of the LiDAR.
+      mounting: Mounting of the LiDAR, or that at each frame.
     """
     against = [one.loop for one in rejected if one.reason == "contradicts the odometry"]
     agreeing = {one.query for one in loops} | {one.loop.query for one in rejected} - {one.query for one in against}
@@ -97,7 +97,7 @@ def check_odometry(
 
 
 def _readings(
-    against: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], config: DetectorConfig, mounting: Mounting | None
+    against: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], config: DetectorConfig, mounting: AnyMounting
 ) -> str:
     """Both explanations of loops that contradict the odometry, with the drift that would explain them."""
     found = deviations(against, odometry, drift=config.drift, mounting=mounting)
@@ -132,7 +132,7 @@ def settled(
     """
     kept, rejected = list(loops), []
     if odometry is not None:
-        rules = {"mounting": recording.mounting, "drift": config.drift, "config": config.consistency}
+        rules = {"mounting": mountings_of(recording), "drift": config.drift, "config": config.consistency}
         kept, rejected = accepted(loops, odometry, **rules)
     if registered:
         kept, others = _registered(recording, kept, should_stop)

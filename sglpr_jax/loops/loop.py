@@ -8,8 +8,9 @@ from jax import Array
 from jaxtyping import Float
 
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.loops.mountings import upright_from_lidar
 from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, yaw_of
-from sglpr_jax.loops.upright import lidar_pose, upright_from_lidar
+from sglpr_jax.loops.upright import lidar_pose
 from sglpr_jax.loops.verification import Alignment
 
 Reason = Literal[
@@ -27,6 +28,8 @@ UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M = 1.2, 0.07
 """Standard deviations of height, and of pitch and roll, which images do not show. Each has a value for two scans at one
 position, and an increase per metre between them. They hold for vehicles, in simulated towns and outskirts and on
 KITTI."""
+GROUND_HEIGHT_PER_M, GROUND_TILT_DEG_PER_M = 0.018, 0.07
+"""Increase of these standard deviations per metre between two scans whose mountings were estimated from the scans."""
 DEGENERATE_M = 1.0
 """Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
 
@@ -65,17 +68,45 @@ class Loop:
         return is_degenerate(self.covariance)
 
 
-def unseen_covariance(apart_m: float) -> Float[np.ndarray, "6 6"]:
-    """Covariance of height, roll and pitch between two gravity-aligned scans. The other entries are zero.
+def unseen_covariance(
+    match_from_query: Float[np.ndarray, "4 4"], query: Mounting | None = None, match: Mounting | None = None
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of height, roll and pitch of a query in its own frame, between two gravity-aligned scans.
 
-    Suspension and bumps tilt both vehicles. With a tilt or a slope, the height error grows with the distance.
+    Suspension and bumps tilt vehicles. With a tilt or a slope, the height error grows with the distance. If a mounting
+    was estimated from its scan, its deviations count. A wrong tilt of the match lifts the query by its distance.
 
     Arguments:
-      apart_m: Distance between the two scans in the plane, in metres.
+      match_from_query: Pose of the gravity-aligned query in the plane.
+      query: Mounting of the query's sensor.
+      match: Mounting of the match's sensor.
     """
-    height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
-    tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
-    return np.diag([0.0, 0.0, height, tilt, tilt, 0.0]) ** 2
+    apart_m = float(np.hypot(*match_from_query[:2, 3]))
+    if not (_is_estimated(query) or _is_estimated(match)):
+        height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
+        tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
+        return np.diag([0.0, 0.0, height, tilt, tilt, 0.0]) ** 2
+    ground = _diagonal(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)
+    own, other = (_diagonal(*_deviations(mounting)) for mounting in (query, match))
+    return own + moved_covariance(other, inverse(match_from_query)) + ground
+
+
+def _is_estimated(mounting: Mounting | None) -> bool:
+    """Whether the mounting was estimated from its own scan."""
+    return mounting is not None and mounting.tilt_deviation_deg is not None
+
+
+def _deviations(mounting: Mounting | None) -> tuple[float, float]:
+    """Standard deviations of height (metres) and tilt (degrees) of one scan."""
+    if mounting is None or mounting.height_deviation_m is None or mounting.tilt_deviation_deg is None:
+        return UNSEEN_HEIGHT_M / 2**0.5, UNSEEN_TILT_DEG / 2**0.5
+    return mounting.height_deviation_m, mounting.tilt_deviation_deg
+
+
+def _diagonal(height_m: float, tilt_deg: float) -> Float[np.ndarray, "6 6"]:
+    """Covariance of independent height, roll and pitch."""
+    tilt = np.radians(tilt_deg)
+    return np.diag([0.0, 0.0, height_m, tilt, tilt, 0.0]) ** 2
 
 
 def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
@@ -125,7 +156,7 @@ def planar_loop(
       match_mounting: Mounting of the match's sensor.
     """
     upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
-    covariance = unseen_covariance(float(np.hypot(*upright[:2, 3])))
+    covariance = unseen_covariance(upright, query_mounting, match_mounting)
     seen = np.array([0, 1, 5])
     to_query = np.eye(3)
     to_query[:2, :2] = upright[:2, :2].T  # the alignment's covariance is in the match's frame

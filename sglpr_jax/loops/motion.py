@@ -9,12 +9,11 @@ is extrapolated at the last known velocity, and its drift grows fast.
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import MotionConfig
+from sglpr_jax.loops.mountings import AnyMounting, uprights
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
-from sglpr_jax.loops.upright import upright_from_lidar
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
@@ -164,9 +163,9 @@ class Motion:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return self.segments[rows] == self.segments[frame]
 
-    def odometry(self, mounting: Mounting | None) -> Float[np.ndarray, "n 4 4"]:
+    def odometry(self, mounting: AnyMounting) -> Float[np.ndarray, "n 4 4"]:
         """Poses of the LiDAR, whose frame is tilted by its mounting."""
-        return self.poses @ upright_from_lidar(mounting)
+        return self.poses @ uprights(mounting, np.arange(len(self)))
 
     def near_last(self, travelled_m: float) -> Bool[np.ndarray, " n"]:
         """Whether each frame is known to be less than `travelled_m` (metres) before the last frame."""

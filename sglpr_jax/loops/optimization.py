@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.mountings import AnyMounting, mountings_of
 from sglpr_jax.loops.transforms import inverse
 
 FIRST_POSE = 1e-6
@@ -74,7 +74,7 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     if found.odometry is None:
         raise ValueError(f"{found.recording.name}: expected loops found with odometry, found loops without it")
     odometry = found.odometry[: found.frames]
-    corrected = optimized(odometry, found.loops, drift=found.drift, mounting=found.recording.mounting)
+    corrected = optimized(odometry, found.loops, drift=found.drift, mounting=mountings_of(found.recording))
     risen_m = float(np.abs(corrected.poses[:, 2, 3] - odometry[:, 2, 3]).max(initial=0))
     if risen_m > MOST_RISEN_M:
         warn(
@@ -89,7 +89,7 @@ def optimized(
     loops: tuple[Loop, ...],
     *,
     drift: DriftModel = DriftModel(),
-    mounting: Mounting | None = None,
+    mounting: AnyMounting = None,
 ) -> OptimizedTrajectory:
     """Solve the graph of odometry and loops.
 
@@ -101,7 +101,7 @@ def optimized(
       odometry: Pose of the LiDAR at each frame.
       loops: Loops between these frames.
       drift: Stated drift of the odometry.
-      mounting: Mounting of the LiDAR.
+      mounting: Mounting of the LiDAR, or that at each frame.
 
     Raises:
       ImportError: If the extra `gtsam` is not installed.

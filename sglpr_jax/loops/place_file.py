@@ -16,8 +16,10 @@ ARRAYS = {
     "images": Column("uint8", ("n", "h", "h")),
     "world_from_place": Column("float64", ("n", 4, 4)),
     "mountings": Column("float64", ("n", 4)),
+    "mounting_deviations": Column("float64", ("n", 2), finite=False, optional=True),
 }
 """Arrays of a map's file in addition to the index."""
+REQUIRED = tuple(name for name, column in ARRAYS.items() if not column.optional)
 
 
 def write_places(path: Path, index: Index, arrays: Mapping[str, np.ndarray]) -> None:
@@ -30,12 +32,12 @@ def write_places(path: Path, index: Index, arrays: Mapping[str, np.ndarray]) -> 
 def read_places(path: Path | str, *, weights_hash: str | None) -> tuple[Index, dict[str, np.ndarray]]:
     """Read index and arrays. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
     index, more = Index.load_with(path, weights_hash=weights_hash)
-    left_out = [name for name in ARRAYS if name not in more]
+    left_out = [name for name in REQUIRED if name not in more]
     if left_out:
         raise ValueError(f"{path}: expected a map of places, found an index without {', '.join(left_out)}")
     with naming(path):
         _check(index, more)
-    return index, {name: more[name] for name in ARRAYS}
+    return index, {name: more[name] for name in ARRAYS if name in more}
 
 
 def _check(index: Index, arrays: Mapping[str, np.ndarray]) -> None:

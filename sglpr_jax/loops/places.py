@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.gravity import GroundFilter, with_odometry
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
@@ -21,7 +22,8 @@ from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig
 from sglpr_jax.loops.given import check_is, given_poses, given_record
 from sglpr_jax.loops.loop import planar_loop
-from sglpr_jax.loops.place_file import ARRAYS, read_places, write_places
+from sglpr_jax.loops.mountings import mountings_of, upright_from_lidar
+from sglpr_jax.loops.place_file import REQUIRED, read_places, write_places
 from sglpr_jax.loops.place_names import Content, free_names, place_names
 from sglpr_jax.loops.place_scans import PlaceScans
 from sglpr_jax.loops.pose_search import Peak, occupied, query_spectra, search_spectra, within_reach
@@ -31,7 +33,7 @@ from sglpr_jax.loops.rivals import MAP_RIVALS, distance_share, rival_places, riv
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.shortlist import shortlist
 from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.upright import check_level, upright_from_lidar
+from sglpr_jax.loops.upright import check_level
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
@@ -54,6 +56,9 @@ class PlaceMap:
     """Pose of the LiDAR at each place."""
     mountings: Float[np.ndarray, "n 4"]
     """Mounting of the sensor: height above the ground, in metres, and the up direction in its frame."""
+    mounting_deviations: Float[np.ndarray, "n 2"] | None = None
+    """Standard deviations of height (metres) and tilt (degrees), NaN for a sensor fixed to a vehicle. None stands for
+    NaN everywhere."""
 
     def __len__(self) -> int:
         return len(self.index)
@@ -85,7 +90,27 @@ class PlaceMap:
     def mounting(self, row: int = -1) -> Mounting:
         """Mounting of the sensor at a place, by default the last one."""
         height, *up = self.mountings[row].tolist()
-        return Mounting(height, tuple(up))
+        deviations = self._deviations[row]
+        return Mounting(height, tuple(up), *(() if np.isnan(deviations).any() else deviations.tolist()))
+
+    def query_mounting(self, points: Float[np.ndarray, "n 3"]) -> Mounting:
+        """Mounting of the sensor of a query: that of the last place or, if the sensor of the map tilts, by the ground
+        of the query near the median of all places."""
+        if not self.tilts:
+            return self.mounting()
+        height, *up = np.median(self.mountings, axis=0)
+        mean = Mounting(float(height), tuple((np.array(up) / np.linalg.norm(up)).tolist()))
+        return GroundFilter(mean).add(points)
+
+    @property
+    def tilts(self) -> bool:
+        """Whether the mounting of some place was estimated from its scan, because the sensor tilts."""
+        return bool(np.isfinite(self._deviations).all(axis=1).any())
+
+    @property
+    def _deviations(self) -> Float[np.ndarray, "n 2"]:
+        given = self.mounting_deviations
+        return np.full((len(self), 2), np.nan) if given is None else given
 
     def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
         """Merge two maps in one world frame. Places that are in both are stored once.
@@ -112,8 +137,9 @@ class PlaceMap:
         for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
             places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
             index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
-        both = (np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in ARRAYS)
-        return PlaceMap(index, *both)
+        both = (np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in REQUIRED)
+        deviations = np.concatenate([self._deviations, other._deviations[new]])
+        return PlaceMap(index, *both, mounting_deviations=deviations)
 
     def relocate(
         self,
@@ -128,7 +154,7 @@ class PlaceMap:
         Arguments:
           params: Weights that made the map.
           record: A record, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that
-            of the last place (`mounting`). For another mounting pass a record.
+            of the map (`query_mounting`). For another mounting pass a record.
           model: Model of the probabilities, by default the one shipped for the weights.
           candidates: Maximum number of poses, and number of nearest places that the query is compared with. If it fits
             none of them well, as many others of the nearest 25 are compared, chosen by a coarse comparison.
@@ -143,7 +169,10 @@ class PlaceMap:
         """
         check_value(candidates, PlaceCount, "candidates")
         finder = CandidateFinder(params)
-        seen = finder.seen(given_record(record, mounting=self.mounting() if len(self) else None))
+        given = given_record(record)
+        if len(self) and not isinstance(record, Record) and given.points is not None:
+            given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
+        seen = finder.seen(given)
         image = seen.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
@@ -163,8 +192,9 @@ class PlaceMap:
         return with_shared_probability(answers)[:candidates]
 
     def save(self, path: Path | str) -> None:
-        """Write the map atomically to one file: an index file with additional arrays (`ARRAYS`)."""
-        write_places(Path(path), self.index, {name: getattr(self, name) for name in ARRAYS})
+        """Write the map atomically to one file: an index file with additional arrays (`place_file.ARRAYS`)."""
+        deviations = {"mounting_deviations": self._deviations} if self.tilts else {}
+        write_places(Path(path), self.index, {name: getattr(self, name) for name in REQUIRED} | deviations)
 
     @classmethod
     def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
@@ -218,9 +248,10 @@ class PlaceMap:
         if peak.correlation < CandidateConfig().min_rival_correlation or not len(rows):
             return np.nan, np.nan
         found = jax.device_get(search_spectra(spectra, self.images[np.resize(rows, MAP_RIVALS)])).some(slice(len(rows)))
-        upright = self.world_from_place @ inverse(upright_from_lidar(self.mounting(match)))
-        query = upright[match] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
-        expected = [(inverse(upright[rows]) @ query, np.full(len(rows), RivalConfig().agree_m))]
+        of_place = np.array([upright_from_lidar(self.mounting(row)) for row in (match, *rows.tolist())])
+        upright = self.world_from_place[[match, *rows.tolist()]] @ inverse(of_place)
+        query = upright[0] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
+        expected = [(inverse(upright[1:]) @ query, np.full(len(rows), RivalConfig().agree_m))]
         return distance_share(distance, apart[rows], expected), rival_share(found, float(peak.correlation), expected)
 
 
@@ -269,7 +300,8 @@ def map_recording(
     poses = given_poses(poses, of="poses")
     if len(poses) != len(recording) or not len(recording):
         raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
-    check_level(poses, recording.mounting, name=recording.name)
+    check_level(poses, mountings_of(recording), name=recording.name)
+    recording = with_odometry(recording, poses)
     finder = CandidateFinder(params)
     chosen = PlaceScans(finder, poses[:, :3, 3], spacing_m)
     seen_scans: list[Seen | None] = []
@@ -314,6 +346,13 @@ def _places(
     descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, like.width)
     index.add(descriptors, ids=ids, positions=poses[rows, :3, 3])
     images = [one.image for one in places]
-    sensor = recording.mounting or Mounting(MODEL_HEIGHT_M)
-    mountings = np.tile([sensor.height_m, *sensor.up], (len(rows), 1))
-    return PlaceMap(index, np.stack(images) if images else np.zeros((0, 0, 0), np.uint8), poses[rows], mountings)
+    sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
+    mountings = np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4)
+    deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
+    return PlaceMap(
+        index,
+        np.stack(images) if images else np.zeros((0, 0, 0), np.uint8),
+        poses[rows],
+        mountings,
+        np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN
+    )

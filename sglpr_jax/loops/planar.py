@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.loop import DEGENERATE_M, Loop
+from sglpr_jax.loops.mountings import AnyMounting, uprights
 from sglpr_jax.loops.transforms import moved_covariance, yaw_of
-from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry, upright_poses
+from sglpr_jax.loops.upright import upright_odometry, upright_poses
 
 Planar = Float[np.ndarray, "... 3"]
 """Poses in the plane: x, y, yaw."""
@@ -22,12 +22,12 @@ def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
     return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
 
 
-def planar_odometry(odometry: Float[np.ndarray, "n 4 4"], mounting: Mounting | None) -> Planar:
+def planar_odometry(odometry: Float[np.ndarray, "n 4 4"], mounting: AnyMounting) -> Planar:
     """Project the odometry of a LiDAR with this `mounting` to the plane of the ground."""
     return planar(upright_odometry(odometry, mounting))
 
 
-def planar_loops(loops: Sequence[Loop], mounting: Mounting | None) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
+def planar_loops(loops: Sequence[Loop], mounting: AnyMounting) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
     """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries.
 
     Standard deviations are limited to `DEGENERATE_M` along every direction. Otherwise a pose that may lie anywhere
@@ -35,8 +35,10 @@ def planar_loops(loops: Sequence[Loop], mounting: Mounting | None) -> tuple[Plan
     """
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
     covariances = np.array([loop.covariance for loop in loops], np.float64).reshape(-1, 6, 6)
-    covariances = moved_covariance(covariances, upright_from_lidar(mounting))
-    return planar(upright_poses(poses, mounting)), _bounded(covariances[:, SEEN[:, None], SEEN])
+    query, match = frames_of(loops)
+    covariances = moved_covariance(covariances, uprights(mounting, query))
+    upright = upright_poses(poses, mounting, query=query, match=match)
+    return planar(upright), _bounded(covariances[:, SEEN[:, None], SEEN])
 
 
 def _bounded(covariances: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:

@@ -26,7 +26,7 @@ def read_query(
       format: Format of the scan. "auto" uses the file name. For a .bin whose name does not state the format, it uses
         the content, as for a folder of scans.
       sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates height and tilt from the
-        scan. "auto" uses the mounting of the last place of the map.
+        scan. "auto" uses `PlaceMap.query_mounting`.
 
     Raises:
       IsADirectoryError: If `path` is a folder.
@@ -42,11 +42,11 @@ def read_query(
     if path.suffix == ".png":
         return Record(image=read_image(path))
     record = scan_record(path, format=found_format(path) if format == "auto" else format)
+    assert record.points is not None
     if sensor_height == "auto":
-        return dataclasses.replace(record, mounting=places.mounting())
+        return dataclasses.replace(record, mounting=places.query_mounting(record.points))
     if sensor_height != "estimate":
         return dataclasses.replace(record, mounting=Mounting(float(sensor_height)))
-    assert record.points is not None
     found = estimate_mounting(record.points)
     if found is None:
         raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")

@@ -4,7 +4,7 @@ Neither method detects whether the scans show one place. If GICP starts 3 m off 
 too. The overlap shows such errors. It is the share of the space of one scan that the other scan fills, too.
 """
 
-import importlib
+import importlib.util
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -149,6 +149,11 @@ def _finite(points: Float32[np.ndarray, "n 3"], name: str) -> Float32[np.ndarray
     if len(points) < 100:
         raise ValueError(f"expected a {name} of 100 finite points or more to register, found {len(points)}")
     return points
+
+
+def is_installed() -> bool:
+    """Whether small-gicp is installed, which registers scans with a first guess."""
+    return importlib.util.find_spec("small_gicp") is not None
 
 
 def check_installed() -> None:

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import logit
 
-from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import SequenceConfig
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.mountings import AnyMounting
 from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar, planar_loops, wrapped
 
 
@@ -26,7 +26,7 @@ def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceCo
 
 
 def agree_in_motion(
-    loops: Sequence[Loop], motion: Motion, mounting: Mounting | None, *, config: SequenceConfig = SequenceConfig()
+    loops: Sequence[Loop], motion: Motion, mounting: AnyMounting, *, config: SequenceConfig = SequenceConfig()
 ) -> Bool[np.ndarray, "n n"]:
     """Whether each pair of loops agrees with the motion of the sensor and, if it is a guess, in frame numbers."""
     query, match = frames_of(loops)

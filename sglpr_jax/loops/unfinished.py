@@ -27,7 +27,7 @@ from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.retrieval.reuse import fingerprint
+from sglpr_jax.retrieval.reuse import each_mounting, fingerprint
 from sglpr_jax.schema import Column, check_columns
 
 KIND = "sglpr-jax unfinished loops"
@@ -61,7 +61,8 @@ def settings(
         "name": recording.name,
         "recording": fingerprint(recording),
         "scans": _sample(recording),
-        "sensor": None if recording.mounting is None else dataclasses.asdict(recording.mounting),
+        "sensor": None if recording.mounting is None else recording.mounting.fields,
+        "gravity": _digest(each_mounting(recording)),
         "times": _digest(recording.times),
         "weights": finder.index.weights_hash,
         "candidates": dataclasses.asdict(finder.config),
@@ -129,7 +130,7 @@ class Unfinished:
     def recall(
         self,
         finder: CandidateFinder,
-        mounting: Mounting | None,
+        mounting_of: Callable[[int], Mounting | None],
         add: Callable[[Seen | None, Compared], None],
         *,
         missing: bool,
@@ -141,7 +142,7 @@ class Unfinished:
 
         Arguments:
           finder: Empty finder, to which `add` adds the frames.
-          mounting: Mounting of the sensor.
+          mounting_of: Mounting of the sensor at a frame.
           add: Function that adds a frame.
           missing: Whether scans may be unreadable.
         """
@@ -154,7 +155,7 @@ class Unfinished:
             shown, images = set(more["shown"].tolist()), iter(more["images"])
             rows = range(self.kept, self.kept + len(frames))
             for row, descriptor, compared in zip(rows, frames.descriptors, compared_of(more, rows), strict=True):
-                seen = Seen(np.array(descriptor), next(images), mounting) if row in shown else None
+                seen = Seen(np.array(descriptor), next(images), mounting_of(row)) if row in shown else None
                 if seen is None and not missing:
                     return
                 add(seen, compared)

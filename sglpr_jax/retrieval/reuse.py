@@ -65,12 +65,19 @@ def fingerprint(recording: Recording) -> str:
     """
     files = (recording.containers or recording.paths, recording.label_paths)
     scans, labels = ([_state(path) for path in paths] for paths in files)
-    mounting = None if recording.mounting is None else dataclasses.asdict(recording.mounting)
+    mounting = None if recording.mounting is None else recording.mounting.fields
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
-    for values in (recording.positions, recording.times):
+    for values in (recording.positions, recording.times, each_mounting(recording)):
         if values is not None:
             digest.update(values.tobytes())
     return digest.hexdigest()[:16]
+
+
+def each_mounting(recording: Recording) -> Float[np.ndarray, "n 4"] | None:
+    """Height and up of the sensor at each scan, or None if one mounting holds for all."""
+    if recording.mountings is None:
+        return None
+    return np.array([(one.height_m, *one.up) for one in recording.mountings])
 
 
 def _state(path: Path | None) -> tuple[int, int] | None:

@@ -35,6 +35,12 @@ TILT_DEG = 0.6
 """Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
 TILT_S = 0.5
 """Approximate duration of a tilt, in seconds."""
+HAND_HEIGHT_M, HAND_BOB_M = 1.4, 0.04
+"""Mean height of a hand-held sensor above the ground, and amplitude of its vertical motion, in metres."""
+HAND_TILT_DEG = 15.0
+"""Maximum pitch and roll of a hand-held sensor, in degrees."""
+STEPS_HZ = 2.0
+"""Steps of a walking person per second."""
 FREE_SPEED = 1.35
 """Speed on a free street, as a multiple of the mean speed."""
 
@@ -161,17 +167,35 @@ def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float
     return np.stack([np.interp(times, steps, axis) for axis in noise.T], axis=1)
 
 
+def hand_motion(
+    rng: np.random.Generator, times: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Draws the motion of a hand-held sensor at `times`.
+
+    Pitch and roll oscillate with the steps, around directions that change over some seconds.
+
+    Returns:
+      Pitch and roll relative to the ground, in radians, and height above the ground, in metres.
+    """
+    steps = np.pi * STEPS_HZ * times[:, None] * rng.uniform(0.97, 1.03, 2)  # the body sways once every two steps
+    sway = np.sin(steps * [2, 1] + rng.uniform(0, 2 * np.pi, 2))
+    seconds = rng.uniform(3, 8, 2)
+    drift = np.sin(2 * np.pi * times[:, None] / seconds + rng.uniform(0, 2 * np.pi, 2))
+    tilt = np.radians(HAND_TILT_DEG) * (0.6 * sway + 0.4 * drift)
+    return tilt, HAND_HEIGHT_M + HAND_BOB_M * np.sin(2 * steps[:, 0])
+
+
 def poses_on(
     relief: Relief,
     xy: Float[np.ndarray, "n 2"],
     yaw: Float[np.ndarray, " n"],
     *,
-    height_m: float,
+    height_m: float | Float[np.ndarray, " n"],
     tilt: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "n 4 4"]:
     """Returns world_from_lidar of a vehicle on hills: x points forward, z along the normal of the ground.
 
-    The LiDAR is `height_m` above the ground along the normal. `tilt` is pitch and roll relative to the ground, in
+    The LiDAR is `height_m` (one value, or one for each pose) above the ground along the normal. `tilt` is pitch and roll relative to the ground, in
     radians, see `body_tilt`.
     """
     slope = relief_gradient(relief, xy)

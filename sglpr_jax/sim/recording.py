@@ -14,12 +14,14 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import (
+    HAND_HEIGHT_M,
     PlanarPath,
     TimedPoses,
     body_tilt,
     check_drawing,
     drive_seed,
     every_kth,
+    hand_motion,
     name_of_path,
     plan_path,
     poses_on,
@@ -56,6 +58,7 @@ def simulate_recording(
     seed: int = 0,
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
+    handheld: bool = False,
 ) -> SimulatedRecording:
     """Builds the town around a drive and returns the recording of the drive.
 
@@ -70,6 +73,8 @@ def simulate_recording(
       seed: Seed of the town, at least 0.
       rate_hz: Scans per second of a route. Not used along a pose file.
       scenery: Scenery of the town.
+      handheld: Whether a person carries the sensor, at the height and with the tilt of `hand_motion`. The speed is that
+        of the vehicle.
 
     Raises:
       ValueError: The route is unknown, `rate_hz` is not positive, `seed` is negative, or the pose file is malformed.
@@ -95,7 +100,12 @@ def simulate_recording(
         sensor=sensor,
         key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
         rng=np.random.default_rng((*seeds, 2)),
+        handheld=handheld,
     )
+
+
+def _mounting(height_m: float) -> Mounting | None:
+    return None if height_m == MODEL_HEIGHT_M else Mounting(height_m)
 
 
 def drive_through(
@@ -109,6 +119,7 @@ def drive_through(
     sensor: Sensor,
     key: PRNGKeyArray,
     rng: np.random.Generator,
+    handheld: bool = False,
 ) -> SimulatedRecording:
     """Returns the recording of a drive through a town.
 
@@ -121,11 +132,12 @@ def drive_through(
       times: Times of the scans in the recording, in seconds. They may differ from the times of the town.
       sensor: LiDAR.
       key: Random key of the measurements.
-      rng: Random generator of the tilt of the vehicle's body.
+      rng: Random generator of the tilt of the vehicle's body or of the hand.
+      handheld: Whether a person carries the sensor (`hand_motion`).
     """
     xy, yaw, clock = (values[rows] for values in path)
-    tilt = body_tilt(rng, clock)
-    poses = TimedPoses(poses_on(world.ground.relief, xy, yaw, height_m=sensor.height_m, tilt=tilt), times)
+    tilt, height_m = hand_motion(rng, clock) if handheld else (body_tilt(rng, clock), sensor.height_m)
+    poses = TimedPoses(poses_on(world.ground.relief, xy, yaw, height_m=height_m, tilt=tilt), times)
     speed = speeds(path)[rows]
     row_of = {scan_id: i for i, scan_id in enumerate(ids)}
 
@@ -148,7 +160,7 @@ def drive_through(
         paths=names,
         label_paths=names,
         read=read,
-        mounting=None if sensor.height_m == MODEL_HEIGHT_M else Mounting(sensor.height_m),
+        mounting=_mounting(HAND_HEIGHT_M if handheld else sensor.height_m),
         on_disk=False,
         poses=poses,
         render=render,

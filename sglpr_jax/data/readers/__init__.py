@@ -8,7 +8,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from sglpr_jax.data.choices import PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
+from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS
 from sglpr_jax.data.listing import left_aside
 from sglpr_jax.data.mounted import mounted
@@ -44,6 +44,7 @@ def open_recording(
     pose_source: PoseChoice = "auto",
     format: ScanFormat = "auto",
     sensor_height: SensorHeight = "auto",
+    gravity: Gravity = "auto",
     poses: Path | str | None = None,
     pose_format: PoseFormat = "auto",
     times: Path | str | None = None,
@@ -59,6 +60,8 @@ def open_recording(
       format: Format of the scan files, for a plain folder and for KITTI's layout. "auto" detects it.
       sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates the height and the tilt from
         some scans. "auto" estimates them only if the layout does not define the mounting.
+      gravity: "recording" uses one mounting for all scans, and "scan" estimates height and up of each scan, which reads
+        all scans. "auto" does so if the mounting is estimated and some scans show that the sensor tilts.
       poses: Pose file of a plain folder, if it is not beside the scans.
       pose_format: Format of the pose file of a plain folder.
       times: File of timestamps of a plain folder, if it is not beside the scans.
@@ -92,7 +95,7 @@ def open_recording(
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")
         check_jumps(recording.times, source=f"{root}, sequence {name}")
-    return mounted(recording, sensor_height, known=reader.knows_mounting)
+    return mounted(recording, sensor_height, gravity=gravity, known=reader.knows_mounting)
 
 
 def _reader_of(root: Path) -> tuple[Reader, tuple[str, ...]]:

@@ -10,6 +10,7 @@ from sglpr_jax.evaluation.page.document import Section, document, figure_html, h
 from sglpr_jax.loops.explanation import why_none
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.optimization import OptimizedTrajectory, trajectory_error
 from sglpr_jax.loops.overlay import overlaid
 from sglpr_jax.loops.reasons import MEANING, counted
@@ -47,7 +48,7 @@ def _where(found: FoundLoops) -> str:
         return missing("No scan was processed.")
     positions = found.recording.positions
     if found.odometry is not None:
-        positions = upright_odometry(found.odometry, found.recording.mounting)[:, :3, 3]
+        positions = upright_odometry(found.odometry, mountings_of(found.recording))[:, :3, 3]
     parts, wrong = [], _frames(wrong_loops(found))
     right = [pair for pair in _frames(found.loops) if pair not in set(wrong)]
     if positions is not None:
@@ -99,7 +100,7 @@ def _corrected(found: FoundLoops, optimized: OptimizedTrajectory) -> str:
         about += f" Position error (RMSE after alignment with {found.recording.pose_source}): {', '.join(errors)}."
     if not figures.can_draw():
         return missing(about)
-    level = {name: upright_odometry(poses, found.recording.mounting)[:, :3, 3] for name, poses in both.items()}
+    level = {name: upright_odometry(poses, mountings_of(found.recording))[:, :3, 3] for name, poses in both.items()}
     return figure_html(loop_figures.trajectories(level), "The trajectory before and after", caption=about)
 
 
@@ -137,7 +138,8 @@ def _pairs(found: FoundLoops) -> str:
 
 def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
     query, match = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
-    return overlaid(query, match, upright_poses(loop.match_from_query, found.recording.mounting))
+    mounting = mountings_of(found.recording)
+    return overlaid(query, match, upright_poses(loop.match_from_query, mounting, query=loop.query, match=loop.match))
 
 
 def _title(found: FoundLoops, loop: Loop) -> str:

@@ -1,0 +1,188 @@
+"""Gravity of each scan of a sensor that tilts, as in a hand: from the ground of the scans, and from odometry.
+
+The ground of one scan gives height and up (`estimate_mounting`). `GroundFilter` replaces ground that contradicts the
+scans before. With odometry, up is averaged over the ground of some metres of path.
+"""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from sglpr_jax.data.mounting import Mounting, estimate_mounting
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import scan_stream
+
+TILTS_DEG = 3.0
+"""90 % quantile of the angle between up of the scans and its median above which a sensor tilts, in degrees."""
+GROUND_TILT_DEG, GROUND_HEIGHT_M = 0.45, 0.04
+"""Standard deviations of up about each horizontal axis, and of the height, from the ground of one scan."""
+SPREAD_DEG, SPREAD_M = 8.0, 0.15
+"""Standard deviations of a sensor in a hand about its mean, for a stream whose scans are not known in advance."""
+LEAST_SPREAD_DEG, LEAST_SPREAD_M = 2.0, 0.05
+"""Minimum of these standard deviations."""
+MEMORY = 0.8
+"""Share of the deviation from the mean that remains until the next scan. A hand turns within a second."""
+GATE = 4.6
+"""Maximum deviation of the ground of a scan from its prediction, in standard deviations of 3 degrees of freedom."""
+AVERAGED_M = 8.0
+"""Standard deviation of the Gaussian over which up is averaged along the path, in metres."""
+ODOMETRY_TILT_DEG = 0.35
+"""Standard deviation of up about each horizontal axis, averaged with odometry."""
+EXPLAINED = 0.5
+"""Maximum angle between up of a scan and of odometry that shows the tilt, as a share of the tilt. Odometry in the plane
+does not show it."""
+
+
+class GroundFilter:
+    """Kalman filter of height and up over consecutive scans.
+
+    The prediction is the last state, drawn towards the mean. Ground that contradicts the prediction is ignored.
+
+    Example:
+      gravity = sglpr_jax.GroundFilter(sglpr_jax.estimate_mounting(first_points))
+      record = sglpr_jax.Record(points=points, mounting=gravity.add(points))
+    """
+
+    def __init__(self, mean: Mounting, *, spread_deg: float = SPREAD_DEG, spread_m: float = SPREAD_M):
+        """Start a filter.
+
+        Arguments:
+          mean: Mean mounting.
+          spread_deg: Standard deviation of up about its mean, about each horizontal axis, in degrees.
+          spread_m: Standard deviation of the height about its mean, in metres.
+        """
+        self.mean = mean
+        self._spread = np.array([np.radians(spread_deg)] * 2 + [spread_m]) ** 2
+        self._noise = np.array([np.radians(GROUND_TILT_DEG)] * 2 + [GROUND_HEIGHT_M]) ** 2
+        self._state, self._variance = np.zeros(3), self._spread
+
+    def add(self, points: Float[np.ndarray, "n 3"]) -> Mounting:
+        """Estimate the mounting at the next scan from its points (n, 3), in metres."""
+        return self.update(estimate_mounting(points, near=self.mean))
+
+    def update(self, ground: Mounting | None) -> Mounting:
+        """Add the mounting by the ground of the next scan, or None for a scan without ground."""
+        predicted, variance = MEMORY * self._state, MEMORY**2 * self._variance + (1 - MEMORY**2) * self._spread
+        if ground is not None:
+            ahead = _apart(ground, self.mean) - predicted
+            if np.sum(ahead**2 / (variance + self._noise)) <= GATE**2:
+                gain = variance / (variance + self._noise)
+                predicted, variance = predicted + gain * ahead, variance * (1 - gain)
+        self._state, self._variance = predicted, variance
+        tilt_deg = float(np.degrees(np.sqrt(variance[:2].mean())))
+        return _beside(self.mean, predicted, float(np.sqrt(variance[2])), tilt_deg)
+
+
+def tilts(scans: Sequence[Mounting | None], common: Mounting | None) -> bool:
+    """Whether the mountings of some scans show a sensor that tilts, relative to their median `common`."""
+    seen = [scan for scan in scans if scan is not None]
+    return common is not None and len(seen) > 0 and _spread_deg(seen, common) > TILTS_DEG
+
+
+def with_gravity(recording: Recording, common: Mounting) -> Recording:
+    """Estimate the mounting of each scan of a recording. This reads all scans.
+
+    Arguments:
+      recording: The scans.
+      common: Mean mounting.
+    """
+    ground = _ground(recording, common)
+    seen = [scan for scan in ground if scan is not None] or [common]
+    apart = np.array([_apart(scan, common) for scan in seen])
+    middle = np.median(apart, axis=0)
+    mean = _beside(common, middle, 0.0, 0.0)
+    spread = 1.4826 * np.median(np.abs(apart - middle), axis=0)  # of a normal distribution
+    filtered = GroundFilter(
+        mean,
+        spread_deg=max(float(np.degrees(spread[:2].max())), LEAST_SPREAD_DEG),
+        spread_m=max(float(spread[2]), LEAST_SPREAD_M),
+    )
+    mountings = tuple(filtered.update(scan) for scan in ground)
+    followed = sum((one.tilt_deviation_deg or 0.0) <= 2 * GROUND_TILT_DEG for one in mountings)
+    found = (
+        f"gravity: the sensor tilts by {_spread_deg(seen, mean):.0f} degrees about its mean; height and tilt of each "
+        f"scan from the ground in {followed} of {len(ground)} scans"
+    )
+    return dataclasses.replace(recording, mountings=mountings, found=(*recording.found, found))
+
+
+def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
+    """Average up of each scan over the path by the rotations of odometry, if the recording has `mountings`.
+
+    Odometry that does not show the tilt, as that of wheels, is not used.
+
+    Arguments:
+      recording: The scans.
+      world_from_lidar: Pose of the LiDAR at each scan, in any fixed frame.
+    """
+    if recording.mountings is None:
+        return recording
+    turn = world_from_lidar[:, :3, :3]
+    up = np.einsum("nij,nj->ni", turn, np.array([one.up for one in recording.mountings]))
+    weight = np.array([1 / (one.tilt_deviation_deg or GROUND_TILT_DEG) ** 2 for one in recording.mountings])
+    mean = _averaged(up, weight, world_from_lidar[:, :3, 3])
+    left = np.quantile(_angles_deg(up, mean), 0.9)
+    whole = np.quantile(_angles_deg(np.array([one.up for one in recording.mountings]), None), 0.9)
+    if left > EXPLAINED * whole:
+        found = "gravity: the odometry does not show the tilt of the scans; their ground is used"
+        return dataclasses.replace(recording, found=(*recording.found, found))
+    ups = np.einsum("nji,nj->ni", turn, mean).tolist()
+    mountings = tuple(
+        dataclasses.replace(one, up=tuple(up), tilt_deviation_deg=ODOMETRY_TILT_DEG)
+        for one, up in zip(recording.mountings, ups, strict=True)
+    )
+    found = f"gravity: tilt of each scan from the odometry and the ground, {left:.1f} degrees apart"
+    return dataclasses.replace(recording, mountings=mountings, found=(*recording.found, found))
+
+
+def _ground(recording: Recording, common: Mounting) -> list[Mounting | None]:
+    """Mounting by the ground of each scan, or None for scans that show no ground or cannot be read."""
+
+    def of_scan(row: int, record) -> Mounting | None:
+        return estimate_mounting(record.points, near=common)
+
+    options = {"ahead": os.cpu_count() or 1, "on_bad_scan": lambda scan, error: None}
+    return [found for _, found in scan_stream(recording, of_scan, **options)]
+
+
+def _apart(one: Mounting, mean: Mounting) -> Float[np.ndarray, "3"]:
+    """Up of a mounting in the upright frame of the mean (x and y), and its height relative to the mean."""
+    x, y, _ = mean.upright_from_lidar @ np.array(one.up)
+    return np.array([x, y, one.height_m - mean.height_m])
+
+
+def _beside(mean: Mounting, apart: Float[np.ndarray, "3"], deviation_m: float, deviation_deg: float) -> Mounting:
+    """Inverse of `_apart`."""
+    x, y, height = apart.tolist()
+    up = mean.upright_from_lidar.T @ np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))])
+    up = up / np.linalg.norm(up)
+    return Mounting(mean.height_m + height, tuple(up.tolist()), deviation_m, deviation_deg)
+
+
+def _averaged(
+    values: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Weighted Gaussian average of directions along a path."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    metre = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    sums = np.zeros((metre[-1] + 1, 3))
+    np.add.at(sums, metre, values * weight[:, None])
+    mean = gaussian_filter1d(sums, AVERAGED_M, axis=0, mode="constant")[metre]
+    return mean / np.linalg.norm(mean, axis=1, keepdims=True)
+
+
+def _spread_deg(scans: Sequence[Mounting], mean: Mounting) -> float:
+    """90 % quantile of the angle between up of some scans and its mean, in degrees."""
+    return float(np.quantile(_angles_deg(np.array([one.up for one in scans]), np.array(mean.up)), 0.9))
+
+
+def _angles_deg(ups: Float[np.ndarray, "n 3"], mean: Float[np.ndarray, "*n 3"] | None) -> Float[np.ndarray, " n"]:
+    """Angle between each direction and the mean, by default the median of all, in degrees."""
+    if mean is None:
+        mean = np.median(ups, axis=0)
+        mean = mean / np.linalg.norm(mean)
+    return np.degrees(np.arccos(np.clip((ups * mean).sum(axis=1), -1, 1)))
