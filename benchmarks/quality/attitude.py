@@ -1,20 +1,22 @@
 """Compare roll, pitch and height of loops with their covariances, for a sensor in a hand and on a car.
 
-    python -m benchmarks.quality.attitude
-    python -m benchmarks.quality.attitude --drives car:town:08:620 --sensors hdl64e
+    python -m benchmarks.quality.attitude pairs
+    python -m benchmarks.quality.attitude search --drives hand:town:08:620 --sensors hdl64e
 
-Each drive is searched with one mounting for the recording and with the gravity of each scan, without and with odometry
-that drifts, each without and with registration. The table shows right loops (within 10 m), wrong ones (beyond 20 m),
-the share of revisits (within 5 m) that have a loop, median errors, the share of errors within 2 standard deviations,
-and the 95 % quantile of the normalised error squared of roll, pitch and height, which is 7.81 for a right covariance.
-The constants were fitted on seeds 500 to 507.
+`pairs` aligns the images of scans that are revisits, with one mounting for the recording and with the gravity of each
+scan, without and with registration. `search` searches whole drives, without and with odometry that drifts, and also
+counts right loops (within 10 m), wrong ones (beyond 20 m), and the share of revisits (within 5 m) that have a loop.
+Both print median errors, the share of errors within 2 standard deviations, and the 95 % quantile of the normalised
+error squared of roll, pitch and height, which is 7.81 for a right covariance. Pairs whose position is more than 3 m off
+are left out. The constants were fitted on seeds 500 to 507.
 """
 
 import dataclasses
 import time
-from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Annotated, NamedTuple
 
+import jax
 import numpy as np
 import tyro
 from jaxtyping import Float
@@ -22,17 +24,21 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from benchmarks.quality.covariance import STEPS, twist
+from benchmarks.quality.covariance import ALIAS_M, STEPS, revisits, twist
 from benchmarks.quality.loops import LOOP_M, OTHER_M, REVISIT_M, drifted
 from sglpr_jax.data.choices import Gravity
 from sglpr_jax.data.mounted import mounted
+from sglpr_jax.data.readable import only
 from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.find import FoundLoops, find_loops
 from sglpr_jax.loops.joint import settled
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop import Loop, planar_loop
+from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.seen import square_image
 from sglpr_jax.loops.transforms import inverse
-from sglpr_jax.models.params import Params
+from sglpr_jax.loops.verification import align
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS
@@ -40,143 +46,158 @@ from sglpr_jax.sim.sensor import SENSORS
 UNSEEN = np.array([3, 4, 2])
 """Roll, pitch and height in an error of 6 degrees of freedom."""
 OLDER_S = 30.0
+GRAVITIES: tuple[Gravity, ...] = ("recording", "auto")
+DRIVES = (
+    *("hand:town:08:620", "hand:town:00:621", "hand:outskirts:06:622", "hand:gardens:08:623"),
+    *("car:town:08:624", "car:outskirts:06:625"),
+)
+"""CARRIER:SCENERY:ROUTE:SEED. The carrier is hand or car."""
+ERRORS = ("roll, pitch [deg]", "height [m]", "roll/pitch/height in 2 sigma", "95 % (7.81)")
+
+
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """Pairs of scans of one place."""
+
+    drives: tuple[str, ...] = DRIVES
+    sensors: tuple[str, ...] = ("hdl64e", "vlp16")
+    scans: int = 360
+    pairs: int = 40
+
+    def run(self) -> None:
+        table = Table("drive", "sensor", "gravity", "6 DoF", "pairs", *ERRORS, "overlap, 5 %", "ms a pair")
+        for name, sensor, recording in simulated(self.drives, self.sensors, self.scans):
+            chosen = revisits(recording, self.pairs, np.random.default_rng(0))
+            frames = np.unique(chosen)
+            few, poses = only(in_memory(recording, frames), frames.tolist()), recording.poses.world_from_lidar[frames]
+            for gravity in GRAVITIES:
+                opened = mounted(dataclasses.replace(few, mounting=None), "auto", gravity=gravity, known=False)
+                print(*opened.found, sep="\n")
+                loops = list(_near(aligned(opened, np.searchsorted(frames, chosen)), poses))
+                start = time.process_time()
+                fine = [_registered(opened, loop) for loop in loops]
+                ms = 1e3 * (time.process_time() - start) / max(len(loops), 1)
+                overlap = f"{np.quantile([loop.overlap or 0.0 for loop in fine], 0.05):.2f}" if fine else "-"
+                for how, found, more in (("no", loops, ["", ""]), ("yes", fine, [overlap, f"{ms:.0f}"])):
+                    row = [name, sensor, gravity, how, str(len(found)), *errors_of(found, poses), *more]
+                    print(*row, flush=True)
+                    table.add_row(*row)
+        Console(width=170).print(table)
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """Whole drives."""
+
+    drives: tuple[str, ...] = DRIVES
+    sensors: tuple[str, ...] = ("hdl64e",)
+    scans: int = 360
+    weights: str = "sglpr"
+
+    def run(self) -> None:
+        params = sglpr_jax.load(self.weights)
+        counted = ("gravity", "odometry", "6 DoF", "right", "wrong", "recall")
+        table = Table("drive", "sensor", *counted, *ERRORS)
+        for name, sensor, recording in simulated(self.drives, self.sensors, self.scans):
+            poses = recording.poses.world_from_lidar
+            unknown = dataclasses.replace(in_memory(recording), mounting=None)
+            odometry = drifted(poses, seed=int(name.split(":")[-1]))
+            for gravity, given in [("recording", None), ("auto", None), ("auto", odometry)]:
+                opened = mounted(unknown, "auto", gravity=gravity, known=False)
+                found = find_loops(opened, params, odometry=given, registered=False)
+                print(*found.recording.found, sep="\n")
+                for how, loops in (("no", found.loops), ("yes", registered(found))):
+                    about = [gravity, "no" if given is None else "yes", how]
+                    row = [name, sensor, *about, *counts(loops, recording), *errors_of(loops, poses)]
+                    print(*row, flush=True)
+                    table.add_row(*row)
+        Console(width=170).print(table)
 
 
 class Drive(NamedTuple):
     """A simulated drive."""
 
-    carrier: Literal["hand", "car"]
-    scenery: str
-    route: str
-    seed: int
+    name: str
+    sensor: str
+    recording: SimulatedRecording
 
 
-class Search(NamedTuple):
-    """Loops of one drive, found in one way."""
-
-    gravity: Gravity
-    odometry: bool
-    registered: bool
-    loops: tuple[Loop, ...]
-    overlaps: tuple[float, ...]
-    """Overlaps of all loops that were registered."""
-    ms: float
-    """Time of the registration of a loop, in milliseconds."""
-
-
-def main(
-    *,
-    drives: tuple[str, ...] = (
-        *("hand:town:08:620", "hand:town:00:621", "hand:outskirts:06:622", "hand:gardens:08:623"),
-        *("car:town:08:624", "car:outskirts:06:625"),
-    ),
-    sensors: tuple[str, ...] = ("hdl64e", "vlp16"),
-    scans: int = 360,
-    weights: str = "sglpr",
-) -> None:
-    """Print a table: a row for each drive, sensor and way of searching.
-
-    Args:
-        drives: CARRIER:SCENERY:ROUTE:SEED. The carrier is hand or car.
-        sensors: their names.
-        scans: of each drive.
-        weights: of the model that describes the scans.
-    """
-    params = sglpr_jax.load(weights)
-    table = Table(
-        *("drive", "sensor", "gravity", "odometry", "6 DoF", "right", "wrong", "recall"),
-        *("roll, pitch [deg]", "height [m]", "in 2 sigma", "95 % (7.81)", "ms a loop"),
-    )
+def simulated(drives: Sequence[str], sensors: Sequence[str], scans: int) -> Iterator[Drive]:
+    """The recordings of all drives by all sensors."""
     for name in drives:
         carrier, scenery, route, seed = name.split(":")
         for sensor in sensors:
-            recording = in_memory(simulated(Drive(carrier, scenery, route, int(seed)), sensor, scans))
-            for search in searches(recording, params, int(seed)):
-                row = row_of(recording, search)
-                print(name, sensor, *row, flush=True)
-                table.add_row(name, sensor, *row)
-    Console(width=170).print(table)
+            lidar = dataclasses.replace(SENSORS[sensor], azimuth_steps=STEPS[sensor])
+            options = {"sensor": lidar, "scenery": SCENERIES[scenery], "handheld": carrier == "hand"}
+            yield Drive(name, sensor, simulate_recording(route, scans=scans, seed=int(seed), **options))
 
 
-def simulated(drive: Drive, sensor: str, scans: int) -> SimulatedRecording:
-    """The recording of a drive."""
-    lidar = dataclasses.replace(SENSORS[sensor], azimuth_steps=STEPS[sensor])
-    options = {"sensor": lidar, "scenery": SCENERIES[drive.scenery], "handheld": drive.carrier == "hand"}
-    return simulate_recording(drive.route, scans=scans, seed=drive.seed, **options)
-
-
-def in_memory(recording: SimulatedRecording) -> SimulatedRecording:
-    """The recording, with all scans rendered."""
-    rendered = dict(zip(recording.paths, (recording.points(i) for i in range(len(recording))), strict=True))
+def in_memory(recording: SimulatedRecording, frames: Sequence[int] | np.ndarray | None = None) -> Recording:
+    """The recording, with its scans or those of some frames rendered."""
+    chosen = range(len(recording)) if frames is None else frames
+    rendered = {recording.paths[i]: recording.points(int(i)) for i in chosen}
     return dataclasses.replace(recording, read=lambda path, labels, lasers: Record(points=rendered[path]))
 
 
-def searches(recording: SimulatedRecording, params: Params, seed: int) -> Iterator[Search]:
-    """Search a drive whose mounting is not known, in all ways."""
-    unknown, odometry = (
-        dataclasses.replace(recording, mounting=None),
-        drifted(recording.poses.world_from_lidar, seed=seed),
-    )
-    gravities: tuple[Gravity, ...] = ("recording", "auto")
-    for gravity in gravities:
-        opened = mounted(unknown, "auto", gravity=gravity, known=False)
-        print(*opened.found, sep="\n")
-        for given in (None, odometry):
-            found = find_loops(opened, params, odometry=given, registered=False)
-            print(*found.recording.found[len(opened.found) :], sep="\n")
-            yield Search(gravity, given is not None, False, found.loops, (), 0.0)
-            yield registered(found, gravity)
+def aligned(recording: Recording, pairs: np.ndarray) -> Iterator[Loop]:
+    """The loops of pairs of query and match, by their images."""
+    for query, match in pairs.tolist():
+        images = [square_image(recording.record(frame, labels=False)) for frame in (query, match)]
+        mountings = {"query_mounting": recording.mounting_of(query), "match_mounting": recording.mounting_of(match)}
+        yield planar_loop(query, match, jax.device_get(align(*images)), probability=1.0, **mountings)
 
 
-def registered(found: FoundLoops, gravity: Gravity) -> Search:
+def _near(loops: Iterator[Loop], poses: Float[np.ndarray, "n 4 4"]) -> Iterator[Loop]:
+    """The loops whose position in the plane is right."""
+    for loop in loops:
+        apart = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
+        if np.linalg.norm(apart[:3, 3]) <= ALIAS_M:
+            yield loop
+
+
+def _registered(recording: Recording, loop: Loop) -> Loop:
+    points = [recording.points(frame) for frame in (loop.query, loop.match)]
+    found = register(*points, initial=loop.match_from_query, initial_covariance=loop.covariance)
+    return dataclasses.replace(loop, **found._asdict())
+
+
+def registered(found: FoundLoops) -> tuple[Loop, ...]:
     """The loops of a search, registered."""
-    start = time.process_time()
-    kept, rejected = settled(found.recording, found.loops, None, DetectorConfig(), registered=True)
-    ms = 1e3 * (time.process_time() - start) / max(len(found.loops), 1)
-    overlaps = tuple(loop.overlap or 0.0 for loop in (*kept, *(one.loop for one in rejected)))
-    return Search(gravity, found.odometry is not None, True, tuple(kept), overlaps, ms)
+    kept, _ = settled(found.recording, found.loops, None, DetectorConfig(), registered=True)
+    return tuple(kept)
 
 
-def row_of(recording: SimulatedRecording, search: Search) -> list[str]:
-    """Cells of a row."""
-    poses = recording.poses.world_from_lidar
-    apart = np.array([np.linalg.norm(poses[one.query, :3, 3] - poses[one.match, :3, 3]) for one in search.loops])
-    right = [loop for loop, metres in zip(search.loops, apart, strict=True) if metres <= LOOP_M]
-    errors, covariances = errors_of(right, poses)
+def counts(loops: Sequence[Loop], recording: SimulatedRecording) -> list[str]:
+    """Right loops, wrong loops and recall."""
+    positions, times = recording.poses.world_from_lidar[:, :3, 3], recording.poses.times
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    of_loops = np.array([apart[loop.query, loop.match] for loop in loops])
+    right = {loop.query for loop in loops if apart[loop.query, loop.match] <= LOOP_M}
+    again = (apart <= REVISIT_M) & (times[:, None] - times[None] >= OLDER_S)
+    queries = set(np.flatnonzero(again.any(axis=1)).tolist())
+    share = len(queries & right) / max(len(queries), 1)
+    return [str(int((of_loops <= LOOP_M).sum())), str(int((of_loops > OTHER_M).sum())), f"{share:.3f}"]
+
+
+def errors_of(loops: Sequence[Loop], poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
+    """Errors of roll, pitch and height of the right loops beside their deviations, as cells."""
+    right = [one for one in loops if np.linalg.norm(poses[one.query, :3, 3] - poses[one.match, :3, 3]) <= LOOP_M]
+    if not right:
+        return ["-"] * len(ERRORS)
+    apart = [inverse(inverse(poses[one.match]) @ poses[one.query]) @ one.match_from_query for one in right]
+    errors = np.array([twist(one) for one in apart])[:, UNSEEN]
+    covariances = np.array([one.covariance for one in right])[:, UNSEEN[:, None], UNSEEN]
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
     degrees, metres = np.degrees(np.abs(errors[:, :2])), np.abs(errors[:, 2])
-    cells = ["-"] * 4
-    if len(right):
-        within = (np.abs(errors) <= 2 * sigmas).mean(axis=0)
-        cells = [
-            f"{np.median(degrees):.2f}, 95 % {np.quantile(degrees, 0.95):.2f}",
-            f"{np.median(metres):.3f}, 95 % {np.quantile(metres, 0.95):.3f}",
-            "/".join(f"{share:.2f}" for share in within),
-            f"{np.quantile(squares, 0.95):.2f}",
-        ]
-    how = [search.gravity, *("yes" if value else "no" for value in (search.odometry, search.registered))]
-    counts = [str(len(right)), str(int((apart > OTHER_M).sum())), f"{recall(recording, right):.3f}"]
-    return [*how, *counts, *cells, f"{search.ms:.0f}"]
-
-
-def errors_of(
-    loops: list[Loop], poses: Float[np.ndarray, "n 4 4"]
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-    """Errors of roll, pitch (radians) and height (metres) of loops, and their covariances."""
-    errors = [twist(inverse(inverse(poses[one.match]) @ poses[one.query]) @ one.match_from_query) for one in loops]
-    covariances = np.array([one.covariance for one in loops]).reshape(-1, 6, 6)
-    return np.array(errors).reshape(-1, 6)[:, UNSEEN], covariances[:, UNSEEN[:, None], UNSEEN]
-
-
-def recall(recording: SimulatedRecording, right: list[Loop]) -> float:
-    """Share of the scans within 5 m of a scan 30 s older that have a right loop."""
-    positions, times = recording.poses.world_from_lidar[:, :3, 3], recording.poses.times
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    apart[times[:, None] - times[None] < OLDER_S] = np.inf
-    revisits = set(np.flatnonzero((apart <= REVISIT_M).any(axis=1)).tolist())
-    return len(revisits & {loop.query for loop in right}) / max(len(revisits), 1)
+    within = (np.abs(errors) <= 2 * sigmas).mean(axis=0)
+    return [
+        f"{np.median(degrees):.2f}, 95 % {np.quantile(degrees, 0.95):.2f}",
+        f"{np.median(metres):.3f}, 95 % {np.quantile(metres, 0.95):.3f}",
+        "/".join(f"{share:.2f}" for share in within),
+        f"{np.quantile(squares, 0.95):.2f}",
+    ]
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    tyro.cli(Annotated[Pairs, tyro.conf.subcommand("pairs")] | Annotated[Search, tyro.conf.subcommand("search")]).run()

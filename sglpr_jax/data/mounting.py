@@ -184,7 +184,7 @@ def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 def _planes(
-    points: Float[np.ndarray, "n 3"], *, trials: int = TRIALS
+    points: Float[np.ndarray, "n 3"], *, trials: int
 ) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
     """Sample planes that may be the ground. Returns normals that point up, and heights of the sensor above the
     planes."""

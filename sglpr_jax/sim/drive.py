@@ -195,8 +195,8 @@ def poses_on(
 ) -> Float[np.ndarray, "n 4 4"]:
     """Returns world_from_lidar of a vehicle on hills: x points forward, z along the normal of the ground.
 
-    The LiDAR is `height_m` (one value, or one for each pose) above the ground along the normal. `tilt` is pitch and roll relative to the ground, in
-    radians, see `body_tilt`.
+    The LiDAR is `height_m` above the ground along the normal, one value or one for each pose. `tilt` is pitch and roll
+    relative to the ground, in radians, see `body_tilt`.
     """
     slope = relief_gradient(relief, xy)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)

@@ -55,7 +55,7 @@ def recalled(folder: Path, wanted: dict) -> list:
         finder.frames += 1
 
     kept = unfinished.Unfinished.opened(folder, wanted)
-    kept.recall(finder, None, add, missing=True)
+    kept.recall(finder, lambda frame: None, add, missing=True)
     return found
 
 

@@ -42,10 +42,10 @@ def recording():
 def test_lists_are_taken_for_arrays():
     np.testing.assert_array_equal(given_poses(POSES, of="odometry"), np.array(POSES))
     np.testing.assert_array_equal(given_pose(POSES[0]), np.eye(4))
-    record, mounting = Record(), Mounting(1.0)
-    assert given_record(record, mounting=mounting) is record
-    points = given_record([[1, 2, 3], [4, 5, 6]], mounting=mounting)
-    assert points.points.dtype == np.float32 and points.points.shape == (2, 3) and points.mounting is mounting
+    record = Record()
+    assert given_record(record) is record
+    points = given_record([[1, 2, 3], [4, 5, 6]])
+    assert points.points.dtype == np.float32 and points.points.shape == (2, 3) and points.mounting is None
     assert given_record(np.ones((9, 9), int)).image.shape == (9, 9)
     assert given_time(np.int64(3)) == 3.0 and given_time(None) is None and given_pose(None) is None
 

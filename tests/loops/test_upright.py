@@ -13,12 +13,14 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.consistency import agree
+from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.loop import planar_loop
+from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
 from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.registration import register
 from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, transformed
-from sglpr_jax.loops.upright import lidar_pose, upright_from_lidar, upright_odometry, upright_poses
+from sglpr_jax.loops.upright import lidar_pose, upright_odometry, upright_poses
 from sglpr_jax.loops.verification import Alignment
 
 TILTS = {"forward": (0.0, 25.0, 0.0), "sideways": (20.0, 10.0, 0.0), "upside down": (170.0, 5.0, 0.0)}
@@ -179,10 +181,43 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
     np.testing.assert_allclose(np.cov(seen.T), expected, atol=0.05 * expected.diagonal().max())
 
 
-def test_a_stream_of_sensors_mounted_otherwise_is_refused(drive, params):
-    finder = CandidateFinder(params)
-    finder.add(Record(points=drive.points(0)))
-    with pytest.raises(
-        ValueError, match=r"expected one sensor mounting for all frames, None, found 2\.50 m above the ground"
-    ):
-        finder.add(Record(points=drive.points(1), mounting=Mounting(2.5)))
+@pytest.mark.slow
+def test_each_frame_of_a_stream_has_its_own_mounting(drive, revisit, params):
+    query, match = revisit
+    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=0, min_travelled_m=0.0))
+    tilts = [tilted_from_level(TILTS[name]) for name in ("sideways", "forward")]
+    for frame, tilted in zip((match, query), tilts, strict=True):
+        points = transformed(tilted, drive.points(frame)).astype(np.float32)
+        candidates = finder.add(Record(points=points, mounting=mounting_of(tilted)))
+    mountings = {"query_mounting": finder.mountings[1], "match_mounting": finder.mountings[0]}
+    loop = planar_loop(1, 0, candidates[0].alignment, probability=1.0, **mountings)
+    poses = drive.poses.world_from_lidar[[match, query]] @ inverse(np.stack(tilts))
+    metres, degrees = error_of(loop.match_from_query, inverse(poses[0]) @ poses[1])
+    assert metres < 1.0 and degrees < 4
+
+
+def test_loops_of_frames_with_different_tilts_agree_with_their_odometry():
+    rng = np.random.default_rng(3)
+    level = np.stack([transform(20 * np.cos(a), 20 * np.sin(a), a) for a in np.linspace(0, 12, 120)])
+    tilts = [tilted_from_level(rng.uniform(-15, 15, 3)) for _ in level]
+    mountings = Mountings(mounting_of(tilted) for tilted in tilts)
+    odometry = np.stack([pose @ inverse(tilted) for pose, tilted in zip(level, tilts, strict=True)])
+    pairs, spread = [(70, 7), (75, 12), (90, 27)], np.diag([0.05, 0.05, 0.002]).astype(np.float32)
+    loops = []
+    for query, match in pairs:
+        pose = inverse(level[match]) @ level[query]
+        alignment = Alignment(pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0]), spread, 1.0, 0.0)
+        options = {"query_mounting": mountings[query], "match_mounting": mountings[match]}
+        loops.append(planar_loop(query, match, alignment, probability=1.0, **options))
+    assert agree(loops, odometry, mounting=mountings).all()
+    np.testing.assert_allclose(deviations(loops, odometry, mounting=mountings), 0, atol=1e-3)
+    assert (deviations(loops, odometry) > 0.3).any()  # with the mean mounting
+
+
+def test_frames_with_one_mounting_are_stored_once():
+    mountings = Mountings([Mounting(2.5)] * 9)
+    assert len(mountings) == 9 and not mountings.differ and mountings.nbytes == 0
+    np.testing.assert_array_equal(mountings.uprights(np.arange(4)), upright_from_lidar(Mounting(2.5)))
+    mountings.append(None)
+    assert len(mountings) == 10 and mountings[8] == Mounting(2.5) and mountings[9] is None
+    np.testing.assert_array_equal(mountings.uprights(np.array([8, 9]))[:, 2, 3], [2.5 - MODEL_HEIGHT_M, 0])
