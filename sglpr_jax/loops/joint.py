@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
@@ -16,10 +17,15 @@ from sglpr_jax.loops.loop import Loop, Reason, Rejected
 from sglpr_jax.loops.mountings import AnyMounting, mountings_of
 from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.registration import register
-from sglpr_jax.loops.transforms import travelled
+from sglpr_jax.loops.transforms import inverse, travelled
 
 MIN_OVERLAP = 0.6
 """Minimum overlap of two registered scans of one place. Measurements: docs/decisions/loops.md."""
+LITTLE_OVERLAP = 0.2
+"""Minimum overlap of two registered scans of one place whose pose agrees with that of their images."""
+AGREE, AGREE_M, AGREE_DEG = 5.0, 0.05, 0.3
+"""Maximum distance of both poses in standard deviations of 6 degrees of freedom, and standard deviations (metres,
+degrees) added to those of the poses."""
 FEWEST_AGAINST = 5
 """Minimum number of frames whose loops contradict the odometry, for a warning."""
 AXES = "x forward, y left, z up, of the LiDAR, not of a camera."
@@ -143,7 +149,7 @@ def settled(
 def _registered(
     recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
 ) -> tuple[list[Loop], list[Rejected]]:
-    """Registered loops, and loops whose scans overlap too little. After a stop, the remaining loops are unchanged."""
+    """Registered loops, and loops whose scans contradict the images. After a stop, the remaining loops are unchanged."""
     kept, rejected = [], []
     for i, loop in enumerate(loops):
         if should_stop():
@@ -154,10 +160,18 @@ def _registered(
             initial=loop.match_from_query,
             initial_covariance=loop.covariance,
         )
-        values = {"match_from_query": found.match_from_query, "covariance": found.covariance, "overlap": found.overlap}
-        loop = dataclasses.replace(loop, **values)
-        if found.overlap >= MIN_OVERLAP:
-            kept.append(loop)
+        fine = dataclasses.replace(loop, **found._asdict())
+        if found.overlap >= MIN_OVERLAP or (found.overlap >= LITTLE_OVERLAP and agrees(fine, loop)):
+            kept.append(fine)
         else:
-            rejected.append(Rejected(loop, "little overlap"))
+            rejected.append(Rejected(fine, "little overlap"))
     return kept, rejected
+
+
+def agrees(fine: Loop, loop: Loop) -> bool:
+    """Whether the pose by the scans agrees with that by the images, within the covariances of both."""
+    apart = inverse(loop.match_from_query) @ fine.match_from_query
+    error = np.concatenate([apart[:3, 3], Rotation.from_matrix(apart[:3, :3]).as_rotvec()])
+    least = np.repeat([AGREE_M, np.radians(AGREE_DEG)], 3) ** 2
+    spread = loop.covariance + fine.covariance + np.diag(least)
+    return bool(error @ np.linalg.solve(spread, error) <= AGREE**2)

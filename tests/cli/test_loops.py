@@ -147,11 +147,10 @@ def test_bad_scans_are_told_and_skipped(command, town, tmp_path):
     assert [line[:14] for line in ended.error.splitlines() if "skipped" in line] == ["skipped 000003", "skipped 000021"]
 
 
-@pytest.mark.parametrize(("flag", "module"), [("--optimize", "gtsam"), ("--register", "small_gicp")])
-def test_a_missing_extra_is_said_before_the_search(command, town, odometry, tmp_path, monkeypatch, flag, module):
-    monkeypatch.setitem(sys.modules, module, None)
+def test_a_missing_extra_is_said_before_the_search(command, town, odometry, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gtsam", None)
     write_tum(tmp_path / "odometry.tum", odometry, np.arange(float(SCANS)))
-    options = ("--odometry", tmp_path / "odometry.tum", "--out", tmp_path / "found", flag)
+    options = ("--odometry", tmp_path / "odometry.tum", "--out", tmp_path / "found", "--optimize")
     assert_one_line_error(command("loops", town, "--seq", "08", *options), "pip install 'sglpr-jax[")
     assert not (tmp_path / "found").exists()
 
@@ -226,9 +225,31 @@ def test_a_file_where_the_folder_should_be_is_one_clear_error(command, town, tmp
     assert_one_line_error(ended, f"{tmp_path}: expected odometry, found a folder")
 
 
-def test_images_cannot_be_registered(command, images, tmp_path):
-    ended = command("loops", images, "--seq", "06", "--out", tmp_path / "found", "--register")
-    assert_one_line_error(ended, "expected scans to register, found ready-made images")
+@pytest.mark.parametrize(
+    ("layout", "installed", "flags", "registered", "said"),
+    [
+        ("town", True, [], True, None),
+        ("town", True, ["--no-register"], False, None),
+        ("town", False, [], False, "because small-gicp is not installed: pip install 'sglpr-jax[slam]'"),
+        ("images", True, [], False, "because they are ready-made images"),
+    ],
+)
+def test_scans_are_registered_if_they_can_be(
+    command, town, images, tmp_path, monkeypatch, layout, installed, flags, registered, said
+):
+    asked = []
+
+    def searched(recording, params, *, registered, **options):
+        asked.append(registered)
+        return find.FoundLoops(recording, len(recording), (), (), None)
+
+    monkeypatch.setattr(find, "find_loops", searched)
+    monkeypatch.setattr(find, "is_installed", lambda: installed)
+    source = (town, "--seq", "08") if layout == "town" else (images, "--seq", "06")
+    ended = command("loops", *source, "--out", tmp_path / "found", *flags)
+    assert ended.status == 0 and asked == [registered], ended.error
+    lines = [line for line in ended.error.splitlines() if "not registered" in line]
+    assert len(lines) == (said is not None) and all(line.endswith(said) for line in lines)
 
 
 @pytest.mark.slow

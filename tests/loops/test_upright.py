@@ -221,3 +221,29 @@ def test_frames_with_one_mounting_are_stored_once():
     mountings.append(None)
     assert len(mountings) == 10 and mountings[8] == Mounting(2.5) and mountings[9] is None
     np.testing.assert_array_equal(mountings.uprights(np.array([8, 9]))[:, 2, 3], [2.5 - MODEL_HEIGHT_M, 0])
+
+
+def test_the_covariance_of_estimated_mountings_is_that_of_drawn_ones():
+    rng = np.random.default_rng(0)
+    tilts = [tilted_from_level(degrees) for degrees in ((9.0, -6.0, 0.0), (-4.0, 12.0, 0.0))]
+    query, match = (
+        dataclasses.replace(mounting_of(tilted), height_deviation_m=0.04, tilt_deviation_deg=1.0) for tilted in tilts
+    )
+    upright, none = transform(3.0, -2.0, 2.0), np.zeros((3, 3), np.float32)
+    alignment = Alignment(3.0, -2.0, 2.0, none, 1.0, 0.0)
+    loop = planar_loop(1, 0, alignment, probability=1.0, query_mounting=query, match_mounting=match)
+
+    def drawn(mounting):
+        off = rng.normal(size=3) * [np.radians(1.0), np.radians(1.0), 0.04]
+        error = np.eye(4)
+        error[:3, :3], error[2, 3] = Rotation.from_rotvec([off[0], off[1], 0]).as_matrix(), off[2]
+        return error @ upright_from_lidar(mounting)
+
+    poses = np.array([inverse(drawn(match)) @ upright @ drawn(query) for _ in range(4000)])
+    apart = inverse(loop.match_from_query) @ poses
+    errors = np.concatenate([apart[:, :3, 3], Rotation.from_matrix(apart[:, :3, :3]).as_rotvec()], axis=1)
+    whitened = errors @ np.linalg.cholesky(np.linalg.inv(loop.covariance + 1e-9 * np.eye(6)))
+    squares = (whitened**2).sum(axis=1)
+    assert 0.6 < np.median(squares) / 2.37 < 1.05 and 0.6 < np.quantile(squares, 0.95) / 7.81 < 1.05
+    fixed = planar_loop(1, 0, alignment, probability=1.0)
+    np.testing.assert_allclose(np.sqrt(fixed.covariance[2, 2]), np.hypot(0.03, 0.018 * np.hypot(3, 2)), rtol=1e-12)
