@@ -18,7 +18,7 @@ from sglpr_jax.data.scan_stream import scan_stream
 
 TILTS_DEG = 3.0
 """90 % quantile of the angle between up of the scans and its median above which a sensor tilts, in degrees."""
-GROUND_TILT_DEG, GROUND_HEIGHT_M = 0.45, 0.04
+GROUND_TILT_DEG, GROUND_HEIGHT_M = 0.25, 0.03
 """Standard deviations of up about each horizontal axis, and of the height, from the ground of one scan."""
 SPREAD_DEG, SPREAD_M = 8.0, 0.15
 """Standard deviations of a sensor in a hand about its mean, for a stream whose scans are not known in advance."""
@@ -30,7 +30,7 @@ GATE = 4.6
 """Maximum deviation of the ground of a scan from its prediction, in standard deviations of 3 degrees of freedom."""
 AVERAGED_M = 8.0
 """Standard deviation of the Gaussian over which up is averaged along the path, in metres."""
-ODOMETRY_TILT_DEG = 0.35
+ODOMETRY_TILT_DEG = 0.3
 """Standard deviation of up about each horizontal axis, averaged with odometry."""
 EXPLAINED = 0.5
 """Maximum angle between up of a scan and of odometry that shows the tilt, as a share of the tilt. Odometry in the plane
@@ -102,7 +102,7 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
         spread_m=max(float(spread[2]), LEAST_SPREAD_M),
     )
     mountings = tuple(filtered.update(scan) for scan in ground)
-    followed = sum((one.tilt_deviation_deg or 0.0) <= 2 * GROUND_TILT_DEG for one in mountings)
+    followed = sum((one.tilt_deviation_deg or 0.0) <= GROUND_TILT_DEG for one in mountings)
     found = (
         f"gravity: the sensor tilts by {_spread_deg(seen, mean):.0f} degrees about its mean; height and tilt of each "
         f"scan from the ground in {followed} of {len(ground)} scans"

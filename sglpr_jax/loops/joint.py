@@ -21,9 +21,9 @@ from sglpr_jax.loops.transforms import inverse, travelled
 
 MIN_OVERLAP = 0.6
 """Minimum overlap of two registered scans of one place. Measurements: docs/decisions/loops.md."""
-LITTLE_OVERLAP = 0.2
+LITTLE_OVERLAP = 0.3
 """Minimum overlap of two registered scans of one place whose pose agrees with that of their images."""
-AGREE, AGREE_M, AGREE_DEG = 5.0, 0.05, 0.3
+AGREE, AGREE_M, AGREE_DEG = 6.0, 0.05, 0.3
 """Maximum distance of both poses in standard deviations of 6 degrees of freedom, and standard deviations (metres,
 degrees) added to those of the poses."""
 FEWEST_AGAINST = 5
@@ -149,7 +149,7 @@ def settled(
 def _registered(
     recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
 ) -> tuple[list[Loop], list[Rejected]]:
-    """Registered loops, and loops whose scans contradict the images. After a stop, the remaining loops are unchanged."""
+    """Registered loops, and loops whose scans contradict the images. After a stop, the others are unchanged."""
     kept, rejected = [], []
     for i, loop in enumerate(loops):
         if should_stop():

@@ -28,7 +28,7 @@ UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M = 1.2, 0.07
 """Standard deviations of height, and of pitch and roll, which images do not show. Each has a value for two scans at one
 position, and an increase per metre between them. They hold for vehicles, in simulated towns and outskirts and on
 KITTI."""
-GROUND_HEIGHT_PER_M, GROUND_TILT_DEG_PER_M = 0.018, 0.07
+GROUND_HEIGHT_PER_M, GROUND_TILT_DEG_PER_M = 0.008, 0.03
 """Increase of these standard deviations per metre between two scans whose mountings were estimated from the scans."""
 DEGENERATE_M = 1.0
 """Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
