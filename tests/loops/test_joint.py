@@ -2,16 +2,20 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import of_scans
 
 from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops import joint
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.joint import accepted, check_odometry, stretches
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.optimization import optimized, trajectory_error
+from sglpr_jax.loops.registration import Registration
 from sglpr_jax.loops.transforms import transform
 
 from .drives import along, drifted, rooms, town, true_loops, wrong_loops
@@ -133,3 +137,19 @@ def test_a_solution_beyond_the_drift_loses_the_loops_that_bend_it_or_is_not_take
     if not right:
         np.testing.assert_array_equal(found.poses, true)
         assert str(found).startswith("trajectory not corrected: 53 loops need more than 4 sigmas of the stated drift")
+
+
+@pytest.mark.parametrize(
+    ("overlap", "off_m", "kept"), [(0.7, 5.0, True), (0.45, 0.1, True), (0.45, 5.0, False), (0.2, 0.1, False)]
+)
+def test_scans_that_overlap_little_are_a_loop_if_both_poses_agree(monkeypatch, overlap, off_m, kept):
+    def registered(query, match, *, initial, initial_covariance):
+        return Registration(initial @ transform(off_m, 0.0, 0.0), 1e-4 * np.eye(6), overlap)
+
+    monkeypatch.setattr(joint, "register", registered)
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
+    loop = Loop(1, 0, np.eye(4), 0.01 * np.eye(6), 0.99)
+    loops, rejected = joint.settled(recording, [loop], None, DetectorConfig(), registered=True)
+    (found,) = loops if kept else [one.loop for one in rejected]
+    assert found.overlap == overlap and found.match_from_query[0, 3] == off_m
+    assert [one.reason for one in rejected] == ([] if kept else ["little overlap"])

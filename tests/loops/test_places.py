@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import with_points
+from scipy.spatial.transform import Rotation
 
 import sglpr_jax
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import rotated
 from sglpr_jax.data.warning import DataWarning
@@ -252,3 +254,18 @@ def test_a_map_of_another_program_is_refused_though_its_checksum_is_right(tmp_pa
     assert len(PlaceMap.load(small_map(tmp_path / "good.safetensors"))) == 3
     with pytest.raises(ValueError, match=rf"town\.safetensors: {message}"):
         PlaceMap.load(small_map(tmp_path / "town.safetensors", **change))
+
+
+def test_a_map_keeps_the_deviations_of_a_sensor_that_tilts(tmp_path):
+    deviations = np.array([[0.03, 0.25], [0.04, 0.5], [np.nan, np.nan]])
+    places = PlaceMap.load(small_map(tmp_path / "hand.safetensors", mounting_deviations=deviations))
+    assert places.mounting(0) == Mounting(1.73, (0.0, 0.0, 1.0), 0.03, 0.25) and places.mounting(2) == Mounting(1.73)
+    places.save(tmp_path / "again.safetensors")
+    np.testing.assert_array_equal(PlaceMap.load(tmp_path / "again.safetensors").mounting_deviations, deviations)
+    ground = np.random.default_rng(0).uniform(-10, 10, (800, 3)) * [1, 1, 0] - [0, 0, 1.6]
+    tilted = (ground @ Rotation.from_euler("y", 9, degrees=True).as_matrix()).astype(np.float32)
+    found = places.query_mounting(tilted)
+    assert found.tilt_deg == pytest.approx(9, abs=0.5) and found.height_m == pytest.approx(1.6, abs=0.05)
+    fixed = PlaceMap.load(small_map(tmp_path / "car.safetensors"))
+    assert not fixed.tilts and fixed.query_mounting(tilted) == fixed.mounting() == Mounting(1.73)
+    np.testing.assert_array_equal(np.isnan(fixed.merged(places).mounting_deviations)[:3], True)

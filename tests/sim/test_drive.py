@@ -7,7 +7,17 @@ from hypothesis import strategies as st
 
 from sglpr_jax.poses import distances
 from sglpr_jax.sim import plan_scan_path, poses_on, read_path
-from sglpr_jax.sim.drive import TILT_DEG, body_tilt, name_of_path, plan_path, speeds, thinned
+from sglpr_jax.sim.drive import (
+    HAND_TILT_DEG,
+    STEPS_HZ,
+    TILT_DEG,
+    body_tilt,
+    hand_motion,
+    name_of_path,
+    plan_path,
+    speeds,
+    thinned,
+)
 from sglpr_jax.sim.ground import Relief, draw_relief, relief_height
 from sglpr_jax.sim.routes import ROLES, plan_walk
 
@@ -146,6 +156,18 @@ def test_the_body_tilts_on_the_spot():
     turn = level[:, :3, :3].transpose(0, 2, 1) @ tilted[:, :3, :3]
     np.testing.assert_allclose(turn[:, 0, 2], tilt[:, 0], atol=1e-3)  # nose down lifts what lies ahead
     np.testing.assert_allclose(turn[:, 2, 1], tilt[:, 1], atol=1e-3)
+
+
+def test_a_hand_tilts_and_bobs_with_its_steps():
+    times = np.linspace(0, 60, 1200)
+    tilt, height_m = hand_motion(np.random.default_rng(0), times)
+    degrees = np.degrees(np.abs(tilt))
+    assert 11 < degrees.max() <= HAND_TILT_DEG and (degrees.max(axis=1) > 5).mean() > 0.5
+    np.testing.assert_allclose(np.quantile(height_m, [0, 0.5, 1]), [1.36, 1.4, 1.44], atol=0.01)
+    sways = np.diff(np.sign(height_m - 1.4)) > 0
+    assert abs(sways.sum() / 60 - STEPS_HZ) < 0.2
+    poses = poses_on(PLAIN, np.zeros((1200, 2)), np.zeros(1200), height_m=height_m, tilt=tilt)
+    np.testing.assert_allclose(poses[:, 2, 3], height_m)
 
 
 def pose_file(path, xy, yaw):
