@@ -63,14 +63,14 @@ def height_deviations(
     odometry: Float[np.ndarray, "n 4 4"],
     *,
     drift: DriftModel = DriftModel(),
-    mounting: Mounting | None = None,
+    mounting: AnyMounting = None,
 ) -> Float[np.ndarray, " k"]:
     """Deviation of each loop from the odometry in height, in standard deviations. The arguments are those of
     `deviations`."""
     query, match = frames_of(loops)
     world = upright_odometry(odometry, mounting)
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
-    by_loop = world[match] @ upright_poses(poses, mounting)
+    by_loop = world[match] @ upright_poses(poses, mounting, query=query, match=match)
     variance, way = np.array([loop.covariance[2, 2] for loop in loops]), travelled(odometry)
     spread = np.sqrt(drift.height_m**2 + (drift.height_per_metre * (way[query] - way[match])) ** 2 + variance)
     return np.abs(by_loop[:, 2, 3] - world[query, 2, 3]) / spread
