@@ -12,7 +12,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.background import Background
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
-from sglpr_jax.loops.drift import position_deviations
+from sglpr_jax.loops.drift import on_other_floor, position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
@@ -231,7 +231,11 @@ class CandidateFinder:
         if not len(rows):
             return Compared([], link)
         rows, found = self._with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded)
-        best = int(np.argmax(found.correlation))
+        fit = found.correlation
+        if pose is not None:  # floors of a building look alike
+            poses, way = self.motion.poses, self.motion.travelled
+            fit = fit - 2 * on_other_floor(poses, way, self.stored.frames[rows], found, self.drift)
+        best = int(np.argmax(fit))
         return Compared([self._candidate(seen, spectra, rows, found, best)], link)
 
     def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting
 from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
+from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.upright import upright_odometry, upright_poses
 
@@ -72,8 +73,36 @@ def height_deviations(
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
     by_loop = world[match] @ upright_poses(poses, mounting, query=query, match=match)
     variance, way = np.array([loop.covariance[2, 2] for loop in loops]), travelled(odometry)
-    spread = np.sqrt(drift.height_m**2 + (drift.height_per_metre * (way[query] - way[match])) ** 2 + variance)
+    spread = np.sqrt(_height_spread(way[query] - way[match], drift) ** 2 + variance)
     return np.abs(by_loop[:, 2, 3] - world[query, 2, 3]) / spread
+
+
+def on_other_floor(
+    poses: Float[np.ndarray, "n 4 4"],
+    way: Float[np.ndarray, " n"],
+    frames: Int[np.ndarray, " k"],
+    found: Peak,
+    drift: DriftModel,
+) -> Bool[np.ndarray, " k"]:
+    """Whether the odometry contradicts the pose of the last frame found at each of some other frames, by height alone.
+
+    Arguments:
+      poses: Gravity-aligned poses by odometry. The world may be tilted.
+      way: Travelled distance at each pose, in metres.
+      frames: The other frames.
+      found: Pose of the last frame in the image of each of them.
+      drift: Drift model.
+    """
+    up = poses[:, :3, 2].mean(axis=0)
+    shifts = np.stack([found.x, found.y, np.zeros_like(found.x)], axis=1)
+    positions = np.einsum("kij,kj->ki", poses[frames, :3, :3], shifts) + poses[frames, :3, 3]
+    apart = (positions - poses[-1, :3, 3]) @ (up / np.linalg.norm(up))
+    return np.abs(apart) > drift.max_deviation * _height_spread(way[-1] - way[frames], drift)
+
+
+def _height_spread(travelled_m: Float[np.ndarray, " k"], drift: DriftModel) -> Float[np.ndarray, " k"]:
+    """Standard deviation of a difference in height after a travelled distance, in metres."""
+    return np.hypot(drift.height_m, drift.height_per_metre * travelled_m)
 
 
 def position_deviations(

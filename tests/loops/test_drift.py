@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.drift import deviations, position_deviations, step_deviations
+from sglpr_jax.loops.drift import deviations, on_other_floor, position_deviations, step_deviations
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.loop_files import read_g2o, write_g2o
+from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
 
@@ -145,3 +146,15 @@ def test_height_by_hand():
     above = Loop(100, 0, odometry[100] @ transform(0.0, 0.0, 0.0), np.diag([0, 0, 0.16, 0, 0, 0]), 1.0)
     above.match_from_query[2, 3] = 2.0
     np.testing.assert_allclose(deviations([above], odometry), 2 / np.sqrt(0.3**2 + 0.3**2 + 0.16), rtol=1e-6)
+
+
+@settings(deadline=None, max_examples=10)
+@given(roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
+def test_another_floor_is_seen_in_a_world_that_is_tilted(roll, pitch):
+    world = np.eye(4)
+    world[:3, :3] = Rotation.from_euler("xy", [roll, pitch]).as_matrix()
+    for rise_m, other in ((0.0, False), (3.5, True)):
+        poses = world @ ramp(3, rise_m)
+        frames = np.array([len(poses) - 101, len(poses) - 201])
+        peaks = Peak(*np.zeros((6, 2)))
+        assert (on_other_floor(poses, np.arange(len(poses)) * 1.0, frames, peaks, DriftModel()) == other).all()
