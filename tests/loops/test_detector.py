@@ -11,7 +11,7 @@ from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, RivalConfig, SequenceConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
-from sglpr_jax.loops.joint import MIN_OVERLAP
+from sglpr_jax.loops.joint import LITTLE_OVERLAP
 from sglpr_jax.loops.pose_search import within_reach
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.seen import Seen, square_image
@@ -75,7 +75,7 @@ def test_a_whole_recording_is_searched_registered_and_stopped(drive, params, str
     assert str(found).startswith(f"{len(found.loops)} loops in 240 of 240 frames of 08")
     for loop in found.loops:
         error = inverse(inverse(poses[loop.match]) @ poses[loop.query]) @ loop.match_from_query
-        assert loop.overlap >= MIN_OVERLAP and np.linalg.norm(error[:3, 3]) < 0.5
+        assert loop.overlap >= LITTLE_OVERLAP and np.linalg.norm(error[:3, 3]) < 0.5
     stopped = find_loops(drive, params, should_stop=lambda: True)
     assert stopped.frames == 0 and stopped.loops == ()
 
