@@ -55,7 +55,7 @@ def main(
     sensors: tuple[str, ...] = ("vlp16", "os1-64", "hdl64e"),
     seeds: tuple[int, ...] = (601, 602),
     lengths_m: tuple[float, ...] = (0.0, 10.0),
-    metres: int = 220,
+    metres: int = 160,
     spacing_m: float = 2.0,
     azimuth_steps: int = 900,
     weights: str = "sglpr",
@@ -159,7 +159,7 @@ def drive(
     every = [len(path.times) // metres for path in paths]
     rows = np.concatenate([start + np.arange(metres) * step for start, step in zip(starts, every, strict=True)])
     lidar = SENSORS[sensor]
-    if lidar.azimuth_steps > azimuth_steps:
+    if lidar.azimuth_steps > azimuth_steps and lidar.pattern == "rings":
         lidar = dataclasses.replace(lidar, azimuth_steps=azimuth_steps)
     recording = drive_through(
         build_world((seed, 7), whole.xy, whole.times),
