@@ -1,7 +1,8 @@
 """Submaps: the scans of the last metres of a drive, laid together in the frame of the newest scan.
 
 A sparse or narrow sensor sees a place better in several scans than in one. `SubmapBuilder` takes a stream of scans, and
-`submaps` returns a recording whose scans are submaps.
+`submaps` returns a recording whose scans are submaps. A submap holds the nearest point of each direction, as a scan
+does, because the weights are trained on scans (docs/decisions/data.md).
 """
 
 import dataclasses
@@ -13,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int, Int32, UInt64
 
 from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.record import Record
@@ -28,13 +29,19 @@ KEYFRAME_DEG = 20.0
 TURN = 18
 """Number of further keyframes of a sensor that turns in place: a full turn."""
 VOXEL_M = 0.1
-"""Edge of the voxels of a submap, in metres. Each voxel holds one point, of the newest scan in it."""
+"""Edge of the voxels of a stored scan, in metres. Each voxel holds one point."""
+DIRECTION_DEG = 0.4
+"""Edge of a direction of a submap, in degrees of azimuth and elevation. Each direction holds its nearest point."""
+AZIMUTHS = 900
+"""Number of directions in a revolution."""
+INDEX_BITS = 22
+"""Bits of the number of a point in a sorted key. A submap has at most 4 million points before it is thinned."""
 HALF = 2**13
 """Offset of voxel numbers, which makes them positive. Points more than `HALF` voxels from the sensor are dropped."""
 SUBMAPS = "submaps"
 """Name of the read option that describes the submaps of a recording."""
 
-Cloud = tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]
+Cloud = tuple[Float32[np.ndarray, "_ 3"], Int32[np.ndarray, " _"] | None]
 """Points and their labels, or None without labels."""
 
 
@@ -203,14 +210,27 @@ def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -
 
 
 def _together(clouds: Sequence[Cloud], poses: Sequence[Float[np.ndarray, "4 4"]]) -> Cloud:
-    """One cloud in the frame of the first one, with one point per voxel."""
+    """One cloud in the frame of the first one, as its sensor would see it."""
     turned, position = poses[0][:3, :3], poses[0][:3, 3]
     moved = [
         (points @ (turned.T @ pose[:3, :3]).T + turned.T @ (pose[:3, 3] - position)).astype(np.float32)
         for (points, _), pose in zip(clouds[1:], poses[1:], strict=True)
     ]
     labels = [labels for _, labels in clouds if labels is not None]
-    return _thinned((np.concatenate([clouds[0][0], *moved]), np.concatenate(labels) if labels else None))
+    return _visible((np.concatenate([clouds[0][0], *moved]), np.concatenate(labels) if labels else None))
+
+
+def _visible(cloud: Cloud) -> Cloud:
+    """The nearest point of each direction. A scan also shows nothing behind it, and weights are trained on scans."""
+    points, labels = cloud
+    x, y, z = points.T
+    distance = np.sqrt(x * x + y * y + z * z)
+    scale = np.float32(AZIMUTHS / (2 * np.pi))
+    azimuth = np.floor(np.arctan2(y, x) * scale).astype(np.int64) + AZIMUTHS
+    elevation = np.floor(np.arctan2(z, np.hypot(x, y)) * scale).astype(np.int64) + AZIMUTHS
+    direction = (elevation * 2 * AZIMUTHS + azimuth).astype(np.uint64)
+    kept = _first_of(direction << np.uint64(20) | (distance * 500).clip(max=2**20 - 1).astype(np.uint64), shift=20)
+    return points[kept], None if labels is None else labels[kept]
 
 
 def _thinned(cloud: Cloud) -> Cloud:
@@ -219,8 +239,16 @@ def _thinned(cloud: Cloud) -> Cloud:
     with np.errstate(over="ignore", invalid="ignore"):
         inside = np.flatnonzero((np.abs(points) < (HALF - 1) * VOXEL_M).all(axis=1))  # false for NaN
     x, y, z = (np.floor(points[inside].T / np.float32(VOXEL_M)) + HALF).astype(np.uint64)
-    voxel = (z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x  # 42 bits
-    order = np.sort(voxel << np.uint64(22) | np.arange(len(inside), dtype=np.uint64))  # faster than np.unique
-    first = np.diff(order >> np.uint64(22), prepend=np.uint64(2**64 - 1)) != 0
-    kept = inside[np.sort(order[first] & np.uint64(2**22 - 1)).astype(np.int64)]
+    kept = inside[_first_of((z * np.uint64(2 * HALF) + y) * np.uint64(2 * HALF) + x, shift=0)]
     return points[kept], None if labels is None else labels[kept]
+
+
+def _first_of(keys: UInt64[np.ndarray, " n"], *, shift: int) -> Int[np.ndarray, " m"]:
+    """Row of the smallest of the keys that are equal but for their last `shift` bits, in the order of the rows.
+
+    Sorting keys that contain the row is ten times as fast as np.unique. Keys have at most 42 bits.
+    """
+    keys = keys[: 2**INDEX_BITS]  # the newest scans come first
+    order = np.sort(keys << np.uint64(INDEX_BITS) | np.arange(len(keys), dtype=np.uint64))
+    first = np.diff(order >> np.uint64(INDEX_BITS + shift), prepend=np.uint64(2**64 - 1)) != 0
+    return np.sort(order[first] & np.uint64(2**INDEX_BITS - 1)).astype(np.int64)
