@@ -166,7 +166,9 @@ def drifted(poses: Float[np.ndarray, "n 4 4"], *, seed: int, turn_deg: float = 0
     steps = inverse(poses[:-1]) @ poses[1:]
     metres = np.linalg.norm(steps[:, :3, 3], axis=1)
     length = 1 + 0.01 * (rng.choice([-1, 1]) + rng.normal(size=len(steps)))
-    turn = np.radians(turn_deg) * (rng.choice([-1, 1]) * metres / 100 + rng.normal(size=len(steps)) * np.sqrt(metres / 100))
+    turn = np.radians(turn_deg) * (
+        rng.choice([-1, 1]) * metres / 100 + rng.normal(size=len(steps)) * np.sqrt(metres / 100)
+    )
     found = [np.eye(4)]
     for step, scale, angle in zip(steps, length, turn, strict=True):
         step = step.copy()

@@ -8,7 +8,6 @@ in the folder `--out`; delete it after a change of the simulator.
 """
 
 import dataclasses
-import itertools
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -143,9 +142,7 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
     return Drive(dataclasses.replace(recording, read=read, label_paths=()), poses, passes)
 
 
-def drive(
-    sensor: str, seed: int, metres: int, azimuth_steps: int
-) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:
+def drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:
     """The simulated drive, and the number of the pass of each scan."""
     line, left = street(seed, metres)
     rng, paths, clock = np.random.default_rng((seed, 6)), [], 0.0

@@ -105,7 +105,7 @@ def submaps(
 
     Arguments:
       recording: Recording of scans.
-      world_from_lidar: Pose of the LiDAR at each scan, from odometry or a map. Drift within `length_m` blurs the submap.
+      world_from_lidar: Pose of the LiDAR at each scan, from odometry or a map. Drift within `length_m` blurs it.
       length_m: Travelled distance that a submap covers, in metres. 0 returns the recording unchanged.
       keyframe_m: Minimum distance between the scans of a submap, in metres.
 
@@ -127,7 +127,9 @@ def submaps(
             f"sequence {recording.name}: expected a pose (4, 4) for each of {len(recording)} scans, found an array of "
             f"shape {poses.shape}"
         )
-    read = _SubmapReader(recording, _checked(poses), [window.add(pose) for pose in poses], f"{length_m:g} {keyframe_m:g}")
+    read = _SubmapReader(
+        recording, _checked(poses), [window.add(pose) for pose in poses], f"{length_m:g} {keyframe_m:g}"
+    )
     said = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
     return dataclasses.replace(recording, read=read, on_disk=False, found=(*recording.found, said))
 

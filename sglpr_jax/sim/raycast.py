@@ -56,8 +56,8 @@ class Chance(NamedTuple):
 
 
 def sector_count(azimuth_steps: int) -> int:
-    """Number of sectors in a scan. The last one may extend beyond the last azimuth, and in a revolution overlap the first
-    one."""
+    """Number of sectors in a scan. The last one may extend beyond the last azimuth. In a revolution it may overlap the
+    first one."""
     return -(-azimuth_steps // COLUMNS)
 
 

@@ -18,9 +18,7 @@ STEPS = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
 """Steps of the sequence from one azimuth, laser and scan to the next: irrational numbers without a common multiple."""
 
 
-def scattered(
-    elevations_deg: Sequence[float], azimuths: int, *, time: float
-) -> Float[np.ndarray, "lasers {azimuths}"]:
+def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) -> Float[np.ndarray, "lasers {azimuths}"]:
     """Elevation of each ray of the scan at `time`, in degrees.
 
     Arguments:
