@@ -64,8 +64,8 @@ class SubmapOptions:
     """Submaps in place of single scans."""
 
     submap_m: NotNegative = 0.0
-    """Travelled distance of a submap, in metres. Its scans are laid together in the frame of the newest one, which needs
-    poses with rotations. 0 uses single scans."""
+    """Travelled distance of a submap, in metres. 0 uses single scans. The scans of a submap are laid together in the
+    frame of the newest one, which needs poses with rotations."""
     submap_keyframe_m: Positive = 1.0
     """Minimum distance between the scans of a submap, in metres."""
 
