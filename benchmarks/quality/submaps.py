@@ -93,13 +93,17 @@ def row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: fl
         for i in rows[: len(rows) // 4]:
             recording.points(i)
         seconds += (time.perf_counter() - begin) / (len(rows) // 4) / len(drives)
-        file = sglpr_jax.embed(params, only(recording, rows))
-        described.append((file.descriptors, drive.poses[rows, :3, 3] + [1e5 * town, 0, 0], drive.passes[rows]))
+        file = sglpr_jax.embed(params, only(recording, rows), on_bad_scan=lambda scan, error: None)
+        descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # of a scan that shows nothing
+        descriptors[np.isin([recording.ids[i] for i in rows], file.ids)] = file.descriptors
+        described.append((descriptors, drive.poses[rows, :3, 3] + [1e5 * town, 0, 0], drive.passes[rows]))
     descriptors, positions, passes = (np.concatenate(values) for values in zip(*described, strict=True))
-    mapped = passes == 0
+    seen = np.isfinite(descriptors).all(axis=1)
+    descriptors = np.where(seen[:, None], descriptors, 0.0)
+    mapped = (passes == 0) & seen
     nearest = distances(descriptors, descriptors[mapped]).argmin(axis=1)
     apart = distances(positions, positions[mapped])
-    right = apart[np.arange(len(apart)), nearest] <= RIGHT_M
+    right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & seen
     answerable = apart.min(axis=1) <= RIGHT_M
     recalls = [right[answerable & (passes == number)].mean() for number in range(1, len(PASSES))]
     return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} | {1e3 * seconds:.0f} |"
