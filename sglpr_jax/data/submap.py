@@ -1,6 +1,6 @@
 """Submaps: the scans of the last metres of a drive, laid together in the frame of the newest scan.
 
-A sparse or narrow sensor sees a place better in several scans than in one. `SubmapBuilder` takes a stream of scans, and
+A narrow sensor sees more of a place in several scans than in one. `SubmapBuilder` takes a stream of scans, and
 `submaps` returns a recording whose scans are submaps. A submap holds the nearest point of each direction, as a scan
 does, because the weights are trained on scans (docs/decisions/data.md).
 """
