@@ -216,7 +216,7 @@ def test_a_pattern_that_does_not_repeat_fills_its_field_of_view():
     cells = [np.unique(np.floor(one).astype(int) * 360 + np.arange(1000) * 360 // 1000) for one in (scans[0], scans)]
     assert len(cells[0]) < 0.85 * 59 * 360 and len(cells[1]) > 0.98 * 59 * 360
     hidden = outside_round(SENSORS["avia"].elevations_deg, np.linspace(-35.2, 35.2, 480))
-    assert hidden.mean() == pytest.approx(1 - np.pi / 4, abs=0.01) and not hidden[32, 240]
+    assert hidden.mean() == pytest.approx(1 - np.pi / 4, abs=0.03) and not hidden[32, 240]
 
 
 def test_a_sector_sees_what_a_revolution_sees_there():
