@@ -160,13 +160,15 @@ class Speed:
             print(f"{name}: {1e3 * (time.process_time() - start) / self.repeats:.1f} ms of processor time a scan")
 
 
-def drifted(poses: Float[np.ndarray, "n 4 4"], *, seed: int) -> Float[np.ndarray, "n 4 4"]:
-    """Odometry of a drive: 1 % too long or short, turned by .5 degrees every 100 m, both with as much noise again."""
+def drifted(poses: Float[np.ndarray, "n 4 4"], *, seed: int, turn_deg: float = 0.5) -> Float[np.ndarray, "n 4 4"]:
+    """Odometry of a drive: 1 % too long or short, turned by `turn_deg` every 100 m, both with as much noise again."""
     rng = np.random.default_rng(seed)
     steps = inverse(poses[:-1]) @ poses[1:]
     metres = np.linalg.norm(steps[:, :3, 3], axis=1)
     length = 1 + 0.01 * (rng.choice([-1, 1]) + rng.normal(size=len(steps)))
-    turn = np.radians(0.5) * (rng.choice([-1, 1]) * metres / 100 + rng.normal(size=len(steps)) * np.sqrt(metres / 100))
+    turn = np.radians(turn_deg) * (
+        rng.choice([-1, 1]) * metres / 100 + rng.normal(size=len(steps)) * np.sqrt(metres / 100)
+    )
     found = [np.eye(4)]
     for step, scale, angle in zip(steps, length, turn, strict=True):
         step = step.copy()

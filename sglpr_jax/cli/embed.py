@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.recording import PosedRecordingOptions, report_bad_scan
+from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import NETWORK, MethodName
@@ -19,6 +19,7 @@ class EmbedCommand:
       bin/embed --weights runs/sglpr-08 --data KITTI --seq 08 --out 08.npz
       bin/embed --data my_scans/ --out mine.npz --skip-bad
       bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
+      bin/embed --data my_scans/ --submap-m 10 --odometry odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
     """
 
@@ -32,6 +33,7 @@ class EmbedCommand:
     method: MethodName = "sglpr"
     """The network, or a handcrafted method, which needs no weights. Some methods need points; ssc also needs labels."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
+    submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
     rotate: bool = False
     """Rotate every scan about z by its own random angle."""
     seed: CountOrNone = 0
@@ -57,7 +59,7 @@ def embed_recording(command: EmbedCommand) -> Path:
         raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
     check_writable(command.out)
     params = None if command.weights is None else load(command.weights)
-    recording = command.source.open(command.data)
+    recording = command.submap.open(command.source, command.data)
     method = method_named(command.method, params, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         file = embed(

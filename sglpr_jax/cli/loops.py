@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.recording import PosedRecordingOptions, open_with_poses, report_bad_scan
+from sglpr_jax.cli.recording import PosedRecordingOptions, SubmapOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.choices import (
@@ -51,6 +51,7 @@ class LoopsCommand:
       bin/loops drive.mcap --odometry drive.mcap --out found
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found
       bin/loops my_scans --odometry odometry.tum --optimize --out found
+      bin/loops my_scans --odometry odometry.tum --submap-m 10 --out found
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
@@ -74,6 +75,7 @@ class LoopsCommand:
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
+    submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
     register: bool = True
     """Register the full scans of loops in 6 degrees of freedom and check their overlap (extra slam). Images are not
     registered."""
@@ -160,6 +162,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         recording, odometry = source.open(command.recording), None
     else:
         recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
+    recording = command.submap.submaps(recording, odometry)
     register = command.register and can_register(recording)
     if command.register and not register:
         print(f"{recording.name}: loops are not registered, {_why_not(recording)}", file=sys.stderr)

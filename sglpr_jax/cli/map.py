@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sglpr_jax.cli.recording import RecordingOptions, open_with_poses, report_bad_scan
+from sglpr_jax.cli.recording import RecordingOptions, SubmapOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
@@ -48,6 +48,7 @@ class MapCommand:
     weights: str = DEFAULT_WEIGHTS
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
+    submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
 
@@ -76,6 +77,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     recording, poses = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
+    recording = command.submap.submaps(recording, poses)
     unfinished = command.out.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         places, scans, skipped = map_recording(

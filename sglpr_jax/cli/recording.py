@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
+from sglpr_jax.fields import NotNegative, Positive
+from sglpr_jax.loops.choices import OdometryFormat
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
     from sglpr_jax.data import Recording
-    from sglpr_jax.loops.choices import OdometryFormat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +59,56 @@ class PosedRecordingOptions(RecordingOptions):
     """File of timestamps, if no times.txt is beside the scans: one number a line, in `--time-unit`."""
 
 
+@dataclasses.dataclass(frozen=True)
+class SubmapOptions:
+    """Submaps in place of single scans."""
+
+    submap_m: NotNegative = 0.0
+    """Travelled distance of a submap, in metres. 0 uses single scans. The scans of a submap are laid together in the
+    frame of the newest one, which needs poses with rotations."""
+    submap_keyframe_m: Positive = 1.0
+    """Minimum distance between the scans of a submap, in metres."""
+
+    def submaps(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
+        """Return the recording with submaps by the poses, or else by the poses of its bag. Raises ValueError without
+        poses."""
+        if self.submap_m == 0:
+            return recording
+        from sglpr_jax.data.submap import submaps  # slow import, not needed for --help
+
+        poses = recording.world_from_lidar if poses is None else poses
+        if poses is None:
+            raise ValueError(
+                f"{recording.name}: expected poses with rotations for --submap-m, found none; state a file with "
+                "--odometry"
+            )
+        found = submaps(recording, poses, length_m=self.submap_m, keyframe_m=self.submap_keyframe_m)
+        print(found.found[-1], file=sys.stderr)
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class OdometrySubmapOptions(SubmapOptions):
+    """Submaps in place of single scans, and the poses that they are built with."""
+
+    odometry: Path | None = None
+    """Poses for --submap-m: file with a pose for each scan, or tum file with poses at other times, which are
+    interpolated. By default, the poses of a bag are used."""
+    odometry_format: OdometryFormat = "auto"
+    """Format of --odometry. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
+    recognises tum and .g2o."""
+
+    def open(self, source: RecordingOptions, root: Path) -> "Recording":
+        """Open a recording, with submaps if these are selected. Scans without a pose are then removed."""
+        if self.odometry is not None and self.submap_m == 0:
+            raise ValueError(f"{self.odometry}: expected --submap-m with --odometry, found 0")
+        if self.odometry is None or self.submap_m == 0:
+            return self.submaps(source.open(root), None)
+        return self.submaps(*open_with_poses(source, root, self.odometry, format=self.odometry_format))
+
+
 def open_with_poses(
-    source: RecordingOptions, root: Path, path: Path, *, format: "OdometryFormat"
+    source: RecordingOptions, root: Path, path: Path, *, format: OdometryFormat
 ) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']]":
     """Open a recording, with a pose for each scan from the file at `path`, or from the bag if `path` is the bag itself.
 

@@ -9,7 +9,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from sglpr_jax.cli.recording import RecordingOptions
+from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import ScanFormat, SensorHeight
 from sglpr_jax.fields import CountOrNone
@@ -31,6 +31,7 @@ class RelocalizeCommand:
       bin/relocalize my_scans/000003.bin --map town.safetensors
       bin/relocalize my_scans/000003.bin --map town.safetensors --out pose.json
       bin/relocalize drive.mcap --frame 12 --map town.safetensors
+      bin/relocalize drive.mcap --frame 12 --submap-m 10 --map town.safetensors
     """
 
     scan: Annotated[Path, tyro.conf.Positional]
@@ -54,6 +55,7 @@ class RelocalizeCommand:
     sensor_height: SensorHeight = "auto"
     """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scan.
     `auto` takes the mounting of the map's last place or, with --frame, that of the recording."""
+    submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
 
 
 def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
@@ -66,6 +68,8 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
 
     if command.out is not None:
         check_writable(command.out)
+    if command.frame is None and command.submap.submap_m:
+        raise ValueError(f"{command.scan}: expected --frame of a recording with --submap-m, found a single scan")
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     name = command.scan.name
@@ -73,7 +77,8 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
         record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)
     else:
         options = RecordingOptions(command.seq, format=command.format, sensor_height=command.sensor_height)
-        record, name = query_of(options.open(command.scan), command.frame), f"frame {command.frame} of {name}"
+        recording = command.submap.open(options, command.scan)
+        record, name = query_of(recording, command.frame), f"frame {command.frame} of {name}"
     found = places.relocate(params, record, candidates=command.candidates)
     if not found:
         raise ValueError(f"{name}: expected a scan that shows a place, found an almost empty one")

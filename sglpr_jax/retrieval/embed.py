@@ -11,6 +11,7 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
+from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
@@ -203,7 +204,8 @@ def _file(
     check_readable(recording, len(rows))
     sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
     skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
-    config = {"data": recording.name, **sensor, **method.about, "rotation_seed": rotation_seed}
+    submaps = {name: value for name, value in recording.read_options.items() if name == SUBMAPS}
+    config = {"data": recording.name, **sensor, **submaps, **method.about, "rotation_seed": rotation_seed}
     return DescriptorFile(
         sequence=recording.name,
         ids=tuple(recording.ids[row] for row in rows),

@@ -148,13 +148,16 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    """Stored settings with the current field names. Older datasets without a scenery have `TOWN`."""
+    """Stored settings with the current field names. Older datasets have `TOWN`, and sensors that repeat their rings."""
     settings = read_json(path)
     scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
     if not isinstance(scenery, dict):
         raise ValueError(f"{path}: expected the settings of a simulated dataset, found {settings!r:.60}")
     scenery = {OLD_NAMES.get(name, name): value for name, value in scenery.items()}
-    return {**settings, "scenery": json.loads(json.dumps(scenery))}
+    sensor = settings.get("sensor")
+    rings = {name: getattr(Sensor, name) for name in ("azimuths_deg", "pattern")}
+    sensor = {**rings, **sensor} if isinstance(sensor, dict) else sensor
+    return {**settings, "sensor": json.loads(json.dumps(sensor)), "scenery": json.loads(json.dumps(scenery))}
 
 
 def _write_drive(

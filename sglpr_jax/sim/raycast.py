@@ -56,7 +56,8 @@ class Chance(NamedTuple):
 
 
 def sector_count(azimuth_steps: int) -> int:
-    """Number of sectors in a revolution. The last one may overlap the first one."""
+    """Number of sectors in a scan. The last one may extend beyond the last azimuth. In a revolution it may overlap the
+    first one."""
     return -(-azimuth_steps // COLUMNS)
 
 
@@ -66,12 +67,17 @@ def find_candidates(
     *,
     time: float,
     azimuth_steps: int,
+    azimuths_deg: tuple[float, float] = (0.0, 360.0),
     reach_m: float,
     slots: tuple[int, ...] = SLOTS,
 ) -> tuple[Candidates, ...]:
-    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`."""
-    step = 2 * np.pi / azimuth_steps
-    middle = (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
+    """Lists the boxes, cylinders and ellipsoids within `reach_m` that the rays of each sector may hit at `time`.
+
+    The azimuth steps divide the azimuths from the first to the second of `azimuths_deg`.
+    """
+    first, last = np.radians(azimuths_deg)
+    step = (last - first) / azimuth_steps
+    middle = first + (np.arange(sector_count(azimuth_steps)) * COLUMNS + (COLUMNS - 1) / 2) * step
     half_width = (COLUMNS - 1) / 2 * step + _MARGIN
     found = []
     for shapes, count in zip(scene, slots, strict=True):

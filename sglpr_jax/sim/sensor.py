@@ -1,4 +1,4 @@
-"""Simulation of a spinning LiDAR: one revolution of its lasers in a world."""
+"""Simulation of a LiDAR: one scan of a world, a revolution or a sector."""
 
 import dataclasses
 import functools
@@ -14,6 +14,7 @@ from sglpr_jax.poses import are_rotations
 from sglpr_jax.sim.ground_cast import GroundView, ground_view, meet_ground
 from sglpr_jax.sim.raycast import COLUMNS, Candidates, Chance, find_candidates, nearest_hit, sector_count
 from sglpr_jax.sim.returns import Surface, echo_returns, mix_edges, nearer, reflectivity, surface_of_shapes
+from sglpr_jax.sim.scattered import ScanPattern, outside_round, scattered
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 from sglpr_jax.sim.world import World
 
@@ -25,6 +26,16 @@ NCLT_HEIGHT_M = 1.03
 VLP16_DEG = tuple(np.linspace(15.0, -15.0, 16).tolist())
 XT32_DEG = tuple(np.linspace(15.0, -16.0, 32).tolist())
 OS1_64_DEG = tuple(np.linspace(22.5, -22.5, 64).tolist())
+OS0_32_DEG = tuple(np.linspace(45.0, -45.0, 32).tolist())
+M1_DEG = tuple(np.linspace(12.5, -12.5, 125).tolist())
+
+
+def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
+    """Middle of each of `count` equal bands of elevation, from the top, in degrees."""
+    edges = np.linspace(last_deg, first_deg, count + 1)
+    return tuple(((edges[:-1] + edges[1:]) / 2).tolist())
+
+
 TURN_S = 0.1
 LASERS_AT_A_TIME = 16
 """Maximum number of lasers in a block. The block size is its greatest common divisor with the number of lasers."""
@@ -32,10 +43,15 @@ LASERS_AT_A_TIME = 16
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """Spinning LiDAR. The default is KITTI's Velodyne HDL-64E without occlusion by the vehicle."""
+    """LiDAR. The default is KITTI's Velodyne HDL-64E without occlusion by the vehicle."""
 
     elevations_deg: tuple[float, ...] = HDL64E_DEG
     azimuth_steps: int = 1800
+    azimuths_deg: tuple[float, float] = (0.0, 360.0)
+    """First and last azimuth of a scan, counter-clockwise, in degrees."""
+    pattern: ScanPattern = "rings"
+    """"rings" repeats the elevations in every scan. "scattered" gives every ray another elevation in the band around
+    its laser's elevation, differently in every scan. "scattered-round" also has a round field of view."""
     height_m: float = 1.73
     """Height above the road, in metres."""
     min_range_m: float = 2.5
@@ -62,6 +78,8 @@ class Sensor:
                 "a sensor needs at least one elevation and one azimuth step, found "
                 f"{len(self.elevations_deg)} and {self.azimuth_steps}"
             )
+        if not 0 < self.azimuths_deg[1] - self.azimuths_deg[0] <= 360:
+            raise ValueError(f"expected azimuths_deg over at most 360 degrees, found {self.azimuths_deg}")
         if not 0 <= self.min_range_m < self.max_range_m:
             raise ValueError(f"expected 0 <= min_range_m < max_range_m, found {self.min_range_m}, {self.max_range_m}")
 
@@ -83,6 +101,21 @@ SENSORS = {
     "vlp16": Sensor(VLP16_DEG, min_range_m=0.5, height_m=1.8, range_noise_m=0.03),
     "xt32": Sensor(XT32_DEG, azimuth_steps=2000, min_range_m=0.5, height_m=0.8, range_noise_m=0.01),
     "os1-64": Sensor(OS1_64_DEG, azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
+    "os0-32": Sensor(OS0_32_DEG, azimuth_steps=1024, min_range_m=0.5, height_m=1.2),
+    # RoboSense M1: 120 x 25 degrees in steps of .2 degrees.
+    "m1": Sensor(M1_DEG, azimuth_steps=600, azimuths_deg=(-60.0, 60.0), min_range_m=0.5),
+    # 200,000 points a second over 360 x 59 degrees, 20,000 in a scan.
+    "mid360": Sensor(
+        _bands(-7.0, 52.0, 20), azimuth_steps=1000, pattern="scattered", min_range_m=0.1, max_range_m=70.0, height_m=1.2
+    ),
+    # 240,000 points a second over 70.4 x 77.2 degrees, 24,000 in a scan.
+    "avia": Sensor(
+        _bands(-38.6, 38.6, 64),
+        azimuth_steps=480,
+        azimuths_deg=(-35.2, 35.2),
+        pattern="scattered-round",
+        min_range_m=1.0,
+    ),
 }
 """Real sensors by their names on the command line."""
 
@@ -97,6 +130,7 @@ class View(NamedTuple):
     ground: GroundView
     rotation: AnyArray  # (3, 3) rotation of world_from_lidar
     velocity: AnyArray  # (3,) velocity of the sensor in its own frame, m/s
+    rays: Vectors | None = None  # unit vectors of the rays; None if they are the same in every scan
 
 
 class Turn(NamedTuple):
@@ -154,11 +188,17 @@ def view_of(
     if sensor.motion_distortion and velocity is None:
         raise ValueError("a sensor with motion_distortion needs the velocity of the sensor, found None")
     candidates = find_candidates(
-        world.scene, world_from_lidar, time=time, azimuth_steps=sensor.azimuth_steps, reach_m=sensor.max_range_m
+        world.scene,
+        world_from_lidar,
+        time=time,
+        azimuth_steps=sensor.azimuth_steps,
+        azimuths_deg=sensor.azimuths_deg,
+        reach_m=sensor.max_range_m,
     )
     ground = ground_view(world.ground, world_from_lidar[:3, 3], reach_m=sensor.max_range_m)
     velocity = np.zeros(3) if velocity is None else velocity
-    return View(candidates, ground, rotation.astype(np.float32), velocity.astype(np.float32))
+    rays = None if sensor.pattern == "rings" else _rays(sensor, time=time)
+    return View(candidates, ground, rotation.astype(np.float32), velocity.astype(np.float32), rays)
 
 
 @functools.partial(jax.jit, static_argnames="sensor")
@@ -171,7 +211,7 @@ def cast_turn(key: Array, view: View, *, sensor: Sensor) -> Turn:
     surface = first_surface(key_surface, view, sensor=sensor)
     reach, returned = _echoes(key_echoes, surface, sensor)
     steps = sensor.azimuth_steps
-    points = [axis[:, :steps] * reach for axis in _rays(sensor)]
+    points = [axis[:, :steps] * reach for axis in _rays_of(view, sensor)]
     if sensor.motion_distortion:
         since_middle = TURN_S * (jnp.arange(steps, dtype=jnp.float32) / steps - 0.5)
         points = [axis - view.velocity[i] * since_middle[None, :] for i, axis in enumerate(points)]
@@ -192,7 +232,7 @@ def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
 
     Lasers are processed in blocks. Low lasers hit the ground in front of most shapes, so their blocks finish early.
     """
-    rays = _rays(sensor)
+    rays = _rays_of(view, sensor)
     lasers, azimuths = rays.x.shape
     key_depth, key_pores = jax.random.split(key)
     chance = Chance(jax.random.exponential(key_depth, rays.x.shape), jax.random.bits(key_pores, rays.x.shape))
@@ -211,11 +251,17 @@ def first_surface(key: Array, view: View, *, sensor: Sensor) -> Surface:
     return jax.tree.map(lambda values: values.reshape(lasers, azimuths)[:, : sensor.azimuth_steps], surface)
 
 
-def _rays(sensor: Sensor) -> Vectors:
+def _rays_of(view: View, sensor: Sensor) -> Vectors:
+    return _rays(sensor) if view.rays is None else view.rays
+
+
+def _rays(sensor: Sensor, *, time: float = 0.0) -> Vectors:
     """Unit vectors of the rays in the LiDAR frame, as arrays (lasers, azimuths). The azimuths fill whole sectors."""
     columns = sector_count(sensor.azimuth_steps) * COLUMNS
-    azimuth = (np.arange(columns) * (2 * np.pi / sensor.azimuth_steps))[None, :]
-    elevation = np.radians(sensor.elevations_deg)[:, None]
+    azimuth = _azimuths(sensor, columns)[None, :]
+    repeats = sensor.pattern == "rings"
+    degrees = np.array(sensor.elevations_deg)[:, None]
+    elevation = np.radians(degrees if repeats else scattered(sensor.elevations_deg, columns, time=time))
     level = np.cos(elevation)
     axes = (
         level * np.cos(azimuth),
@@ -223,6 +269,12 @@ def _rays(sensor: Sensor) -> Vectors:
         np.broadcast_to(np.sin(elevation), (len(elevation), columns)),
     )
     return Vectors(*(jnp.asarray(axis, jnp.float32) for axis in axes))
+
+
+def _azimuths(sensor: Sensor, columns: int) -> Float[np.ndarray, " {columns}"]:
+    """The first azimuths of a scan, in radians."""
+    first, last = np.radians(sensor.azimuths_deg)
+    return first + np.arange(columns) * ((last - first) / sensor.azimuth_steps)
 
 
 def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]:
@@ -239,10 +291,13 @@ def _echoes(key: Array, surface: Surface, sensor: Sensor) -> tuple[Array, Array]
 
 
 def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
-    """Whether the vehicle occludes each ray."""
-    azimuth = np.arange(sensor.azimuth_steps) * (360 / sensor.azimuth_steps)
+    """Whether the vehicle occludes each ray, or the ray is outside a round field of view."""
+    first, last = sensor.azimuths_deg
+    azimuth = first + np.arange(sensor.azimuth_steps) * ((last - first) / sensor.azimuth_steps)
     elevation = np.array(sensor.elevations_deg)[:, None]
     hidden = np.zeros((len(elevation), len(azimuth)), bool)
+    if sensor.pattern == "scattered-round":
+        hidden |= outside_round(sensor.elevations_deg, azimuth)
     for first, last, below in sensor.shadows_deg:
         hidden |= ((azimuth - first) % 360 <= last - first) & (elevation < below)
     return hidden

@@ -10,6 +10,7 @@ from scenes import FLAT, HILLS, NOTHING, in_world, pose, shapes, striped_ground
 
 from sglpr_jax.sim.ground import Relief, relief_height
 from sglpr_jax.sim.raw_ids import BUILDING, POLE, ROAD, TERRAIN, VEGETATION
+from sglpr_jax.sim.scattered import outside_round, scattered
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor, cast_turn, scan, view_of
 from sglpr_jax.sim.shapes import Scene
 from sglpr_jax.sim.world import World
@@ -205,3 +206,33 @@ def test_a_sensor_without_rays_is_refused(bad):
 def test_a_sensor_whose_ranges_leave_nothing_is_refused():
     with pytest.raises(ValueError, match="min_range_m < max_range_m"):
         Sensor(min_range_m=80.0, max_range_m=80.0)
+
+
+def test_a_pattern_that_does_not_repeat_fills_its_field_of_view():
+    sensor = SENSORS["mid360"]
+    scans = [scattered(sensor.elevations_deg, sensor.azimuth_steps, time=0.1 * i) for i in range(30)]
+    assert -7 <= np.min(scans) < -6.9 and 51.9 < np.max(scans) <= 52
+    assert np.abs(np.diff(np.sort(np.array(scans)[:, 3, 5]))).max() < 0.4  # of a band of 2.95 degrees
+    cells = [np.unique(np.floor(one).astype(int) * 360 + np.arange(1000) * 360 // 1000) for one in (scans[0], scans)]
+    assert len(cells[0]) < 0.85 * 59 * 360 and len(cells[1]) > 0.98 * 59 * 360
+    hidden = outside_round(SENSORS["avia"].elevations_deg, np.linspace(-35.2, 35.2, 480))
+    assert hidden.mean() == pytest.approx(1 - np.pi / 4, abs=0.03) and not hidden[32, 240]
+
+
+def test_a_sector_sees_what_a_revolution_sees_there():
+    world, where = walled_world(POLE_AHEAD), pose(z=1.73)
+    whole, _ = scan(KEY, world, where, sensor=EXACT)
+    half = dataclasses.replace(EXACT, azimuth_steps=30, azimuths_deg=(-90.0, 90.0))
+    found, _ = scan(KEY, world, where, sensor=half)
+    apart = np.linalg.norm(found[:, None, :3] - whole[None, :, :3], axis=2).min(axis=1)
+    assert len(found) > 100 and np.all(found[:, 0] > -1e-3) and np.quantile(apart, 0.95) < 1e-3
+    other = dataclasses.replace(half, elevations_deg=(-2.0, -6.0, -10.0, -14.0), pattern="scattered")
+    first, second = (scan(KEY, world, where, sensor=other, time=time)[0] for time in (0.0, 0.1))
+    elevations = [np.degrees(np.arcsin(one[:, 2] / np.linalg.norm(one[:, :3], axis=1))) for one in (first, second)]
+    assert all(one.min() >= -16.01 and one.max() <= 0.01 for one in elevations)
+    assert len(np.intersect1d(*(np.round(one, 3) for one in elevations))) < 20
+
+
+def test_azimuths_beyond_a_revolution_are_refused():
+    with pytest.raises(ValueError, match="expected azimuths_deg over at most 360 degrees, found"):
+        Sensor(azimuths_deg=(0.0, 361.0))

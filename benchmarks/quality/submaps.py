@@ -1,0 +1,191 @@
+"""Recall@1 of single scans and of submaps: one street driven five times, in both directions and a lane aside.
+
+    python -m benchmarks.quality.submaps --sensors vlp16 hdl64e --seeds 601 602 --out build/submaps
+
+The first pass is the map. A query is a scan of another pass. It is right if the nearest descriptor of the map is within
+5 m. The odometry is 1 % too long and turns by one degree every 100 m, with noise. The scans are rendered once and kept
+in the folder `--out`; delete it after a change of the simulator.
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from jaxtyping import Float, Int
+from numpy.lib.format import open_memmap
+
+import sglpr_jax
+from benchmarks.quality.loops import drifted
+from sglpr_jax.data.readable import only
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.files import replacing
+from sglpr_jax.poses import distances
+from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
+from sglpr_jax.sim.recording import SimulatedRecording, drive_through
+from sglpr_jax.sim.sensor import SENSORS
+from sglpr_jax.sim.world import build_world
+
+PASSES = {"map": 0.0, "opposite": 2.4, "same": 0.4, "opposite, aside": 3.5, "same, aside": 3.5}
+"""Metres by which each pass is left of the first one. Every second pass drives back."""
+ROUTE = "10"
+"""Route of the first pass. It does not return to a place."""
+SPEED_MPS, PAUSE_S = 8.0, 2.0
+APART_M = 5.0
+RIGHT_M = 5.0
+FIRST_M = 20.0
+"""Scans of the first metres of a pass are not scored, because their submaps are incomplete."""
+
+
+class Drive(NamedTuple):
+    """Scans of the five passes, with the number of the pass of each scan."""
+
+    recording: Recording
+    poses: Float[np.ndarray, "n 4 4"]
+    passes: Int[np.ndarray, " n"]
+
+
+def main(
+    *,
+    sensors: tuple[str, ...] = ("vlp16", "os1-64", "hdl64e"),
+    seeds: tuple[int, ...] = (601, 602),
+    lengths_m: tuple[float, ...] = (0.0, 10.0),
+    metres: int = 160,
+    spacing_m: float = 2.0,
+    azimuth_steps: int = 900,
+    weights: str = "sglpr",
+    render_only: bool = False,
+    out: Path = Path("build/submaps"),
+) -> None:
+    """Print the recall of each sensor and length.
+
+    Args:
+        sensors: names of `sim.SENSORS`.
+        seeds: one town for each.
+        lengths_m: lengths of the submaps; 0 is a single scan.
+        metres: length of the street; a scan every metre.
+        spacing_m: distance between the scored scans.
+        azimuth_steps: firings of the sensor per turn, at most.
+        weights: the model that describes the scans.
+        render_only: render the scans and score nothing.
+        out: folder of the scans.
+    """
+    if not render_only:
+        print(f"| sensor | submap m | {' | '.join(list(PASSES)[1:])} | ms a submap |\n|---|---|" + "---|" * len(PASSES))
+    params = sglpr_jax.load(weights)
+    for sensor in sensors:
+        drives = [rendered(sensor, seed, metres, azimuth_steps, out) for seed in seeds]
+        for length_m in () if render_only else lengths_m:
+            print(row(sensor, drives, params, length_m, max(1, round(spacing_m))), flush=True)
+
+
+def row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> str:
+    """One row of the table."""
+    described, seconds = [], 0.0
+    for town, drive in enumerate(drives):
+        recording = submaps_of_passes(drive, length_m, seed=town)
+        rows = [i for i in scored(drive) if i % every == 0]
+        begin = time.perf_counter()
+        for i in rows[: len(rows) // 4]:
+            recording.points(i)
+        seconds += (time.perf_counter() - begin) / (len(rows) // 4) / len(drives)
+        file = sglpr_jax.embed(params, only(recording, rows), on_bad_scan=lambda scan, error: None)
+        descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # of a scan that shows nothing
+        descriptors[np.isin([recording.ids[i] for i in rows], file.ids)] = file.descriptors
+        described.append((descriptors, drive.poses[rows, :3, 3] + [1e5 * town, 0, 0], drive.passes[rows]))
+    descriptors, positions, passes = (np.concatenate(values) for values in zip(*described, strict=True))
+    seen = np.isfinite(descriptors).all(axis=1)
+    descriptors = np.where(seen[:, None], descriptors, 0.0)
+    mapped = (passes == 0) & seen
+    nearest = distances(descriptors, descriptors[mapped]).argmin(axis=1)
+    apart = distances(positions, positions[mapped])
+    right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & seen
+    answerable = apart.min(axis=1) <= RIGHT_M
+    recalls = [right[answerable & (passes == number)].mean() for number in range(1, len(PASSES))]
+    return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} | {1e3 * seconds:.0f} |"
+
+
+def scored(drive: Drive) -> list[int]:
+    """Scans that are not at the begin of a pass."""
+    first = np.searchsorted(drive.passes, drive.passes)
+    way = np.linalg.norm(np.diff(drive.poses[:, :3, 3], axis=0, prepend=drive.poses[:1, :3, 3]), axis=1).cumsum()
+    return np.flatnonzero(way - way[first] >= FIRST_M).tolist()
+
+
+def submaps_of_passes(drive: Drive, length_m: float, *, seed: int) -> Recording:
+    """The recording with submaps by drifting odometry. Passes are kilometres apart, so no submap spans two."""
+    odometry = drifted(drive.poses, seed=seed, turn_deg=1.0)
+    odometry[:, 2, 3] += 1e4 * drive.passes
+    return sglpr_jax.submaps(drive.recording, odometry, length_m=length_m)
+
+
+def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Path) -> Drive:
+    """The drive with its scans in a file, which is written if it does not exist."""
+    path = folder / f"{sensor}-{seed}-{metres}-{azimuth_steps}.npy"
+    recording, passes = drive(sensor, seed, metres, azimuth_steps)
+    ends_file = path.with_suffix(".ends.npy")
+    if not ends_file.exists():
+        begin, clouds = time.perf_counter(), [recording.points(i) for i in range(len(recording))]
+        folder.mkdir(parents=True, exist_ok=True)
+        for target, values in ((path, np.concatenate(clouds)), (ends_file, np.cumsum([len(one) for one in clouds]))):
+            with replacing(target) as temporary, temporary.open("wb") as file:
+                np.save(file, values)
+        print(f"<!-- {path.name}: {len(clouds)} scans in {time.perf_counter() - begin:.0f} s -->", flush=True)
+    points, ends = open_memmap(path, mode="r"), np.load(ends_file)
+    row_of = {name: i for i, name in enumerate(recording.paths)}
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        i = row_of[path]
+        return Record(points=np.array(points[ends[i - 1] if i else 0 : ends[i]]))
+
+    poses = recording.poses.world_from_lidar
+    return Drive(dataclasses.replace(recording, read=read, label_paths=()), poses, passes)
+
+
+def drive(sensor: str, seed: int, metres: int, azimuth_steps: int) -> tuple[SimulatedRecording, Int[np.ndarray, " n"]]:
+    """The simulated drive, and the number of the pass of each scan."""
+    line, left = street(seed, metres)
+    rng, paths, clock = np.random.default_rng((seed, 6)), [], 0.0
+    for number, aside in enumerate(PASSES.values()):
+        way = line + aside * left
+        path = timed(rng, way[::-1] if number % 2 else way, free_mps=SPEED_MPS, poses=metres)
+        paths.append(path._replace(times=path.times + clock))
+        clock = paths[-1].times[-1] + PAUSE_S
+    whole = PlanarPath(*(np.concatenate(values) for values in zip(*paths, strict=True)))
+    starts = np.cumsum([0, *(len(path.times) for path in paths[:-1])])
+    every = [len(path.times) // metres for path in paths]
+    rows = np.concatenate([start + np.arange(metres) * step for start, step in zip(starts, every, strict=True)])
+    lidar = SENSORS[sensor]
+    if lidar.azimuth_steps > azimuth_steps and lidar.pattern == "rings":
+        lidar = dataclasses.replace(lidar, azimuth_steps=azimuth_steps)
+    recording = drive_through(
+        build_world((seed, 7), whole.xy, whole.times),
+        whole,
+        rows,
+        name=f"{sensor}-{seed}",
+        ids=tuple(f"{i:06d}" for i in range(len(rows))),
+        times=whole.times[rows],
+        sensor=lidar,
+        key=jax.random.key(seed),
+        rng=np.random.default_rng((seed, 8)),
+    )
+    return recording, np.repeat(np.arange(len(PASSES)), metres)
+
+
+def street(seed: int, metres: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """A line of points every half metre, and the unit vectors to its left."""
+    xy = plan_path(np.random.default_rng((seed, 5)), ROUTE, scans=600, rate_hz=10.0).xy
+    way = np.concatenate([[0.0], np.linalg.norm(np.diff(xy, axis=0), axis=1).cumsum()])
+    at = np.arange(0.0, metres, 0.5)
+    line = np.stack([np.interp(at, way, axis) for axis in xy.T], axis=1)
+    ahead = np.gradient(line, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    return line, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
