@@ -33,14 +33,20 @@ def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n
     return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
-def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "4 4"]) -> np.ndarray:
-    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
+def adjoint(a_from_b: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Matrix that transforms a small motion of a body (metres, then radians) from its frame b to its frame a."""
     x, y, z = a_from_b[:3, 3]
     turned = a_from_b[:3, :3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = turned
-    adjoint[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turned
-    return adjoint @ covariance @ adjoint.T
+    found = np.zeros((6, 6))
+    found[:3, :3] = found[3:, 3:] = turned
+    found[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ turned
+    return found
+
+
+def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "4 4"]) -> np.ndarray:
+    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
+    moved = adjoint(a_from_b)
+    return moved @ covariance @ moved.T
 
 
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
