@@ -8,8 +8,9 @@ Reads the pairs that `session_pairs.py` has rendered. Each recording is searched
 first. The frame of a recording is that of its first scan. Strangers are recordings of different towns: the second
 recording of a pair against the first one of the next pair.
 
-The error of a transform is stated twice: at the origin of the second frame, and at the loops (median over the queries).
-With drifting odometry (`loops.drifted`) or without odometry only the second one does not contain the drift.
+The error of a transform is stated twice. `error_m` is that of the second frame's origin by the true poses; it contains
+the drift of both recordings between their first scans and the loops. `at_loops_m` is that of the pose of a query in its
+match by the transform and the poses that the search was given, the median over the loops.
 """
 
 import json
@@ -30,7 +31,7 @@ from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.find_between import FoundBetween, between_searches
 from sglpr_jax.loops.joint import settled
 from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.loops.transforms import inverse, yaw_of
 from sglpr_jax.models.params import Params
 
 OTHER_M = 20.0
@@ -38,6 +39,7 @@ OTHER_M = 20.0
 LIMIT_M, LIMIT_DEG = 0.2, 0.5
 
 Search = tuple[FoundLoops, CandidateFinder]
+Poses = Float[np.ndarray, "n 4 4"]
 
 
 def main(
@@ -67,7 +69,7 @@ def main(
         first, second = (searched(params, content, name, odometry) for name in ("first", "second"))
         true = [content[f"{name}_world_from_lidar"] for name in ("first", "second")]
         row = {"pair": path.stem, "common_m": float(content["common_m"]), "turned_deg": float(content["turned_deg"])}
-        rows.append(row | judged(between_searches(0, 1, (first, second)), true))
+        rows.append(row | judged(between_searches(0, 1, (first, second)), (first, second), true))
         print(json.dumps(rows[-1]), flush=True)
         if before is not None and done < strangers:
             found = between_searches(0, 1, (first, before))
@@ -101,42 +103,49 @@ def searched(params: Params, content: dict[str, np.ndarray], name: str, odometry
     return found, detector.finder
 
 
-def judged(found: FoundBetween, true: list[Float[np.ndarray, "n 4 4"]]) -> dict[str, Any]:
+def judged(found: FoundBetween, searches: tuple[Search, Search], true: list[Poses]) -> dict[str, Any]:
     """Number of loops, wrong ones and transforms, and the errors of the first transform."""
-    first, second = true
-    wrong = [loop for loop in found.loops if np.linalg.norm(first[loop.match][:3, 3] - second[loop.query][:3, 3]) > OTHER_M]
-    row = {"loops": len(found.loops), "wrong": len(wrong), "transforms": len(found.aligned)}
+    seen = [inverse(true[0][loop.match]) @ true[1][loop.query] for loop in found.loops]
+    wrong = sum(bool(np.linalg.norm(pose[:3, 3]) > OTHER_M) for pose in seen)
+    row: dict[str, Any] = {"loops": len(found.loops), "wrong": wrong, "transforms": len(found.aligned)}
     if not found.aligned:
         return row
     aligned = found.aligned[0]
-    parts = aligned.match, aligned.query
+    parts, given = (aligned.match, aligned.query), []
+    for part, (one, finder) in zip(parts, searches, strict=True):
+        poses = finder.motion.poses if one.odometry is None else one.odometry
+        given.append(poses if part.is_odometry else inverse(poses[part.first]) @ poses)
     frames = [poses[0 if part.is_odometry else part.first] for poses, part in zip(true, parts, strict=True)]
-    expected = inverse(frames[0]) @ frames[1]
-    error = inverse(expected) @ aligned.alignment.match_from_query
-    metres, degrees = np.linalg.norm(error[:2, 3]), np.degrees(np.arctan2(error[1, 0], error[0, 0]))
-    there = (inverse(frames[1]) @ second)[[loop.query for loop in found.loops]]
-    here = inverse(expected @ there) @ aligned.alignment.match_from_query @ there
+    match_from_query = aligned.alignment.match_from_query
+    error = inverse(inverse(frames[0]) @ frames[1]) @ match_from_query
+    here = [
+        inverse(given[0][loop.match] @ pose) @ match_from_query @ given[1][loop.query]
+        for loop, pose in zip(found.loops, seen, strict=True)
+        if parts[1].first <= loop.query <= parts[1].last and parts[0].first <= loop.match <= parts[0].last
+    ]
     sigma = np.sqrt(np.diag(aligned.alignment.covariance))
-    return row | {
-        "error_m": round(float(metres), 3),
-        "error_deg": round(float(abs(degrees)), 3),
-        "error_z_m": round(float(abs(error[2, 3])), 3),
-        "at_loops_m": round(float(np.median(np.linalg.norm(here[:, :2, 3], axis=1))), 3),
-        "sigma_m": round(float(np.hypot(*sigma[:2])), 3),
-        "sigma_deg": round(float(np.degrees(sigma[5])), 3),
+    numbers = {
+        "error_m": np.linalg.norm(error[:2, 3]),
+        "error_deg": np.degrees(abs(yaw_of(error))),
+        "error_z_m": abs(error[2, 3]),
+        "at_loops_m": np.median([np.linalg.norm(pose[:2, 3]) for pose in here]),
+        "at_loops_deg": np.degrees(np.median([abs(yaw_of(pose)) for pose in here])),
+        "sigma_m": np.hypot(*sigma[:2]),
+        "sigma_deg": np.degrees(sigma[5]),
     }
+    return row | {name: round(float(value), 3) for name, value in numbers.items()}
 
 
 def report(rows: list[dict[str, Any]], invented: int, strangers: int) -> None:
     """Print the shares."""
     aligned = [row for row in rows if row["transforms"]]
-    turned = np.array([row["error_deg"] for row in aligned]) <= LIMIT_DEG
     print(f"{len(rows)} pairs, {len(aligned)} with a transform, {sum(row['wrong'] for row in rows)} wrong loops")
-    for name in ("error_m", "at_loops_m"):
-        metres = np.array([row[name] for row in aligned])
-        fits = int(((metres <= LIMIT_M) & turned).sum())
+    for where in ("error", "at_loops"):
+        metres, degrees = (np.array([row[f"{where}_{unit}"] for row in aligned]) for unit in ("m", "deg"))
+        fits = int(((metres <= LIMIT_M) & (degrees <= LIMIT_DEG)).sum())
         share = f"{fits} ({fits / max(len(rows), 1):.3f}) within {LIMIT_M:g} m and {LIMIT_DEG:g} degrees"
-        print(f"{name}: {share}; median {np.median(metres):.3f} m, largest {metres.max(initial=0):.3f} m")
+        most = f"largest {metres.max(initial=0):.3f} m and {degrees.max(initial=0):.3f} degrees"
+        print(f"{where}: {share}; median {np.median(metres):.3f} m, {most}")
     print(f"{strangers} pairs of different towns: {invented} transforms")
 
 

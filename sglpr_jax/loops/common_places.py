@@ -52,10 +52,10 @@ def accepted_between(
     pairs_of_parts = np.stack([joined.parts[match], joined.parts[query]], axis=1)
     found, rejected = [], []
     for parts in np.unique(pairs_of_parts, axis=0):
-        rows = np.flatnonzero((pairs_of_parts == parts).all(axis=1))
+        rows = np.flatnonzero((pairs_of_parts == parts).all(axis=1)).tolist()
         some = [loops[row] for row in rows]
         pairs = agree(some, joined.poses, way=joined.travelled, drift=drift, config=config)
-        members = largest_consistent_set(pairs)
+        members = largest_consistent_set(pairs).tolist()
         others = np.setdiff1d(np.arange(len(some)), members)
         rival = largest_consistent_set(pairs[np.ix_(others, others)])
         chosen = [some[k] for k in members]

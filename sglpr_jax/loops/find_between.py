@@ -81,6 +81,13 @@ class FoundRecordings:
         """Whether the search was completed."""
         return not self.stopped and all(found.whole for found in self.recordings)
 
+    def without_degenerate(self) -> "FoundRecordings":
+        """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction. The transforms
+        stay, because their weights contain this uncertainty.
+        """
+        within = tuple(one.without_degenerate() for one in self.recordings)
+        return dataclasses.replace(self, recordings=within, between=tuple(map(_without_degenerate, self.between)))
+
     def __str__(self) -> str:
         return "\n".join([*map(str, self.recordings), *map(self._said, self.between)])
 
@@ -92,6 +99,13 @@ class FoundRecordings:
             return f"{names}: no common place found{why}"
         said = "; ".join(_transform_in_words(aligned) for aligned in one.aligned)
         return f"{names}: {len(one.loops)} loops, {len(one.rejected)} rejected{why}; {said}"
+
+
+def _without_degenerate(one: FoundBetween) -> FoundBetween:
+    kept = tuple(loop for loop in one.loops if not loop.is_degenerate)
+    others = [Rejected(loop, "degenerate") for loop in one.loops if loop.is_degenerate]
+    rejected = tuple(sorted([*one.rejected, *others], key=lambda other: (other.loop.query, other.loop.match)))
+    return dataclasses.replace(one, loops=kept, rejected=rejected)
 
 
 def _transform_in_words(aligned: AlignedParts) -> str:
@@ -238,11 +252,12 @@ def between_searches(
 
 def _joined(found: Sequence[FoundLoops], motion: Motion) -> Joined:
     """Gravity-aligned poses of two recordings: by odometry if there is odometry, otherwise by their motion."""
-    poses = motion.poses
-    if all(one.odometry is not None for one in found):
-        level = [upright_odometry(one.odometry[: one.frames], one.recording.mounting) for one in found]
-        poses = np.concatenate(level)
-    return Joined(poses, motion.travelled, motion.segments)
+    level = [
+        upright_odometry(one.odometry[: one.frames], one.recording.mounting)
+        for one in found
+        if one.odometry is not None
+    ]
+    return Joined(np.concatenate(level) if level else motion.poses, motion.travelled, motion.segments)
 
 
 def _of_lidars(loop: Loop, found: Sequence[FoundLoops], offset: int) -> Loop:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.loops.config import DriftModel, SequenceConfig
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.planar import frames_of
-from sglpr_jax.loops.transforms import adjoint, inverse
+from sglpr_jax.loops.transforms import adjoint, inverse, moved_covariance
 
 ROUNDS = 20
 """Maximum number of Gauss-Newton steps."""
@@ -41,7 +41,8 @@ def aligned_frames(
 
     Each loop predicts the transform. Its weight follows from its covariance and from the drift between the loop and the
     middle of all loops. Neighbouring loops see the same walls, so the weights of loops closer than `independent_m` are
-    reduced in proportion to their distance. The transform is best where the loops are.
+    reduced in proportion to their distance. The transform is best where the loops are. Its covariance also contains the
+    drift over the path between the loops, which does not average out.
 
     Arguments:
       loops: At least one loop. Its match is a row of `match_poses`, its query a row of `query_poses`.
@@ -54,7 +55,8 @@ def aligned_frames(
     query, match = frames_of(loops)
     measured = match_poses[match] @ np.stack([loop.match_from_query for loop in loops])
     there = query_poses[query]
-    spread = np.stack([loop.covariance for loop in loops]) + _drifted(match_way[match], query_way[query], drift)
+    drifted = _drifted(match_way[match], query_way[query], drift)
+    spread = np.stack([loop.covariance for loop in loops]) + drifted
     fresh = _fresh(query_way[query])
     jacobians = np.stack([adjoint(inverse(pose)) for pose in there])
     found = (measured @ inverse(there))[_middle(measured, there)]
@@ -69,7 +71,14 @@ def aligned_frames(
         found = found @ _exponential(step)
         if np.abs(step).max() < SMALL:
             break
-    return FrameAlignment(found, np.linalg.inv(hessian))
+    return FrameAlignment(found, np.linalg.inv(hessian) + _common(drifted, there))
+
+
+def _common(drifted: Float[np.ndarray, "k 6 6"], there: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Mean drift of the loops, as the covariance of a motion of the frame about the middle of the loops."""
+    middle = np.eye(4)
+    middle[:3, 3] = np.median(there[:, :3, 3], axis=0)
+    return moved_covariance(drifted.mean(axis=0), middle)
 
 
 def _middle(measured: Float[np.ndarray, "n 4 4"], there: Float[np.ndarray, "n 4 4"]) -> int:
@@ -83,9 +92,10 @@ def _drifted(
 ) -> Float[np.ndarray, "k 6 6"]:
     """Covariance of the drift of both recordings between each loop and the middle of the loops."""
     length = np.hypot(match_way - np.median(match_way), query_way - np.median(query_way))
-    position = np.repeat((drift.metres_per_metre * length)[:, None], 3, axis=1)
-    turn = np.repeat(np.radians(drift.degrees_per_metre * length)[:, None], 3, axis=1)
-    return np.concatenate([position, turn], axis=1)[:, None] ** 2 * np.eye(6)
+    position, turn = drift.metres_per_metre * length, np.radians(drift.degrees_per_metre * length)
+    level = np.zeros_like(length)  # loops measure height, roll and pitch less precisely than they drift
+    sigmas = np.stack([position, position, level, level, level, turn], axis=1)
+    return sigmas[:, None] ** 2 * np.eye(6)
 
 
 def _fresh(way: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
