@@ -56,7 +56,7 @@ def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.f
 
 
 def loops_between(
-    named: Mapping[str, Float[np.ndarray, "n 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+    named: Mapping[str, Float[np.ndarray, "_ 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> "matplotlib.figure.Figure":
     """Draw trajectories of several recordings in one frame from above, with a line between the scans of each loop.
 

@@ -17,7 +17,7 @@ from sglpr_jax.loops.upright import upright_from_lidar, upright_odometry
 class OptimizedRecordings(NamedTuple):
     """Corrected trajectories of several recordings."""
 
-    poses: tuple[Float[np.ndarray, "n 4 4"], ...]
+    poses: tuple[Float[np.ndarray, "_ 4 4"], ...]
     """Pose of the LiDAR at each searched frame of each recording, in the frame of its group's first recording."""
     groups: tuple[tuple[int, ...], ...]
     """Numbers of the recordings that loops connect, each group in order. Groups have different frames."""
@@ -81,7 +81,7 @@ def optimize_recordings(found: FoundRecordings) -> OptimizedRecordings:
 
 def _optimized_group(
     found: FoundRecordings, members: Sequence[int], first_from_members: Sequence[Float[np.ndarray, "4 4"]]
-) -> tuple[OptimizedTrajectory, list[Float[np.ndarray, "n 4 4"]]]:
+) -> tuple[OptimizedTrajectory, list[Float[np.ndarray, "_ 4 4"]]]:
     """Correct the recordings of a group together, in gravity-aligned frames, because their mountings may differ."""
     some = [found.recordings[number] for number in members]
     mountings = [one.recording.mounting for one in some]

@@ -69,7 +69,7 @@ def write_g2o(
 def write_joint_g2o(
     path: Path | str,
     loops: Sequence[Loop],
-    chains: Sequence[tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]],
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
     *,
     drift: DriftModel = DriftModel(),
     comments: Sequence[str] = (),

@@ -144,8 +144,8 @@ def _solved(
     first = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(odometry[0]), first))
     sigmas = np.repeat(np.stack(step_deviations(odometry, drift)[::-1], axis=1), 3, axis=1)
-    for start in starts[1:]:  # keeps the graph solvable without loops between recordings
-        sigmas[max(start - 1, 0) : start] = UNCONNECTED
+    for begin in starts[1:]:  # keeps the graph solvable without loops between recordings
+        sigmas[max(begin - 1, 0) : begin] = UNCONNECTED
     for frame, pose in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[frame])
         graph.add(gtsam.BetweenFactorPose3(frame, frame + 1, gtsam.Pose3(pose), noise))

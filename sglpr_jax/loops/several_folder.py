@@ -40,7 +40,7 @@ def unique_names(found: FoundRecordings) -> list[str]:
     return names
 
 
-def vertices(found: FoundRecordings) -> list[Int[np.ndarray, " n"]]:
+def vertices(found: FoundRecordings) -> list[Int[np.ndarray, " _"]]:
     """Vertex of each scan in the graph: the scan's number plus a multiple of `FIRST_VERTEX`, the same for a recording.
 
     If a recording has more scans, the multiple is of the next power of ten.
@@ -157,7 +157,7 @@ def _moved(loop: Loop, queries: Int[np.ndarray, " n"], matches: Int[np.ndarray, 
     return dataclasses.replace(loop, query=int(queries[loop.query]), match=int(matches[loop.match]))
 
 
-def _comments(found: FoundRecordings, names: Sequence[str], of: Sequence[Int[np.ndarray, " n"]]) -> list[str]:
+def _comments(found: FoundRecordings, names: Sequence[str], of: Sequence[Int[np.ndarray, " _"]]) -> list[str]:
     """Lines that state the vertices and the frame of each recording."""
     lines = []
     for name, rows, (group, _), one in zip(names, of, placements(found), found.recordings, strict=True):
