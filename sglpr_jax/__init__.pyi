@@ -44,6 +44,7 @@ from .labels import taxonomy as taxonomy
 from .labels import to_classes as to_classes
 from .loops.detector import LoopDetector as LoopDetector
 from .loops.find import find_loops as find_loops
+from .loops.find_between import find_loops_between as find_loops_between
 from .loops.loop import Loop as Loop
 from .loops.odometry import read_odometry as read_odometry
 from .loops.optimization import optimize_trajectory as optimize_trajectory

@@ -7,7 +7,7 @@ GROUPS = {
     "Recordings": ["open_recording", "recording_names", "Recording", "Record", "submaps", "SubmapBuilder"],
     "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "Index", "FleetIndex"],
     "Scores": ["evaluate", "Evaluation"],
-    "Loops": ["find_loops", "LoopDetector", "Loop"],
+    "Loops": ["find_loops", "find_loops_between", "LoopDetector", "Loop"],
     "Training": ["preset", "train", "TrainResult", "init", "save", "for_places", "save_program"],
     "Simulation": ["simulate"],
     "Weights and presets": ["Params", "shipped_weights", "MODELS", "model_preset"],

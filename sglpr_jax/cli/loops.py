@@ -10,6 +10,7 @@ import tyro
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import PosedRecordingOptions, SubmapOptions, open_with_poses, report_bad_scan
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.several_loops import search_several
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.choices import (
     DRIFT_DEG_PER_100M,
@@ -40,6 +41,9 @@ UNFINISHED = "unfinished"
 class LoopsCommand:
     """Find the loop closures of a recording: pairs of scans of one place, their relative poses and probabilities.
 
+    With several recordings, the command finds the loops within and between them, and the transforms between their
+    frames, which need not be the same. It writes frames.json with the transforms.
+
     The command writes loops.g2o, loops.jsonl, loops.csv, rejected.jsonl (rejected pairs, with their reasons),
     index.html and command.json (the flags). With odometry it also writes trajectory.tum and trajectory.kitti, and with
     --optimize the corrected trajectory. Ctrl-C writes the loops found until then. The same command continues a run that
@@ -52,15 +56,16 @@ class LoopsCommand:
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found
       bin/loops my_scans --odometry odometry.tum --optimize --out found
       bin/loops my_scans --odometry odometry.tum --submap-m 10 --out found
+      bin/loops monday tuesday --odometry monday.tum tuesday.tum --optimize --out found
     """
 
-    recording: Annotated[Path, tyro.conf.Positional]
-    """A dataset, a bag or a folder of scans, in any supported layout."""
+    recording: Annotated[Path | tuple[Path, ...], tyro.conf.Positional]
+    """A dataset, a bag or a folder of scans, in any supported layout, or several of them."""
     out: Path
     """Output folder."""
-    odometry: Path | None = None
+    odometry: Path | tuple[Path, ...] | None = None
     """File with a pose for each scan, tum file with poses at other times, which are interpolated, or the bag itself.
-    Without odometry, loops are found by the scans alone."""
+    Without odometry, loops are found by the scans alone. Several recordings need one file each, in the same order."""
     odometry_format: OdometryFormat = "auto"
     """Format of --odometry. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
     recognises tum and .g2o."""
@@ -101,6 +106,18 @@ class LoopsCommand:
     sequence: SequenceConfig = DetectorConfig.sequence
     motion_drift: DriftModel = DetectorConfig.motion_drift
 
+    @property
+    def recordings(self) -> tuple[Path, ...]:
+        """Paths of all recordings."""
+        return (self.recording,) if isinstance(self.recording, Path) else self.recording
+
+    @property
+    def odometry_files(self) -> tuple[Path, ...]:
+        """Files of the odometry, or an empty tuple."""
+        if self.odometry is None:
+            return ()
+        return (self.odometry,) if isinstance(self.odometry, Path) else self.odometry
+
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
@@ -109,6 +126,8 @@ def loops_of_recording(command: LoopsCommand) -> int:
     _check(command)
     config = _config(command)
     with alone(command.out / UNFINISHED):
+        if len(command.recordings) > 1:
+            return search_several(command, config, unfinished=command.out / UNFINISHED)
         return _search(command, config)
 
 
@@ -134,16 +153,28 @@ def _check(command: LoopsCommand) -> None:
     from sglpr_jax.loops.folder import TRAJECTORIES
     from sglpr_jax.loops.optimization import check_installed
 
+    recordings, files = command.recordings, command.odometry_files
+    if not recordings:
+        raise ValueError("expected a recording, found none")
+    if files and len(files) != len(recordings):
+        raise ValueError(f"--odometry: expected a file for each of {len(recordings)} recordings, found {len(files)}")
+    if len(recordings) > 1 and (command.source.poses or command.source.times):
+        raise ValueError("--poses and --times are those of one recording, found several recordings")
     written = {(command.out / name).resolve() for name in TRAJECTORIES}
-    if command.optimize and command.odometry is None:
+    if command.optimize and not files:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
     if command.optimize:
         check_installed()
-    for path in (command.odometry, command.source.poses, command.source.times):
-        if path is not None and path.resolve() in written:
+    for path in (*files, command.source.poses, command.source.times):
+        if path is not None and (path.resolve() in written or _is_trajectory(path, command.out)):
             raise ValueError(
                 f"{path}: expected inputs that this run does not overwrite, found an output file; choose another --out"
             )
+
+
+def _is_trajectory(path: Path, out: Path) -> bool:
+    """Whether a file has the name of an output file with the trajectory of one of several recordings."""
+    return path.resolve().parent == out.resolve() and path.name.startswith("trajectory-")
 
 
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
@@ -156,12 +187,13 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.loops.unfinished import remove
     from sglpr_jax.models.weights_file import load
 
-    source, path = command.source, command.odometry
+    source, (root,) = command.source, command.recordings
     params = load(command.weights)
-    if path is None:
-        recording, odometry = source.open(command.recording), None
+    if not command.odometry_files:
+        recording, odometry = source.open(root), None
     else:
-        recording, odometry = open_with_poses(source, command.recording, path, format=command.odometry_format)
+        (path,) = command.odometry_files
+        recording, odometry = open_with_poses(source, root, path, format=command.odometry_format)
     recording = command.submap.submaps(recording, odometry)
     register = command.register and can_register(recording)
     if command.register and not register:

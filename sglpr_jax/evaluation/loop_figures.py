@@ -55,6 +55,28 @@ def trajectories(named: Mapping[str, Float[np.ndarray, "n 3"]]) -> "matplotlib.f
     return figure
 
 
+def loops_between(
+    named: Mapping[str, Float[np.ndarray, "_ 3"]], pairs: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> "matplotlib.figure.Figure":
+    """Draw trajectories of several recordings in one frame from above, with a line between the scans of each loop.
+
+    Arguments:
+      named: Positions of each recording, in metres, by its name.
+      pairs: Positions of query and match of each loop between two recordings, in metres.
+    """
+    figure = figure_from_above(np.concatenate(list(named.values())))
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    for name, positions in named.items():
+        axes.plot(*positions[:, :2].T, linewidth=1.2, label=name)
+    for ends in pairs:
+        axes.plot(*np.array(ends)[:, :2].T, color="0.4", linewidth=0.8, zorder=3)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+    axes.legend(loc="best", framealpha=0.95)
+    return figure
+
+
 def reliability(bins: Sequence[tuple[float, float, int]]) -> "matplotlib.figure.Figure":
     """Draw the share of loops over the predicted probability.
 

@@ -217,7 +217,7 @@ class CandidateFinder:
             self.motion.add(clock, pose=pose)
             return Compared([], None)
         excluded = self._excluded(time, position)
-        rows = self._rows(seen.descriptor, excluded)
+        rows = self.similar(seen.descriptor, excluded)
         key = self.motion.keyframe
         linked = pose is None and len(self) > 0 and not self.empty[key]
         matches = [self.stored.image(row) for row in rows.tolist()] + 2 * linked * [self._keyframe]
@@ -230,7 +230,7 @@ class CandidateFinder:
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
             return Compared([], link)
-        rows, found = self._with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded)
+        rows, found = self.with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded)
         fit = found.correlation
         if pose is not None:  # floors of a building look alike
             poses, way = self.motion.poses, self.motion.travelled
@@ -238,15 +238,15 @@ class CandidateFinder:
         best = int(np.argmax(fit))
         return Compared([self._candidate(seen, spectra, rows, found, best)], link)
 
-    def _rows(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+    def similar(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
         """Stored scans with the nearest descriptors, and those with the nearest ones at other times than the first."""
         rows = self.nearest(descriptor, self.config.candidates, excluded)
         if not len(rows):
             return rows
-        excluded = excluded | self._about(int(rows[0]))
+        excluded = excluded | self.about(int(rows[0]))
         return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
 
-    def _with_further(
+    def with_further(
         self,
         seen: Seen,
         spectra: Complex[Array, "s t f"],
@@ -265,7 +265,7 @@ class CandidateFinder:
         more = self.search(spectra, [self.stored.image(row) for row in chosen.tolist()], config.candidates)
         return np.concatenate([rows, chosen]), Peak(*map(np.concatenate, zip(found, more, strict=True)))
 
-    def _about(self, row: int) -> Bool[np.ndarray, " n"]:
+    def about(self, row: int) -> Bool[np.ndarray, " n"]:
         """Whether each stored scan was recorded at about the same time as one of them."""
         frames = self.stored.frames
         return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s)[frames]
@@ -295,15 +295,15 @@ class CandidateFinder:
             rows = rivals(seen.descriptor, known, frames, match, self.motion, exclude_s=exclude_s, config=rules)
             found = self.search(spectra, [stored.image(one) for one in rows.tolist()], rules.of_query + rules.of_match)
             by_motion = expected_poses(self.motion, len(self), frames[rows], np.eye(4), config=rules)
-            shares = self._shares(seen, match, distance, peak, rows, found, [by_motion])
-            far = ~self._about(row)[compared] & self.motion.same(match, frames[compared])
-            elsewhere = self._shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
+            shares = self.shares(seen, match, distance, peak, rows, found, [by_motion])
+            far = ~self.about(row)[compared] & self.motion.same(match, frames[compared])
+            elsewhere = self.shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
             shares = np.fmax(shares, elsewhere)
         cells = min(occupied(one, self.verification) for one in (seen.image, image))
         evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
         return Candidate(len(self), match, alignment, evidence)
 
-    def _shares(
+    def shares(
         self,
         seen: Seen,
         match: int,

@@ -129,7 +129,34 @@ def find_loops(
     """
     check_is(recording, Recording, by="open_recording")
     registered = can_register(recording) if registered is None else registered
-    odometry = _checked(recording, odometry, registered=registered)
+    return searched(
+        recording,
+        params,
+        odometry=checked_odometry(recording, odometry, registered=registered),
+        model=model,
+        config=config,
+        registered=registered,
+        on_bad_scan=on_bad_scan,
+        kept_in=kept_in,
+        should_stop=should_stop,
+        on_progress=on_progress,
+    )[0]
+
+
+def searched(
+    recording: Recording,
+    params: Params,
+    *,
+    odometry: Float[np.ndarray, "n 4 4"] | None,
+    model: LoopModel | None,
+    config: DetectorConfig,
+    registered: bool,
+    on_bad_scan: OnBadScan | None,
+    kept_in: Path | str | None,
+    should_stop: Callable[[], bool],
+    on_progress: Callable[[int], None],
+) -> tuple[FoundLoops, CandidateFinder]:
+    """Do the same as `find_loops` with checked arguments, and also return the finder with images and motion."""
     recording = recording if odometry is None else with_odometry(recording, odometry)
     detector = LoopDetector(params, model=model, config=config)
     add_scans(
@@ -148,7 +175,7 @@ def find_loops(
     _check_scans(detector.finder, recording)
     loops, rejected = _accepted(detector, recording, odometry, registered=registered, should_stop=should_stop)
     missing = detector.finder.missing
-    return FoundLoops(
+    found = FoundLoops(
         recording,
         len(detector),
         loops,
@@ -161,6 +188,7 @@ def find_loops(
         config=config,
         empty=int(detector.finder.empty.sum()) - len(missing),
     )
+    return found, detector.finder
 
 
 def can_register(recording: Recording) -> bool:
@@ -175,7 +203,7 @@ def _acceptance(detector: LoopDetector) -> str | None:
     return hashlib.sha256(repr((detector.config, detector.model)).encode()).hexdigest()[:16]
 
 
-def _checked(
+def checked_odometry(
     recording: Recording, odometry: ArrayLike | None, *, registered: bool
 ) -> Float[np.ndarray, "n 4 4"] | None:
     """Check recording and odometry before any work, and return the odometry as an array."""

@@ -24,6 +24,8 @@ from sglpr_jax.loops.loop_files import (
 
 GRAPH, LINES, TABLE = "loops.g2o", "loops.jsonl", "loops.csv"
 REJECTED = "rejected.jsonl"
+FRAMES = "frames.json"
+"""Transforms between the frames of several recordings."""
 TRAJECTORIES = ("trajectory.tum", "trajectory.kitti", "trajectory-optimized.tum", "trajectory-optimized.kitti")
 
 
@@ -73,10 +75,16 @@ def write_found(
             files[f"{stem}.kitti"] = partial(write_kitti, poses=poses)
     files |= {name: partial(Path.write_bytes, data=text_bytes(text)) for name, text in texts.items()}
     written = write_all(folder, files)
-    others = [name for name in TRAJECTORIES if name not in files and (folder / name).exists()]
+    warn_of_others(folder, files)
+    return written
+
+
+def warn_of_others(folder: Path, files: Mapping[str, object]) -> None:
+    """Warn if a folder has trajectories or transforms of an earlier run, which are not among the written `files`."""
+    there = sorted({path.name for path in folder.glob("trajectory-*.*")} - set(TRAJECTORIES))
+    others = [name for name in (*TRAJECTORIES, *there, FRAMES) if name not in files and (folder / name).exists()]
     if others:
         warn(f"{folder}: {', '.join(others)} are from an earlier run and do not belong to these loops")
-    return written
 
 
 def _numbered(loop: Loop, numbers: Int[np.ndarray, " n"]) -> Loop:

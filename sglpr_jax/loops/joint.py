@@ -141,22 +141,29 @@ def settled(
         rules = {"mounting": mountings_of(recording), "drift": config.drift, "config": config.consistency}
         kept, rejected = accepted(loops, odometry, **rules)
     if registered:
-        kept, others = _registered(recording, kept, should_stop)
+        kept, others = registered_loops(recording, recording, kept, should_stop=should_stop)
         rejected = rejected + others
     return kept, rejected
 
 
-def _registered(
-    recording: Recording, loops: list[Loop], should_stop: Callable[[], bool]
+def registered_loops(
+    queries: Recording, matches: Recording, loops: list[Loop], *, should_stop: Callable[[], bool]
 ) -> tuple[list[Loop], list[Rejected]]:
-    """Registered loops, and loops whose scans contradict the images. After a stop, the others are unchanged."""
+    """Registered loops, and loops whose scans contradict the images. After a stop, the others are unchanged.
+
+    Arguments:
+      queries: Recording of the queries.
+      matches: Recording of the matches, which may be the same.
+      loops: Loops, with the rows of these recordings.
+      should_stop: If it returns True, no further loop is registered.
+    """
     kept, rejected = [], []
     for i, loop in enumerate(loops):
         if should_stop():
             return [*kept, *loops[i:]], rejected
         found = register(
-            recording.points(loop.query),
-            recording.points(loop.match),
+            queries.points(loop.query),
+            matches.points(loop.match),
             initial=loop.match_from_query,
             initial_covariance=loop.covariance,
         )

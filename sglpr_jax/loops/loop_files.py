@@ -28,6 +28,8 @@ UPPER = np.triu_indices(6)
 Ids = Sequence[str] | Mapping[int, str]
 """Id of each frame, by its number."""
 COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
+OF_RECORDINGS = ("query_recording", "match_recording")
+"""Further columns of a table of several recordings."""
 
 
 class Graph(NamedTuple):
@@ -58,18 +60,48 @@ def write_g2o(
     Raises:
       WriteError: If the file cannot be written.
     """
-    lines = []
+    chains = []
     if odometry is not None:
-        frames = list(range(len(odometry))) if numbers is None else numbers.tolist()
-        lines += [f"{VERTEX} {i} {row}" for i, row in zip(frames, _pose_rows(odometry), strict=True)]
-        steps = _pose_rows(inverse(odometry[:-1]) @ odometry[1:])
-        spread = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
-        information = (_numbers(np.diag(1 / row)[UPPER]) for row in spread)
-        ends = itertools.pairwise(frames)
-        lines += [f"{EDGE} {i} {j} {row} {next(information)}" for (i, j), row in zip(ends, steps, strict=True)]
+        chains.append((np.arange(len(odometry)) if numbers is None else numbers, odometry))
+    write_joint_g2o(path, loops, chains, drift=drift)
+
+
+def write_joint_g2o(
+    path: Path | str,
+    loops: Sequence[Loop],
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
+    *,
+    drift: DriftModel = DriftModel(),
+    comments: Sequence[str] = (),
+) -> None:
+    """Write the pose graph of several recordings.
+
+    Arguments:
+      path: File to write.
+      loops: Loops between vertices.
+      chains: Vertices and poses of each recording with odometry.
+      drift: Drift of the odometry.
+      comments: Lines at the beginning of the file. Readers ignore them.
+
+    Raises:
+      WriteError: If the file cannot be written.
+    """
+    lines = [f"# {comment}" for comment in comments]
+    for vertices, odometry in chains:
+        lines += _chain(vertices.tolist(), odometry, drift)
     for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
         lines.append(f"{EDGE} {loop.match} {loop.query} {row} {_numbers(loop.information[UPPER])}")
     write_text(Path(path), "".join(f"{line}\n" for line in lines))
+
+
+def _chain(vertices: list[int], odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel) -> list[str]:
+    """Lines of the vertices of a recording, and of the edges of its odometry."""
+    lines = [f"{VERTEX} {i} {row}" for i, row in zip(vertices, _pose_rows(odometry), strict=True)]
+    steps = _pose_rows(inverse(odometry[:-1]) @ odometry[1:])
+    spread = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
+    information = (_numbers(np.diag(1 / row)[UPPER]) for row in spread)
+    ends = itertools.pairwise(vertices)
+    return lines + [f"{EDGE} {i} {j} {row} {next(information)}" for (i, j), row in zip(ends, steps, strict=True)]
 
 
 def read_g2o(path: Path | str) -> Graph:
@@ -122,17 +154,21 @@ def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
     write_text(Path(path), "".join(f"{_all_digits(pose[:3].reshape(-1))}\n" for pose in camera))
 
 
-def write_loops_jsonl(path: Path | str, loops: Sequence[Loop], ids: Ids | None = None) -> None:
-    """Write loops, one JSON object a line, with the `ids` of the frames if they are given."""
-    write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids))}\n" for loop in loops))
+def write_loops_jsonl(
+    path: Path | str, loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None
+) -> None:
+    """Write loops, one JSON object a line, with the `ids` and the `recordings` of the frames if they are given."""
+    write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids, recordings))}\n" for loop in loops))
 
 
-def write_rejected_jsonl(path: Path | str, rejected: Sequence[Rejected], ids: Ids | None = None) -> None:
-    """Write rejected pairs, one JSON object a line, with the `ids` of the frames if they are given."""
+def write_rejected_jsonl(
+    path: Path | str, rejected: Sequence[Rejected], ids: Ids | None = None, recordings: Ids | None = None
+) -> None:
+    """Write rejected pairs, one JSON object a line, with the `ids` and the `recordings` of the frames if given."""
     lines = []
     for one in rejected:
         pose = one.loop.match_from_query.tolist()
-        row = {**_named(one.loop, ids), "reason": one.reason, **_shares(one.loop), "match_from_query": pose}
+        row = {**_named(one.loop, ids, recordings), "reason": one.reason, **_shares(one.loop), "match_from_query": pose}
         lines.append(f"{json.dumps(row)}\n")
     write_text(Path(path), "".join(lines))
 
@@ -146,14 +182,18 @@ def read_loops_jsonl(path: Path | str) -> list[Loop]:
     return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(lines)]
 
 
-def write_loops_csv(path: Path | str, loops: Sequence[Loop]) -> None:
-    """Write a csv table with the columns `COLUMNS`. The overlap is empty if it is unknown."""
+def write_loops_csv(path: Path | str, loops: Sequence[Loop], recordings: Ids | None = None) -> None:
+    """Write a csv table with the columns `COLUMNS`. The overlap is empty if it is unknown.
+
+    If the `recordings` of the frames are given, the table also has the columns `OF_RECORDINGS`.
+    """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
+    table.writerow(COLUMNS if recordings is None else (*COLUMNS, *OF_RECORDINGS))
     for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
         overlap = "" if loop.overlap is None else f"{loop.overlap:.4f}"
-        table.writerow([loop.query, loop.match, *row.split(), f"{loop.probability:.6f}", overlap])
+        names = [] if recordings is None else [recordings[loop.query], recordings[loop.match]]
+        table.writerow([loop.query, loop.match, *row.split(), f"{loop.probability:.6f}", overlap, *names])
     write_text(Path(path), text.getvalue())
 
 
@@ -166,12 +206,13 @@ def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a table of loops, found no file")
     lines = path.read_text(errors="replace").splitlines()
-    if not lines or tuple(lines[0].split(",")) != COLUMNS:
+    if not lines or tuple(lines[0].split(",")) not in (COLUMNS, (*COLUMNS, *OF_RECORDINGS)):
         raise ValueError(
             f"{path}, line 1: expected {','.join(COLUMNS)}, found {lines[0][:200] if lines else 'nothing'}"
         )
     for i, line in enumerate(lines[1:]):
         words, where = line.split(","), f"{path}, line {i + 2}"
+        words = words[: len(COLUMNS)] if lines[0].endswith(OF_RECORDINGS[-1]) else words
         words = words[:-1] if len(words) == len(COLUMNS) and not words[-1] else words  # no overlap
         values = numbers_of(words, columns=len(words) if len(words) in (10, 11) else 10, where=where)
         query, match = _frames(values[:2], where)
@@ -229,14 +270,16 @@ def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-def _as_json(loop: Loop, ids: Ids | None) -> dict:
+def _as_json(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
     pose, covariance = loop.match_from_query.tolist(), loop.covariance.tolist()
-    return {**_named(loop, ids), "match_from_query": pose, "covariance": covariance, **_shares(loop)}
+    return {**_named(loop, ids, recordings), "match_from_query": pose, "covariance": covariance, **_shares(loop)}
 
 
-def _named(loop: Loop, ids: Ids | None) -> dict:
-    """Frames of a loop, and their ids if they are given."""
+def _named(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
+    """Frames of a loop, and their ids and recordings if they are given."""
     named = {} if ids is None else {"query_id": ids[loop.query], "match_id": ids[loop.match]}
+    if recordings is not None:
+        named |= dict(zip(OF_RECORDINGS, (recordings[loop.query], recordings[loop.match]), strict=True))
     return {"query": loop.query, "match": loop.match, **named}
 
 

@@ -6,6 +6,8 @@ surroundings do not show how the sensor moved, as in a tunnel, the motion is unk
 is extrapolated at the last known velocity, and its drift grows fast.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -35,6 +37,18 @@ class Motion:
 
     def __len__(self) -> int:
         return len(self._poses)
+
+    @classmethod
+    def joined(cls, motions: "Sequence[Motion]") -> "Motion":
+        """Motion of several recordings, one after the other. Poses between two recordings are unknown."""
+        found = cls()
+        for one in motions:
+            numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
+            for name in ("segment", "travelled", "guessed_m", "clock") if len(last) else ():
+                numbers[name] += last[name] + (name == "segment")
+            found._numbers.extend(numbers)
+            found._poses.extend(one.poses)
+        return found
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:

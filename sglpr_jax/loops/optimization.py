@@ -19,12 +19,15 @@ from sglpr_jax.loops.drift import deviations, step_deviations
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting, mountings_of
+from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.transforms import inverse
 
 FIRST_POSE = 1e-6
 """Standard deviation of the first pose, which stays fixed, in metres and radians."""
 MOST_RISEN_M = 2.0
 """Maximum correction of a height without a warning, in metres."""
+UNCONNECTED = 1e2
+"""Standard deviation of the motion between two recordings, in metres and radians."""
 ROUNDS = 5
 """Maximum number of solutions. Before each next one, loops that bend the solution beyond the drift are dropped."""
 
@@ -90,6 +93,7 @@ def optimized(
     *,
     drift: DriftModel = DriftModel(),
     mounting: AnyMounting = None,
+    starts: Sequence[int] = (0,),
 ) -> OptimizedTrajectory:
     """Solve the graph of odometry and loops.
 
@@ -102,17 +106,19 @@ def optimized(
       loops: Loops between these frames.
       drift: Stated drift of the odometry.
       mounting: Mounting of the LiDAR, or that at each frame.
+      starts: First frame of each recording, if the frames are those of several recordings. Between two recordings there
+        is no odometry, and loops between them cannot contradict it.
 
     Raises:
       ImportError: If the extra `gtsam` is not installed.
     """
-    gtsam, rules = _library(), {"drift": drift, "mounting": mounting}
-    used = deviations(loops, odometry, **rules) <= drift.max_deviation
+    gtsam, rules = _library(), {"drift": drift, "mounting": mounting, "starts": starts}
+    used = _contradictions(loops, odometry, **rules) <= drift.max_deviation
     for _ in range(ROUNDS):
         if not used.any():
             break
         chosen = np.flatnonzero(used)
-        poses, fits = _solved(gtsam, odometry, [loops[i] for i in chosen], drift)
+        poses, fits = _solved(gtsam, odometry, [loops[i] for i in chosen], drift, starts)
         members = chosen[fits]
         bend = _bend(odometry, poses, [loops[i] for i in members], **rules)
         if (bend <= drift.max_deviation).all():
@@ -125,7 +131,11 @@ def optimized(
 
 
 def _solved(
-    gtsam: ModuleType, odometry: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], drift: DriftModel
+    gtsam: ModuleType,
+    odometry: Float[np.ndarray, "n 4 4"],
+    loops: Sequence[Loop],
+    drift: DriftModel,
+    starts: Sequence[int],
 ) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.ndarray, " k"]]:
     """The poses of the solution, and whether each loop is an inlier of it."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -134,6 +144,8 @@ def _solved(
     first = gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(odometry[0]), first))
     sigmas = np.repeat(np.stack(step_deviations(odometry, drift)[::-1], axis=1), 3, axis=1)
+    for begin in starts[1:]:  # keeps the graph solvable without loops between recordings
+        sigmas[max(begin - 1, 0) : begin] = UNCONNECTED
     for frame, pose in enumerate(inverse(odometry[:-1]) @ odometry[1:]):
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[frame])
         graph.add(gtsam.BetweenFactorPose3(frame, frame + 1, gtsam.Pose3(pose), noise))
@@ -149,6 +161,20 @@ def _solved(
     return poses, np.asarray(solver.getWeights())[certain:] > 0.5
 
 
+def _contradictions(
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"],
+    *,
+    drift: DriftModel,
+    mounting: AnyMounting,
+    starts: Sequence[int],
+) -> Float[np.ndarray, " k"]:
+    """Deviation of each loop from the odometry (`deviations`). It is 0 for loops between two recordings."""
+    found = deviations(loops, odometry, drift=drift, mounting=mounting)
+    recording = [np.searchsorted(starts, frames, side="right") for frames in frames_of(loops)]
+    return np.where(recording[0] == recording[1], found, 0.0)
+
+
 def _bend(
     odometry: Float[np.ndarray, "n 4 4"], poses: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], **rules: Any
 ) -> Float[np.ndarray, " k"]:
@@ -160,7 +186,7 @@ def _bend(
     frames = np.unique([frame for loop in loops for frame in (loop.match, loop.query)])
     ends = [(loop.match, loop.query) for loop in loops] + list(itertools.pairwise(frames))
     solved = [Loop(int(b), int(a), inverse(poses[a]) @ poses[b], np.zeros((6, 6)), 1.0) for a, b in ends]
-    found = deviations(solved, odometry, **rules)
+    found = _contradictions(solved, odometry, **rules)
     return np.array(
         [max(found[k], *(found[len(loops) :][_touching(frames, loop)]), 0.0) for k, loop in enumerate(loops)]
     )

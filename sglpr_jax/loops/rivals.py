@@ -50,11 +50,42 @@ def rivals(
     clock, now = motion.clock[frames], motion.clock[-1]
     youngest, oldest = (share * exclude_s for share in config.age)
     starts = (now - oldest, motion.clock[match] - oldest, motion.clock[match] + youngest)
+    counts = (config.of_query, config.of_match // 2, config.of_match // 2)
+    clock = np.where(clock <= now - youngest, clock, np.inf)
+    return _nearest_in_time(descriptor, descriptors, clock, starts, counts, oldest - youngest)
+
+
+def rivals_around(
+    descriptor: Float[np.ndarray, " d"],
+    descriptors: Float[np.ndarray, "n d"],
+    frames: Int[np.ndarray, " n"],
+    frame: int,
+    motion: Motion,
+    *,
+    count: int,
+    exclude_s: float,
+    config: RivalConfig = RivalConfig(),
+) -> Int[np.ndarray, " k"]:
+    """Choose rivals as `rivals` does, `count` of them around one frame, half before and half after it."""
+    clock, now = motion.clock[frames], motion.clock[frame]
+    youngest, oldest = (share * exclude_s for share in config.age)
+    starts, counts = (now - oldest, now + youngest), (count // 2, count // 2)
+    return _nearest_in_time(descriptor, descriptors, clock, starts, counts, oldest - youngest)
+
+
+def _nearest_in_time(
+    descriptor: Float[np.ndarray, " d"],
+    descriptors: Float[np.ndarray, "n d"],
+    clock: Float[np.ndarray, " n"],
+    starts: Sequence[float],
+    counts: Sequence[int],
+    seconds: float,
+) -> Int[np.ndarray, " k"]:
+    """Rows of the nearest descriptors in equal parts of some intervals. Interval i has `counts[i]` parts."""
     chosen = []
-    for start, count in zip(starts, (config.of_query, config.of_match // 2, config.of_match // 2), strict=True):
-        edges = np.linspace(start, start + oldest - youngest, count + 1)
-        for low, high in itertools.pairwise(edges):
-            pool = np.flatnonzero((clock >= low) & (clock < high) & (clock <= now - youngest))
+    for start, count in zip(starts, counts, strict=True):
+        for low, high in itertools.pairwise(np.linspace(start, start + seconds, count + 1)):
+            pool = np.flatnonzero((clock >= low) & (clock < high))
             if len(pool):
                 chosen.append(pool[np.linalg.norm(descriptors[pool] - descriptor, axis=1).argmin()])
     return np.unique(np.array(chosen, np.int64))

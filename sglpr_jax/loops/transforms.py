@@ -33,18 +33,24 @@ def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n
     return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
-def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
-    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
+def adjoint(a_from_b: Float[np.ndarray, "*m 4 4"]) -> Float[np.ndarray, "*m 6 6"]:
+    """Matrix that transforms a small motion of a body (metres, then radians) from its frame b to its frame a."""
     x, y, z = np.moveaxis(a_from_b[..., :3, 3], -1, 0)
     turned = a_from_b[..., :3, :3]
     crossed = np.zeros(turned.shape)
     crossed[..., 0, 1], crossed[..., 0, 2] = -z, y
     crossed[..., 1, 0], crossed[..., 1, 2] = z, -x
     crossed[..., 2, 0], crossed[..., 2, 1] = -y, x
-    adjoint = np.zeros((*turned.shape[:-2], 6, 6))
-    adjoint[..., :3, :3] = adjoint[..., 3:, 3:] = turned
-    adjoint[..., :3, 3:] = crossed @ turned
-    return adjoint @ covariance @ np.swapaxes(adjoint, -1, -2)
+    found = np.zeros((*turned.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = turned
+    found[..., :3, 3:] = crossed @ turned
+    return found
+
+
+def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
+    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
+    moved = adjoint(a_from_b)
+    return moved @ covariance @ np.swapaxes(moved, -1, -2)
 
 
 def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:

@@ -1,6 +1,6 @@
 """HTML page of the loops of a recording: trajectory, matched images, probabilities, rejected pairs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from sglpr_jax.evaluation import figures, loop_figures
 from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing, paragraph
 from sglpr_jax.loops.explanation import why_none
 from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.optimization import OptimizedTrajectory, trajectory_error
 from sglpr_jax.loops.overlay import overlaid
@@ -26,19 +26,28 @@ SHOWN_ROWS = 40
 
 def loops_page(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> str:
     """Self-contained HTML of the page. With an `optimized` trajectory it shows the trajectory before and after."""
-    about = "with odometry" if found.odometry is not None else "without odometry"
+    return document(f"Loops of {found.recording.name}", about(found), sections_of(found, optimized=optimized))
+
+
+def about(found: FoundLoops) -> str:
+    """The number of loops and rejected pairs, and whether there is odometry, in one line."""
+    return f"{found}; {'with odometry' if found.odometry is not None else 'without odometry'}."
+
+
+def sections_of(found: FoundLoops, *, optimized: OptimizedTrajectory | None = None) -> list[Section]:
+    """Sections of the page of a recording."""
     sections = [Section("Trajectory", _where(found))]
     if reasons := why_none(found):
         sections.insert(0, Section("Why no loops", "\n".join(map(paragraph, reasons))))
     if optimized is not None and found.frames:
         sections.append(Section("Corrected", _corrected(found, optimized)))
-    sections += [
+    return [
+        *sections,
         Section("Pairs", _pairs(found)),
         Section("Loops", _table(found)),
-        Section("Rejected", _rejected(found)),
+        Section("Rejected", rejected_table(found.rejected)),
         Section("Reliability", _sure(found)),
     ]
-    return document(f"Loops of {found.recording.name}", f"{found}; {about}.", sections)
 
 
 def _where(found: FoundLoops) -> str:
@@ -147,11 +156,11 @@ def _title(found: FoundLoops, loop: Loop) -> str:
     return f"query {numbers[loop.query]}, match {numbers[loop.match]}"
 
 
-def _rejected(found: FoundLoops) -> str:
+def rejected_table(rejected: Sequence[Rejected]) -> str:
     """Table of the reasons for rejections, with counts."""
-    if not found.rejected:
+    if not rejected:
         return missing("No pair was rejected.")
-    rows = [(reason, str(count), MEANING[reason]) for reason, count in counted(found.rejected).items()]
+    rows = [(reason, str(count), MEANING[reason]) for reason, count in counted(rejected).items()]
     about = "Pairs that look like loops but were rejected. They are listed in rejected.jsonl."
     return f"{paragraph(about)}\n{html_table(('reason', 'pairs', 'meaning'), rows, numbers=('pairs',))}"
 

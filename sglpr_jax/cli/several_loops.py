@@ -1,0 +1,84 @@
+"""bin/loops with several recordings: loops within and between them, and the transforms between their frames."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sglpr_jax.cli.config_file import record_command
+from sglpr_jax.cli.recording import open_with_poses, report_bad_scan
+from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from sglpr_jax.cli.loops import LoopsCommand
+    from sglpr_jax.data import Recording
+    from sglpr_jax.loops.config import DetectorConfig
+    from sglpr_jax.loops.find_between import FoundRecordings
+
+
+def search_several(command: "LoopsCommand", config: "DetectorConfig", *, unfinished: Path) -> int:
+    """Search several recordings and write the results. Returns the exit status."""
+    from sglpr_jax.evaluation.page.of_loops import PAGE
+    from sglpr_jax.evaluation.page.of_recordings import recordings_page
+    from sglpr_jax.loops.find_between import find_loops_between
+    from sglpr_jax.loops.joint_optimization import optimize_recordings
+    from sglpr_jax.loops.several_folder import write_several
+    from sglpr_jax.loops.unfinished import remove
+    from sglpr_jax.models.weights_file import load
+
+    params = load(command.weights)
+    recordings, odometry = _opened(command)
+    steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
+    with stop_on_signal() as stop, progress_bar(f"loops of {len(recordings)} recordings", steps) as show:
+        found = find_loops_between(
+            recordings,
+            params,
+            odometry=odometry,
+            config=config,
+            registered=None if command.register else False,
+            on_bad_scan=report_bad_scan if command.skip_bad else None,
+            kept_in=unfinished,
+            should_stop=stop,
+            on_progress=show,
+        )
+    if command.degenerate == "drop":
+        found = found.without_degenerate()
+    corrected = optimize_recordings(found) if command.optimize else None
+    page = {PAGE: recordings_page(found, optimized=corrected)}
+    paths = write_several(found, command.out, optimized=corrected, texts=page)
+    paths.append(record_command(command, command.out))
+    _report(found)
+    for one in () if corrected is None else corrected.corrections:
+        print(one)
+    print(f"{command.out}: {', '.join(path.name for path in paths)}")
+    if not found.whole:
+        print("run the same command again to continue", file=sys.stderr)
+        return stop.exit_status
+    for number in range(len(recordings)):
+        remove(unfinished / f"{number}")
+    remove(unfinished)
+    return 0
+
+
+def _opened(command: "LoopsCommand") -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4 4']] | None]":
+    """Open the recordings, with their odometry if there is one."""
+    paths, files = command.recordings, command.odometry_files
+    if not files:
+        return [command.submap.submaps(command.source.open(path), None) for path in paths], None
+    opened = [
+        open_with_poses(command.source, path, file, format=command.odometry_format)
+        for path, file in zip(paths, files, strict=True)
+    ]
+    return [command.submap.submaps(*one) for one in opened], [poses for _, poses in opened]
+
+
+def _report(found: "FoundRecordings") -> None:
+    """Print the results, and why a recording has no loops of its own."""
+    from sglpr_jax.loops.explanation import why_none
+
+    print(found)
+    for one in found.recordings:
+        for line in why_none(one):
+            print(f"{one.recording.name}: {line}")

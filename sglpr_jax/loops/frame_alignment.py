@@ -1,0 +1,121 @@
+"""Transform between the frames of two recordings, estimated from the loops between them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.loops.config import DriftModel, SequenceConfig
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.planar import frames_of
+from sglpr_jax.loops.transforms import adjoint, inverse, moved_covariance
+
+ROUNDS = 20
+"""Maximum number of Gauss-Newton steps."""
+SMALL = 1e-9
+"""Step in metres and radians at which the estimate is final."""
+
+
+class FrameAlignment(NamedTuple):
+    """Transform between the frames of two recordings."""
+
+    match_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the query recording's frame in the match recording's frame, in metres."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the query recording's frame in itself: x, y, z in metres, then rotations about x,
+    y, z in radians."""
+
+
+def aligned_frames(
+    loops: Sequence[Loop],
+    match_poses: Float[np.ndarray, "n 4 4"],
+    query_poses: Float[np.ndarray, "m 4 4"],
+    *,
+    match_way: Float[np.ndarray, " n"],
+    query_way: Float[np.ndarray, " m"],
+    drift: DriftModel,
+) -> FrameAlignment:
+    """Estimate the transform by robust least squares (iteratively reweighted, with Cauchy's cost).
+
+    Each loop predicts the transform. Its weight follows from its covariance and from the drift between the loop and the
+    middle of all loops. Neighbouring loops see the same walls, so the weights of loops closer than `independent_m` are
+    reduced in proportion to their distance. The transform is best where the loops are. Its covariance also contains the
+    drift over the path between the loops, which does not average out.
+
+    Arguments:
+      loops: At least one loop. Its match is a row of `match_poses`, its query a row of `query_poses`.
+      match_poses: Pose of the LiDAR at each frame of the match recording, in its own frame.
+      query_poses: Pose of the LiDAR at each frame of the query recording, in its own frame.
+      match_way: Travelled distance at each frame of the match recording, in metres.
+      query_way: Travelled distance at each frame of the query recording, in metres.
+      drift: Drift model of the poses.
+    """
+    query, match = frames_of(loops)
+    measured = match_poses[match] @ np.stack([loop.match_from_query for loop in loops])
+    there = query_poses[query]
+    drifted = _drifted(match_way[match], query_way[query], drift)
+    spread = np.stack([loop.covariance for loop in loops]) + drifted
+    fresh = _fresh(query_way[query])
+    jacobians = np.stack([adjoint(inverse(pose)) for pose in there])
+    found = (measured @ inverse(there))[_middle(measured, there)]
+    for _ in range(ROUNDS):
+        error = _logarithm(inverse(measured) @ found @ there)
+        weighted = np.linalg.solve(spread, np.concatenate([error[..., None], jacobians], axis=2))
+        distance = np.einsum("ni,ni->n", error, weighted[..., 0])
+        weights = fresh / (1 + distance / 6)
+        gradient = np.einsum("n,nij,ni->j", weights, jacobians, weighted[..., 0])
+        hessian = np.einsum("n,nij,nik->jk", weights, jacobians, weighted[..., 1:])
+        step = -np.linalg.solve(hessian, gradient)
+        found = found @ _exponential(step)
+        if np.abs(step).max() < SMALL:
+            break
+    return FrameAlignment(found, np.linalg.inv(hessian) + _common(drifted, there))
+
+
+def _common(drifted: Float[np.ndarray, "k 6 6"], there: Float[np.ndarray, "k 4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Mean drift of the loops, as the covariance of a motion of the frame about the middle of the loops."""
+    middle = np.eye(4)
+    middle[:3, 3] = np.median(there[:, :3, 3], axis=0)
+    return moved_covariance(drifted.mean(axis=0), middle)
+
+
+def _middle(measured: Float[np.ndarray, "n 4 4"], there: Float[np.ndarray, "n 4 4"]) -> int:
+    """The loop whose transform moves the queries nearest to where the other loops see them: least median distance."""
+    moved = (measured @ inverse(there))[:, None] @ there[None]
+    return int(np.median(np.linalg.norm(moved[..., :3, 3] - measured[None, :, :3, 3], axis=2), axis=1).argmin())
+
+
+def _drifted(
+    match_way: Float[np.ndarray, " k"], query_way: Float[np.ndarray, " k"], drift: DriftModel
+) -> Float[np.ndarray, "k 6 6"]:
+    """Covariance of the drift of both recordings between each loop and the middle of the loops."""
+    length = np.hypot(match_way - np.median(match_way), query_way - np.median(query_way))
+    position, turn = drift.metres_per_metre * length, np.radians(drift.degrees_per_metre * length)
+    level = np.zeros_like(length)  # loops measure height, roll and pitch less precisely than they drift
+    sigmas = np.stack([position, position, level, level, level, turn], axis=1)
+    return sigmas[:, None] ** 2 * np.eye(6)
+
+
+def _fresh(way: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """Weight of each loop: its share of the travelled distance, in units of `independent_m`, at most 1."""
+    order = np.argsort(way)
+    gaps = np.diff(way[order])
+    around = (np.append(gaps, gaps[-1:]) + np.append(gaps[:1], gaps)) / 2 if len(gaps) else np.array([np.inf])
+    weights = np.empty(len(way))
+    weights[order] = np.clip(around / SequenceConfig().independent_m, 1e-3, 1)
+    return weights
+
+
+def _logarithm(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6"]:
+    """Translation and rotation vector of small motions."""
+    return np.concatenate([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()], axis=1)
+
+
+def _exponential(step: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "4 4"]:
+    """Small motion with this translation and rotation vector."""
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
+    found[:3, 3] = step[:3]
+    return found

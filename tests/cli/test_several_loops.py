@@ -1,0 +1,52 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from sglpr_jax.cli import loops
+from sglpr_jax.cli.loops import LoopsCommand
+from sglpr_jax.cli.runtime import parse_command
+from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
+from sglpr_jax.loops.loop_files import write_tum
+from sglpr_jax.loops.transforms import transform
+
+from .conftest import SCANS, assert_one_line_error
+
+
+@pytest.mark.slow
+def test_two_recordings_of_one_drive_get_one_frame(command, town, tmp_path):
+    scans = town / "sequences" / "08"
+    odometry, moved = read_kitti(scans / "poses.txt"), transform(30.0, 5.0, 2.0)
+    paths, files = [], []
+    for name, poses in (("monday", odometry), ("tuesday", moved @ odometry)):
+        paths.append(shutil.copytree(scans / "velodyne", tmp_path / name))
+        files.append(tmp_path / f"{name}.tum")
+        write_tum(files[-1], poses, np.arange(float(SCANS)))
+    out = tmp_path / "found"
+    ended = command("loops", *paths, "--odometry", *files, "--optimize", "--out", out)
+    assert ended.status == 0, ended.error
+    assert "monday and tuesday: " in ended.out and "transform x " in ended.out
+    (found,) = json.loads((out / "frames.json").read_text())["transforms"]
+    np.testing.assert_allclose(found["match_from_query"] @ moved, np.eye(4), atol=0.05)
+    corrected = read_tum(out / "trajectory-optimized-tuesday.tum")[0]
+    np.testing.assert_allclose(corrected[:, :3, 3], odometry[:, :3, 3], atol=0.2)
+    assert {path.name for path in out.iterdir()} >= {"loops.g2o", "index.html", "command.json"}
+    assert not (out / "unfinished").exists()
+
+
+def test_one_path_or_several_are_recordings_with_their_odometry(command, tmp_path):
+    flags = ["a", "b", "--odometry", "a.tum", "b.tum", "--out", "found"]
+    parsed = parse_command(LoopsCommand, "loops", flags)
+    assert [str(path) for path in (*parsed.recordings, *parsed.odometry_files)] == ["a", "b", "a.tum", "b.tum"]
+    one = parse_command(LoopsCommand, "loops", ["a", "--out", "found"])
+    assert len(one.recordings) == 1 and one.odometry_files == ()
+    loops._check(parsed)
+    run = ("loops", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "found")
+    ended = command(*run, "--odometry", tmp_path / "a.tum")
+    assert_one_line_error(ended, "--odometry: expected a file for each of 2 recordings, found 1")
+    ended = command(*run, "--poses", tmp_path / "a.tum")
+    assert_one_line_error(ended, "--poses and --times are those of one recording")
+    assert_one_line_error(command("loops", "--out", tmp_path / "found"), "expected a recording, found none")
+    inside = (tmp_path / "found" / "trajectory-a.tum", tmp_path / "b.tum")
+    assert_one_line_error(command(*run, "--odometry", *inside), "trajectory-a.tum: expected inputs that this run")

@@ -1,0 +1,70 @@
+"""The transform between two frames follows from noisy loops, and wrong loops do not move it."""
+
+import dataclasses
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.frame_alignment import aligned_frames
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, travelled, yaw_of
+
+from .pairs import loops_between, two_drives
+
+EXACT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0)
+
+
+def aligned(loops, first, second, drift=EXACT):
+    return aligned_frames(loops, first, second, match_way=travelled(first), query_way=travelled(second), drift=drift)
+
+
+def error(loops, first, second, true) -> np.ndarray:
+    return inverse(true) @ aligned(loops, first, second).match_from_query
+
+
+def test_loops_with_noise_give_the_transform_to_centimetres_even_if_a_fifth_is_wrong():
+    first, second, true = two_drives()
+    loops = loops_between(first, second, true)
+    found = error(loops, first, second, true)
+    assert np.linalg.norm(found[:3, 3]) < 0.1 and abs(np.degrees(yaw_of(found))) < 0.1
+    aside = transform(8.0, 0.0, 0.5)
+    mixed = [
+        dataclasses.replace(loop, match_from_query=aside @ loop.match_from_query) if i % 5 == 0 else loop
+        for i, loop in enumerate(loops)
+    ]
+    found = error(mixed, first, second, true)
+    assert np.linalg.norm(found[:3, 3]) < 0.25 and abs(np.degrees(yaw_of(found))) < 0.2
+
+
+def test_the_covariance_covers_the_errors_and_grows_with_the_stated_drift():
+    first, second, true = two_drives()
+    squares = []
+    for seed in range(20):
+        found = aligned(loops_between(first, second, true, seed=seed), first, second)
+        apart = inverse(true) @ found.match_from_query
+        planar = np.array([apart[0, 3], apart[1, 3], yaw_of(apart)])
+        squares.append(planar @ np.linalg.solve(found.covariance[np.ix_([0, 1, 5], [0, 1, 5])], planar))
+    assert np.mean(squares) < 3  # 3 for independent loops; neighbouring loops are not taken for independent
+    loops = loops_between(first, second, true)
+    exact, drifting = (aligned(loops, first, second, drift).covariance for drift in (EXACT, DriftModel()))
+    assert (np.diag(drifting)[[0, 1, 5]] > 2 * np.diag(exact)[[0, 1, 5]]).all()
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-3.1, 3.1))
+def test_other_frames_change_only_the_transform(x, y, yaw):
+    first, second, true = two_drives()
+    loops, moved = loops_between(first, second, true), transform(x, y, yaw)
+    before, after = aligned(loops, first, second), aligned(loops, first, moved @ second)
+    np.testing.assert_allclose(after.match_from_query @ moved, before.match_from_query, atol=1e-5)
+    expected = moved_covariance(before.covariance, moved)
+    np.testing.assert_allclose(after.covariance, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+
+
+def test_one_loop_is_enough_for_a_transform():
+    loop = Loop(1, 0, transform(1.0, 2.0, 0.3), np.eye(6), 0.99)
+    poses = np.stack([np.eye(4), transform(5.0, 0.0, 0.0)])
+    found = aligned([loop], poses, poses)
+    np.testing.assert_allclose(found.match_from_query @ poses[1], loop.match_from_query, atol=1e-9)
