@@ -49,6 +49,8 @@ class Command:
     """Of each drive."""
     every: int = 2
     """Every k-th scan is a query."""
+    spacing_m: float = 4.0
+    """Distance between the places of a map, in metres."""
     voxel_m: float = 0.15
     """Edge of the voxels of the cloud, in metres."""
     kiss_icp: bool = False
@@ -139,7 +141,7 @@ def main() -> None:
         poses = maps["scans"]()[1]
         for name in command.maps:
             recording, map_poses = maps[name]()
-            places = sglpr_jax.PlaceMap.of(recording, params, map_poses)
+            places = sglpr_jax.PlaceMap.of(recording, params, map_poses, spacing_m=command.spacing_m)
             for sensor in command.queries:
                 query = driven(
                     command.out, seed=seed, sensor=sensor, day=1, scans=command.scans, azimuth_steps=900
