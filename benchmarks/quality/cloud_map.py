@@ -5,9 +5,9 @@
 
 A simulated town is driven by hdl64e. Its scans at noisy poses (`map_drives.noisy`) are one cloud in voxels. With
 --kiss-icp, the poses are those of kiss-icp, which the program expects in `DRIVE-kiss.tum` beside the folder of the
-drive. On another day, other sensors drive the same streets, partly in the opposite direction. Each of their scans within
-5 m of the first drive is located by `PlaceMap.relocate`. It is right within 0.5 m (horizontally) and 2 degrees of the
-true pose relative to the nearest pose of the first drive, so that drift of kiss-icp is not counted.
+drive. On another day, other sensors drive the same streets, partly in the opposite direction. Each of their scans
+within 5 m of the first drive is located by `PlaceMap.relocate`. It is right within 0.5 m (horizontally) and 2 degrees
+of the true pose relative to the nearest pose of the first drive, so that drift of kiss-icp is not counted.
 
 Maps: `cloud` (the feature), `all points` (the same without removing hidden points), `scans` (the scans of hdl64e).
 """
@@ -75,7 +75,7 @@ def cloud_of(drive: Drive, poses: Float[np.ndarray, "n 4 4"], voxel_m: float) ->
 def write_pcd(path: Path, points: Float32[np.ndarray, "n 3"]) -> None:
     """Write a file in the Point Cloud Library's format."""
     count = len(points)
-    header = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
+    header = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
     path.write_bytes((header + "DATA binary\n").encode() + points.astype("<f4").tobytes())
 
 
@@ -96,7 +96,8 @@ def opened(command: Command, seed: int) -> tuple[Drive, dict[str, Callable[[], t
     kind = "kiss" if command.kiss_icp else "noisy"
     trajectory = drive.folder.with_name(f"{drive.folder.name}-{kind}.tum")
     if not command.kiss_icp:
-        write_tum(trajectory, noisy(drive.world_from_lidar, seed=seed), 0.5 + np.arange(len(drive.world_from_lidar)) / 3)
+        found = noisy(drive.world_from_lidar, seed=seed)
+        write_tum(trajectory, found, 0.5 + np.arange(len(found)) / 3)
     poses = sglpr_jax.read_odometry(trajectory, format="tum")
     cloud = drive.folder.with_name(f"{drive.folder.name}-{kind}-{command.voxel_m:g}.pcd")
     if not cloud.exists():
@@ -143,9 +144,7 @@ def main() -> None:
             recording, map_poses = maps[name]()
             places = sglpr_jax.PlaceMap.of(recording, params, map_poses, spacing_m=command.spacing_m)
             for sensor in command.queries:
-                query = driven(
-                    command.out, seed=seed, sensor=sensor, day=1, scans=command.scans, azimuth_steps=900
-                )
+                query = driven(command.out, seed=seed, sensor=sensor, day=1, scans=command.scans, azimuth_steps=900)
                 found = np.array(located(places, params, query, first, poses, command.every))
                 total[name, sensor] = total.get((name, sensor), 0) + found
                 print(f"| {seed} | {name} | {sensor} | {found[0]} | {found[1]} | {found[2]} |", flush=True)

@@ -51,7 +51,7 @@ def test_a_scan_is_located_in_the_frame_of_the_cloud(command, town, tmp_path):
     assert ended.status == 0, ended.error
     best = json.loads(answer.read_text())[0]
     assert best["place"] == "town/000003"
-    np.testing.assert_allclose(np.array(best["world_from_query"])[:3, 3], START + [15, 0, 1.73], atol=0.3)
+    np.testing.assert_allclose(np.array(best["world_from_query"])[:3, 3], START + np.array([15, 0, 1.73]), atol=0.3)
 
 
 def test_poses_of_a_graph_have_no_trajectory(command, town, tmp_path):

@@ -55,7 +55,8 @@ def test_each_ray_returns_its_nearest_point():
 def test_agreement_with_a_plain_loop():
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(400, 3))
-    points = (directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(1, 30, (400, 1))).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    points = (directions * rng.uniform(1, 30, (400, 1))).astype(np.float32)
     ranges = np.linalg.norm(points, axis=1)
     needed = np.degrees(1.5 * 0.5 / ranges)
     level = np.ceil(np.log2(needed / 0.5).clip(0, 6)).astype(int)  # cells of 0.5, 1, 2, ..., 32 degrees

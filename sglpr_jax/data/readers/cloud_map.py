@@ -17,7 +17,7 @@ from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.formats.cloud_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.formats.timed_poses import poses_of
 from sglpr_jax.data.formats.trajectory import read_trajectory
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.record import Record
@@ -65,8 +65,8 @@ def open_recording(
     """
     if poses is None:
         raise ValueError(
-            f"{root}: expected a point cloud map with the poses of its LiDAR (--poses trajectory.tum), found no poses; put"
-            " single scans into a folder, or read them with read_scan"
+            f"{root}: expected a point cloud map with the poses of its LiDAR (--poses trajectory.tum), found no poses;"
+            " put single scans into a folder, or read them with read_scan"
         )
     path = read_trajectory(poses, format=pose_format, times=times, time_unit=time_unit)
     unturned = np.tile(np.eye(3), (len(path.positions), 1, 1))
@@ -129,16 +129,19 @@ def _check_kept(
     box = _box(cloud.lowest, cloud.highest)
     if len(lost) == len(kept):
         found = _box(positions.min(axis=0), positions.max(axis=0))
-        raise ValueError(f"{poses}: expected poses in the frame of {root.name}, which covers {box}, found poses at {found}")
+        raise ValueError(
+            f"{poses}: expected poses in the frame of {root.name}, which covers {box}, found poses at {found}"
+        )
     first = ", ".join(f"{value:.1f}" for value in positions[lost[0]])
     warn(
-        f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of {len(kept)}"
-        f" poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers {box}"
+        f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of"
+        f" {len(kept)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers {box}"
     )
 
 
 def _box(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str:
-    return ", ".join(f"{axis} {low:.0f} to {high:.0f} m" for axis, low, high in zip("xyz", lowest, highest, strict=True))
+    ends = zip("xyz", lowest, highest, strict=True)
+    return ", ".join(f"{axis} {low:.0f} to {high:.0f} m" for axis, low, high in ends)
 
 
 def _raised(
@@ -151,11 +154,11 @@ def _raised(
         return world_from_lidar
     raised_m = MODEL_HEIGHT_M - found.height_m
     warn(
-        f"{poses}: expected poses of the LiDAR, found poses {found.height_m:.2f} m above the ground, as of the robot's base;"
-        f" the scans are computed {raised_m:.2f} m above them"
+        f"{poses}: expected poses of the LiDAR, found poses {found.height_m:.2f} m above the ground, as of the robot's"
+        f" base; the scans are computed {raised_m:.2f} m above them"
     )
     lidar = np.eye(4)
-    lidar[:3, 3] = raised_m * np.array(Mounting(found.height_m, found.up).up)
+    lidar[:3, 3] = raised_m * np.array(found.up)
     return world_from_lidar @ lidar
 
 
