@@ -95,8 +95,8 @@ def tiled_cloud(
 def _check_size(points: int, source: Path) -> None:
     if points > MOST_POINTS:
         raise ValueError(
-            f"{source}: expected at most {MOST_POINTS} points in voxels of {VOXEL_M:g} m near the trajectory, found more;"
-            " cut the cloud and its trajectory into parts, or keep one point in voxels of 0.2 m"
+            f"{source}: expected at most {MOST_POINTS} points in voxels of {VOXEL_M:g} m near the trajectory, found"
+            " more; cut the cloud and its trajectory into parts, or keep one point in voxels of 0.2 m"
         )
 
 
