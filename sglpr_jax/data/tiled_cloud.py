@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int64, Num
 
+from sglpr_jax.data.trails import on_trail
+
 VOXEL_M = 0.1
 """Edge of a voxel, in metres. One point per voxel is stored."""
 TILE_M = 20.0
@@ -55,7 +57,7 @@ class TiledCloud:
 def tiled_cloud(
     blocks: Iterable[Num[np.ndarray, "_ 3"]], *, positions: Float[np.ndarray, "n 3"], reach_m: float, source: Path
 ) -> TiledCloud:
-    """Store the points of a cloud that are near a trajectory.
+    """Store the points of a cloud that are near a trajectory, without trails of moving objects (`on_trail`).
 
     Arguments:
       blocks: Points of the cloud in metres, in parts. Points that are not finite are dropped.
@@ -83,6 +85,7 @@ def tiled_cloud(
             _check_size(len(kept), source)
     kept = _one_per_voxel(np.concatenate([kept, *pending]))
     _check_size(len(kept), source)
+    kept = kept[~on_trail(kept)]
     if not read:
         raise ValueError(f"{source}: expected finite points, found none")
     tile = _tile(kept[:, :2])

@@ -1,21 +1,22 @@
 """Visible points of a point cloud: those that a LiDAR would measure from one position, because nothing hides them.
 
 The test is a z-buffer over the directions of the sensor. A point hides everything behind it in its cell. Points of a
-near surface are far apart as seen from the sensor, so nearer points have larger cells. The cells have sizes of 0.5,
-1, 2, ... degrees. A point belongs to the smallest size that is not below the angle between neighbouring points.
+near surface are far apart as seen from the sensor, so nearer points have larger cells. The cells have sizes of 0.25,
+0.5, 1, ... degrees. A point belongs to the smallest size that is not below half the angle between neighbouring points.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 
 NEAREST_M = 1.0
 """Minimum distance of a point from the sensor, in metres. Nearer points belong to the vehicle or to a trail."""
-CELL_DEG = 0.5
+CELL_DEG = 0.25
 """Edge of the smallest cells of the z-buffer, in degrees."""
 LARGEST_DEG = 32.0
 """Edge of the largest cells, in degrees."""
-SPACINGS = 1.5
-"""Minimum edge of a cell, as a multiple of the distance between neighbouring points."""
+SPACINGS = 0.5
+"""Minimum edge of a cell, as a multiple of the distance between neighbouring points. With larger cells, vegetation
+hides more than it does from a real sensor (docs/decisions/data.md)."""
 BEHIND_M = 0.3
 """Minimum distance of a hidden point behind the nearest point of its cell, in metres."""
 BEHIND_CELLS = 3.0
@@ -43,9 +44,9 @@ def visible_points(
     points, ranges = points[within], ranges[within]
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     elevation = np.degrees(np.arcsin((points[:, 2] / ranges).clip(-1, 1))) + 90
-    seen = np.flatnonzero(~_hidden(azimuth, elevation, ranges, spacing_m))
-    rays = _cell(azimuth[seen], elevation[seen], *RAY_DEG)
-    return points[np.sort(seen[_nearest(rays, points[seen], ranges[seen])])]
+    first = _nearest(_cell(azimuth, elevation, *RAY_DEG), points, ranges)
+    hidden = _hidden(azimuth[first], elevation[first], ranges[first], spacing_m)
+    return points[first[~hidden]]
 
 
 def _hidden(
@@ -62,10 +63,8 @@ def _hidden(
         cell = _cell(azimuth, elevation, edge_deg, edge_deg)
         last = 2 * edge_deg > LARGEST_DEG
         hiding = (needed_deg > smaller_deg) & ((needed_deg <= edge_deg) | last)
-        nearest = np.full(cell.max(initial=0) + 1, np.inf, np.float32)
-        np.minimum.at(nearest, cell[hiding], ranges[hiding])
-        behind_m = BEHIND_M + BEHIND_CELLS * np.radians(edge_deg) * nearest[cell]
-        hidden |= ranges > nearest[cell] + behind_m
+        nearest = _minima(cell, np.where(hiding, ranges, np.float32(np.inf)))[cell]
+        hidden |= ranges > nearest + BEHIND_M + BEHIND_CELLS * np.radians(edge_deg) * nearest
         edge_deg, smaller_deg = 2 * edge_deg, edge_deg
     return hidden
 
@@ -80,8 +79,17 @@ def _cell(
 
 
 def _nearest(
-    rays: Int64[np.ndarray, " n"], points: Float[np.ndarray, "n 3"], ranges: Float[np.ndarray, " n"]
+    rays: Int64[np.ndarray, " n"], points: Float32[np.ndarray, "n 3"], ranges: Float32[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " m"]:
-    """Row of the nearest point of each ray. Coordinates decide between equal distances, so the order does not."""
-    order = np.lexsort((*points.T, ranges, rays))
-    return order[np.unique(rays[order], return_index=True)[1]]
+    """Row of the nearest point of each ray, in order. Coordinates decide between equal distances."""
+    nearest = _minima(rays, ranges)
+    rows = np.flatnonzero(ranges == nearest[rays])
+    rows = rows[np.lexsort((*points[rows].T, rays[rows]))]
+    return np.sort(rows[np.unique(rays[rows], return_index=True)[1]])
+
+
+def _minima(cells: Int64[np.ndarray, " n"], ranges: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " c"]:
+    """Minimum range in each cell, or infinity."""
+    minima = np.full(cells.max(initial=0) + 1, np.inf, np.float32)
+    np.minimum.at(minima, cells, ranges)
+    return minima

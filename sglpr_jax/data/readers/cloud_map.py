@@ -93,7 +93,7 @@ def open_recording(
 
 
 def _described(root: Path, cloud: TiledCloud) -> str:
-    points = f"{cloud.read} points, {len(cloud.points)} of them in voxels near the trajectory"
+    points = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
     return f"point cloud map {root.name}, {points}, {cloud.spacing_m:.2f} m apart; scans computed from it"
 
 
