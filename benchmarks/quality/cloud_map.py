@@ -106,6 +106,7 @@ def opened(command: Command, seed: int) -> tuple[Drive, dict[str, Callable[[], t
     def of_cloud() -> tuple[Recording, np.ndarray]:
         recording = sglpr_jax.open_recording(cloud, poses=trajectory)
         print("; ".join(recording.description), flush=True)
+        assert recording.world_from_lidar is not None
         return recording, recording.world_from_lidar
 
     def of_all() -> tuple[Recording, np.ndarray]:

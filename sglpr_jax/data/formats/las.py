@@ -27,8 +27,7 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
     """
     laspy = _laspy(path)
     with naming(path):
-        points, width = _checked_sizes(path)
-        check_points(points, bytes_each=width)
+        _check_sizes(path, one_scan=True)
     try:
         with laspy.open(path) as stream:
             found = stream.read()
@@ -47,7 +46,7 @@ def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
     if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
         raise ImportError(f"{path}: .laz files need lazrs (pip install 'sglpr-jax[las]')")
     with naming(path):
-        _checked_sizes(path)
+        _check_sizes(path, one_scan=False)
     try:
         with laspy.open(path) as stream:
             for block in stream.chunk_iterator(BLOCK_POINTS):
@@ -67,10 +66,10 @@ def _laspy(path: Path) -> ModuleType:
     return laspy
 
 
-def _checked_sizes(path: Path) -> tuple[int, int]:
-    """Number of points and their size in bytes.
+def _check_sizes(path: Path, *, one_scan: bool) -> None:
+    """Raise ValueError if the file is shorter than its header declares, or larger than a scan if it is one.
 
-    Raises ValueError if the file is shorter than its header declares. laspy would read 2**32 missing records.
+    laspy would read 2**32 missing records.
     """
     size = path.stat().st_size
     with path.open("rb") as stream:
@@ -84,9 +83,10 @@ def _checked_sizes(path: Path) -> tuple[int, int]:
     missing = header_size + records * _RECORD_HEADER > start
     if missing or (extended and extended_start + extended * _EXTENDED_RECORD_HEADER > size):
         raise ValueError(f"expected {records} and {extended} records by the header, found {size} bytes in total")
+    if one_scan:
+        check_points(points, bytes_each=width)
     if kind & _COMPRESSED:
-        return points, width
+        return
     held = max(size - start, 0) // max(width, 1)
     if points > held or (points < held and header[25] < 3):  # later versions may have records behind the points
         raise ValueError(f"expected {points} points by the header, found {held}")
-    return points, width
