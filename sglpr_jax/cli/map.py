@@ -29,13 +29,15 @@ class MapCommand:
     Example:
       bin/map my_scans --poses poses.tum --out town.safetensors
       bin/map today --poses today.tum --add-to town.safetensors --out town.safetensors
+      bin/map town.pcd --poses trajectory.tum --out town.safetensors
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
-    """A dataset, a bag or a folder of scans, in any supported layout."""
+    """A dataset, a bag or a folder of scans, in any supported layout. Or a point cloud map of another tool (.pcd, .ply,
+    .las, .laz), whose places are seen from the poses."""
     poses: Path
     """File with a pose in the world frame for each scan, tum file with poses at other times, which are interpolated, or
-    the bag itself. Use a corrected trajectory, not raw odometry."""
+    the bag itself. Use a corrected trajectory, not raw odometry. For a point cloud map, the poses of its LiDAR."""
     out: Path
     """Map to write (.safetensors)."""
     pose_format: OdometryFormat = "auto"

@@ -38,11 +38,14 @@ class RecordingOptions:
     """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
 
-    def open(self, root: Path) -> "Recording":
-        """Open the recording and describe it on stderr. Raises the errors of `data.open_recording`."""
+    def open(self, root: Path, **more: Any) -> "Recording":
+        """Open the recording, with `more` options, and describe it on stderr.
+
+        Raises the errors of `data.open_recording`.
+        """
         from sglpr_jax.cli.datasets import open_recording  # slow import, not needed for --help
 
-        options: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"}
+        options: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "seq"} | more
         return open_recording(root, self.seq, **options)
 
 
@@ -112,10 +115,14 @@ def open_with_poses(
 ) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']]":
     """Open a recording, with a pose for each scan from the file at `path`, or from the bag if `path` is the bag itself.
 
-    Poses at other times are interpolated. Scans without a pose are removed and reported on stderr.
+    Poses at other times are interpolated. Scans without a pose are removed and reported on stderr. If `root` is a point
+    cloud map, the scans are those that its LiDAR would measure at the poses.
     """
+    from sglpr_jax.data.formats.cloud_files import is_cloud_file
     from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
 
+    if is_cloud_file(root):
+        return own_odometry(source.open(root, poses=path, pose_format=format), root)
     if is_own(path, root):
         return own_odometry(source.open(root), root)
     odometry = read_odometry(path, format=format, time_unit=source.time_unit)  # read first, because a bag opens slowly

@@ -20,7 +20,7 @@ class ReadOptions:
     format: ScanFormat = "auto"
     """Format of the points in a .bin file, for a plain folder or KITTI's layout."""
     poses: Path | None = None
-    """Pose file of a plain folder, if it is not beside the scans."""
+    """Pose file of a point cloud map, or of a plain folder if it is not beside the scans."""
     pose_format: PoseFormat = "auto"
     times: Path | None = None
     """File with one time per line."""

@@ -1,16 +1,20 @@
-"""Reads points from .las files with laspy (extra `las`)."""
+"""Reads points from .las and .laz files with laspy (extra `las`)."""
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
-from sglpr_jax.data.formats.scan_size import check_points
+from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points
 from sglpr_jax.files import in_short, naming
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
 """Minimum size of a variable-length record before and after the points, in bytes."""
+_COMPRESSED = 0x80
+"""Bit of the point format in the header of a .laz file."""
 
 
 def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
@@ -21,14 +25,9 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
       ImportError: If the extra `las` is not installed.
       ValueError: If the file is not a readable .las file, is truncated, or has no points.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a .las file, found none")
-    try:
-        import laspy
-    except ImportError as error:
-        raise ImportError(f"{path}: .las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
+    laspy = _laspy(path)
     with naming(path):
-        _check_sizes(path)
+        _check_sizes(path, one_scan=True)
     try:
         with laspy.open(path) as stream:
             found = stream.read()
@@ -38,21 +37,56 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
         raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
 
 
-def _check_sizes(path: Path) -> None:
-    """Raise ValueError if the file is shorter than its header declares. laspy would read 2**32 missing records."""
+def las_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the points of a .las or .laz file of any size in parts, in metres, scaled by the header.
+
+    Raises the errors of `read_las`, and ImportError if a .laz file is given and lazrs is not installed.
+    """
+    laspy = _laspy(path)
+    if path.suffix.lower() == ".laz" and not laspy.LazBackend.detect_available():
+        raise ImportError(f"{path}: .laz files need lazrs (pip install 'sglpr-jax[las]')")
+    with naming(path):
+        _check_sizes(path, one_scan=False)
+    try:
+        with laspy.open(path) as stream:
+            for block in stream.chunk_iterator(BLOCK_POINTS):
+                yield np.stack([np.asarray(axis, np.float64) for axis in (block.x, block.y, block.z)], axis=1)
+    except Exception as error:  # laspy and lazrs raise many types
+        raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
+
+
+def _laspy(path: Path) -> ModuleType:
+    """The library. Raises FileNotFoundError if the file does not exist, and ImportError without the extra."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a .las file, found none")
+    try:
+        import laspy
+    except ImportError as error:
+        raise ImportError(f"{path}: .las files need the extra `las` (pip install 'sglpr-jax[las]')") from error
+    return laspy
+
+
+def _check_sizes(path: Path, *, one_scan: bool) -> None:
+    """Raise ValueError if the file is shorter than its header declares, or larger than a scan if it is one.
+
+    laspy would read 2**32 missing records.
+    """
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = stream.read(375).ljust(375, b"\0")
     if header[:4] != b"LASF" or size < 227:
         raise ValueError(f"expected a .las file, found an unreadable one ({size} bytes, which begin {header[:4]!r})")
-    header_size, start, records, _, width, points = struct.unpack_from("<HIIBHI", header, 94)
+    header_size, start, records, kind, width, points = struct.unpack_from("<HIIBHI", header, 94)
     extended_start = extended = 0
     if header[25] >= 4:  # version 1.4 has numbers of 64 bits
         extended_start, extended, points = struct.unpack_from("<QIQ", header, 235)
     missing = header_size + records * _RECORD_HEADER > start
     if missing or (extended and extended_start + extended * _EXTENDED_RECORD_HEADER > size):
         raise ValueError(f"expected {records} and {extended} records by the header, found {size} bytes in total")
-    check_points(points, bytes_each=width)
+    if one_scan:
+        check_points(points, bytes_each=width)
+    if kind & _COMPRESSED:
+        return
     held = max(size - start, 0) // max(width, 1)
     if points > held or (points < held and header[25] < 3):  # later versions may have records behind the points
         raise ValueError(f"expected {points} points by the header, found {held}")

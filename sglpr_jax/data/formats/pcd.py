@@ -1,17 +1,17 @@
 """Reads points from .pcd files, the format of the Point Cloud Library."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.lzf import decompress_lzf
 from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
-from sglpr_jax.data.formats.scan_size import check_points, read_content
+from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points, mapped_content, read_content
 
 _NUMBERS = {
     **{("F", 4): "<f4", ("F", 8): "<f8"},
@@ -50,6 +50,8 @@ class _Header:
     points: int
     """Number of points."""
     fields: tuple[_Field, ...]
+    encoding: str
+    """Word after DATA."""
 
     @property
     def unpadded(self) -> tuple[_Field, ...]:
@@ -72,22 +74,52 @@ def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
         raise ValueError(f"{path}: expected a readable .pcd file, found an invalid one: {error}") from error
 
 
-def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
+def pcd_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the points of a .pcd file in parts. The file may have any size if it has `DATA binary`.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is invalid, or has another encoding and exceeds the size of a scan.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a .pcd file, found none")
+    try:
+        content = mapped_content(path)
+        header, body = _split(content)
+        if header.encoding != "binary":
+            yield _decode(content).astype(np.float64)
+            return
+        points = _binary_records(header, body)
+        for start in range(0, len(points), BLOCK_POINTS):
+            block = points[start : start + BLOCK_POINTS]
+            yield np.stack([block[axis].astype(np.float64) for axis in AXES], axis=1)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a .pcd file of a map, preferably DATA binary, found {error}") from error
+
+
+def _split(content: bytes | memoryview) -> tuple[_Header, bytes | memoryview]:
+    """Header, and the bytes after it."""
     data = re.search(rb"^DATA[ \t]+(\w+)[^\n]*\n", content, flags=re.MULTILINE)
     if data is None:
         raise ValueError("expected a header that ends with a DATA line, found none")
-    header = _parse_header(content[: data.start()].decode("ascii", errors="replace"))
-    encoding, body = data[1], content[data.end() :]
-    if encoding == b"binary":
-        return _decode_binary(header, body)
-    if encoding == b"binary_compressed":
-        return _decode_compressed(header, body)
-    if encoding == b"ascii":
-        return _decode_ascii(header, body)
-    raise ValueError(f"expected DATA binary, binary_compressed or ascii, found {encoding.decode(errors='replace')}")
+    text = bytes(content[: data.start()]).decode("ascii", errors="replace")
+    return _parse_header(text, data[1].decode(errors="replace")), content[data.end() :]
 
 
-def _parse_header(text: str) -> _Header:
+def _decode(content: bytes | memoryview) -> Float32[np.ndarray, "n 3"]:
+    header, body = _split(content)
+    check_points(header.points, bytes_each=sum(field.width for field in header.fields))
+    if header.encoding == "binary":
+        points = _binary_records(header, body)
+        return _rows([points[axis] for axis in AXES])
+    if header.encoding == "binary_compressed":
+        return _decode_compressed(header, bytes(body))
+    if header.encoding == "ascii":
+        return _decode_ascii(header, bytes(body))
+    raise ValueError(f"expected DATA binary, binary_compressed or ascii, found {header.encoding}")
+
+
+def _parse_header(text: str, encoding: str) -> _Header:
     words = _keywords(text)
     missing = [keyword for keyword in ("FIELDS", "SIZE", "TYPE", "POINTS") if not words.get(keyword)]
     if missing:
@@ -97,8 +129,7 @@ def _parse_header(text: str) -> _Header:
     sides = [whole_number((words.get(side) or ["1"])[0], of=side) for side in ("WIDTH", "HEIGHT")]
     if "WIDTH" in words and sides[0] * sides[1] != points:
         raise ValueError(f"expected POINTS of WIDTH x HEIGHT, {sides[0]} x {sides[1]}, found {points}")
-    check_points(points, bytes_each=sum(field.width for field in fields))
-    return _Header(points, fields)
+    return _Header(points, fields, encoding)
 
 
 def _keywords(text: str) -> dict[str, list[str]]:
@@ -137,7 +168,8 @@ def _parse_fields(words: dict[str, list[str]]) -> tuple[_Field, ...]:
     return fields
 
 
-def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
+def _binary_records(header: _Header, body: bytes | memoryview) -> np.ndarray:
+    """Records with the fields x, y and z."""
     offsets = list(accumulate((field.width for field in header.fields), initial=0))
     axes = {field.name: column for column, field in enumerate(header.fields) if field.name in AXES}
     record = np.dtype(
@@ -149,10 +181,9 @@ def _decode_binary(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
         }
     )
     end = header.points * record.itemsize
-    if len(body) < end or body[end:].strip(b"\0\r\n\t "):  # some programs fill the last page with zeros
+    if len(body) < end or bytes(body[end:]).strip(b"\0\r\n\t "):  # some programs fill the last page with zeros
         raise ValueError(f"expected {header.points} points of {record.itemsize} bytes, found {len(body)} bytes")
-    points = np.frombuffer(body, record, header.points)
-    return _rows([points[axis] for axis in AXES])
+    return np.frombuffer(body, record, header.points)
 
 
 def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:

@@ -1,16 +1,16 @@
 """Reads the vertices of .ply files (Stanford format), in text or in binary of either byte order."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
-from sglpr_jax.data.formats.scan_size import check_points, read_content
+from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points, mapped_content, read_content
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -65,20 +65,48 @@ def read_ply(path: Path) -> Float32[np.ndarray, "n 3"]:
         raise ValueError(f"{path}: expected a readable .ply file, found an invalid one: {error}") from error
 
 
-def _decode(content: bytes) -> Float32[np.ndarray, "n 3"]:
+def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the vertices of a .ply file in parts. The file may have any size if it is binary.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file is invalid, or is in text and exceeds the size of a scan.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a .ply file, found none")
+    try:
+        content = mapped_content(path)
+        order, elements, body = _split(content)
+        if order == "ascii":
+            yield _decode(content).astype(np.float64)
+            return
+        points = _binary_records(body, elements, _ORDERS[order])
+        for start in range(0, len(points), BLOCK_POINTS):
+            block = points[start : start + BLOCK_POINTS]
+            yield np.stack([block[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a .ply file of a map, preferably binary, found {error}") from error
+
+
+def _split(content: bytes | memoryview) -> tuple[str, list[_Element], bytes | memoryview]:
+    """Format and elements of the header, and the bytes after it."""
     end = re.search(rb"^end_header[ \t\r]*\n", content, flags=re.MULTILINE)  # not a comment that contains the word
-    lines = content[: end.start()].decode("ascii", errors="replace").splitlines() if end else []
+    lines = bytes(content[: end.start()]).decode("ascii", errors="replace").splitlines() if end else []
     if end is None or not lines or lines[0].strip() != "ply":
         raise ValueError("expected a header from `ply` to `end_header`, found none")
-    order, elements = _parse_header(lines[1:])
+    return *_parse_header(lines[1:]), content[end.end() :]
+
+
+def _decode(content: bytes | memoryview) -> Float32[np.ndarray, "n 3"]:
+    order, elements, body = _split(content)
     at = _index_of_vertices(elements)
-    before, vertices, behind = elements[:at], elements[at], elements[at + 1 :]
-    columns = _columns(vertices)
-    check_points(vertices.count, bytes_each=sum(vertices.sizes))
-    body = content[end.end() :]
+    columns = _columns(elements[at])
+    check_points(elements[at].count, bytes_each=sum(elements[at].sizes))
     if order == "ascii":
-        return _read_text(body, before, vertices, behind)[:, columns]
-    return _read_binary(body[sum(element.bytes for element in before) :], vertices, behind, _ORDERS[order], columns)
+        return _read_text(bytes(body), elements[:at], elements[at], elements[at + 1 :])[:, columns]
+    records = _binary_records(body, elements, _ORDERS[order])
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
 
 
 def _parse_header(lines: Sequence[str]) -> tuple[str, list[_Element]]:
@@ -118,9 +146,11 @@ def _columns(vertices: _Element) -> list[int]:
     return [names.index(axis) for axis in "xyz"]
 
 
-def _read_binary(
-    body: bytes, vertices: _Element, behind: Sequence[_Element], order: str, columns: Sequence[int]
-) -> Float32[np.ndarray, "n 3"]:
+def _binary_records(body: bytes | memoryview, elements: Sequence[_Element], order: str) -> np.ndarray:
+    """Records of the vertices with the fields x, y and z."""
+    at = _index_of_vertices(elements)
+    vertices, columns = elements[at], _columns(elements[at])
+    body = body[sum(element.bytes for element in elements[:at]) :]
     offsets = list(accumulate(vertices.sizes, initial=0))
     kinds = [order + _TYPES[kind] for _, kind in vertices.properties]
     record = np.dtype(
@@ -134,15 +164,13 @@ def _read_binary(
     if len(body) < vertices.bytes:
         raise ValueError(f"expected {vertices.count} points of {record.itemsize} bytes, found {len(body)} bytes")
     end = vertices.bytes
-    for element in behind:
+    for element in elements[at + 1 :]:
         end = _end_of_lists(body, end, element, order) if element.is_list else end + element.bytes
     _check_end(len(body), end, unit="bytes")
-    records = np.frombuffer(body, record, count=vertices.count)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    return np.frombuffer(body, record, count=vertices.count)
 
 
-def _end_of_lists(body: bytes, at: int, element: _Element, order: str) -> int:
+def _end_of_lists(body: bytes | memoryview, at: int, element: _Element, order: str) -> int:
     """Position behind all instances of an element with lists, which starts at `at`. It may be behind the file."""
     steps = [_step(kind, name) for name, kind in element.properties]
     for _ in range(element.count):

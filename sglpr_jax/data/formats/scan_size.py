@@ -1,11 +1,14 @@
 """Bounds of the size of a scan. Headers may declare any size, so readers check it before they allocate memory."""
 
+import mmap
 from pathlib import Path
 
 MOST_POINTS = 1 << 24
 """Maximum number of points of a scan. A LiDAR of 128 beams returns about 2**18 points a turn."""
 MOST_BYTES = 32 * MOST_POINTS
 """Maximum size of a scan in bytes, not compressed."""
+BLOCK_POINTS = 1 << 21
+"""Number of points of a point cloud map that are read at a time."""
 
 
 def check_points(points: int, *, bytes_each: int = 1) -> None:
@@ -32,3 +35,9 @@ def read_content(path: Path) -> bytes:
     """Return the content of a scan file. Raises ValueError if the file exceeds `MOST_BYTES`."""
     check_bytes(path.stat().st_size)
     return path.read_bytes()
+
+
+def mapped_content(path: Path) -> memoryview:
+    """Return the content of a file of any size, which the system reads when it is used. Files must not be empty."""
+    with path.open("rb") as stream:
+        return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))

@@ -39,6 +39,8 @@ class Trajectory:
     """Description of the pose source."""
     by_row: bool = False
     """Whether row i belongs to frame i regardless of the times, because the times are those of the frames."""
+    rotations: np.ndarray | None = None
+    """Rotations (n, 3, 3) of the frames, or None for csv."""
 
 
 TIME_COLUMNS = ("t", "time", "timestamp")
@@ -145,10 +147,11 @@ def _read(path: Path, format: str, unit: TimeUnit) -> Trajectory:
         return _read_csv(path, unit)
     if format == "tum":
         poses, times = read_tum(path, time_unit=unit)
-        return Trajectory(poses[:, :3, 3], times, _said(path, "TUM"))
+        return Trajectory(poses[:, :3, 3], times, _said(path, "TUM"), rotations=poses[:, :3, :3])
     camera = format == "kitti"
     poses = read_kitti(path, camera=camera)
-    return Trajectory(poses[:, :3, 3], None, _said(path, "camera" if camera else "z up"))
+    said = _said(path, "camera" if camera else "z up")
+    return Trajectory(poses[:, :3, 3], None, said, rotations=poses[:, :3, :3])
 
 
 def _read_csv(path: Path, unit: TimeUnit) -> Trajectory:

@@ -54,7 +54,7 @@ def open_recording(
     """Open one sequence of `root`, in any supported layout.
 
     Arguments:
-      root: Folder of a dataset or of scans, or a bag.
+      root: Folder of a dataset or of scans, a bag, or a point cloud map with `poses`.
       name: Name of the sequence. It may be omitted if `root` has only one sequence.
       pose_source: Choice between the two pose files of KITTI's layout. Other layouts ignore it.
       format: Format of the scan files, for a plain folder and for KITTI's layout. "auto" detects it.
@@ -62,8 +62,8 @@ def open_recording(
         some scans. "auto" estimates them only if the layout does not define the mounting.
       gravity: "recording" uses one mounting for all scans, and "scan" estimates height and up of each scan, which reads
         all scans. "auto" does so if the mounting is estimated and some scans show that the sensor tilts.
-      poses: Pose file of a plain folder, if it is not beside the scans.
-      pose_format: Format of the pose file of a plain folder.
+      poses: Pose file of a point cloud map, or of a plain folder if it is not beside the scans.
+      pose_format: Format of the pose file.
       times: File of timestamps of a plain folder, if it is not beside the scans.
       time_unit: Unit of the times in text files of a plain folder or of KITTI's layout. "auto" expects seconds.
       pose_topic: Pose topic of a bag. By default, the topic that covers the largest number of scans is used.

@@ -1,0 +1,177 @@
+"""Reader of a point cloud map that another tool made (.pcd, .ply, .las, .laz), with the trajectory of its LiDAR.
+
+- `town.pcd`: points in metres.
+- `trajectory.tum`: poses of the LiDAR in the frame of the points.
+
+The recording has a scan for each pose. A scan is computed from the map on access: the visible points within the reach
+of an image. Poses without points around them are left out.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sglpr_jax.data.choices import PoseFormat, TimeUnit
+from sglpr_jax.data.formats.cloud_files import cloud_blocks, is_cloud_file
+from sglpr_jax.data.formats.timed_poses import poses_of
+from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
+from sglpr_jax.data.readable import only
+from sglpr_jax.data.reader import Reader
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.tiled_cloud import TiledCloud, tiled_cloud
+from sglpr_jax.data.visible_points import visible_points
+from sglpr_jax.data.warning import warn
+
+REACH_M = 36.0
+"""Maximum distance of a point from the sensor, in metres: the corner of an image of 50 m."""
+AROUND_M = 20.0
+"""Distance in x, y and z within which a pose has points of the map, in metres."""
+POSES_CHECKED = 11
+"""Number of poses whose height above the ground is measured, spread over the trajectory."""
+LOWEST_M = 0.25
+"""Minimum height of a LiDAR above the ground, in metres. Lower poses are those of the robot's base."""
+
+
+def recording_names(root: Path) -> tuple[str, ...]:
+    """Return the name of the map without its ending, or an empty tuple if `root` is another file or a folder."""
+    return (root.stem,) if is_cloud_file(root) else ()
+
+
+def open_recording(
+    root: Path,
+    *,
+    poses: Path | None = None,
+    pose_format: PoseFormat = "auto",
+    times: Path | None = None,
+    time_unit: TimeUnit = "auto",
+) -> Recording:
+    """Read a map, and open the scans that its LiDAR would measure at each pose. Warns if the poses look wrong.
+
+    Arguments:
+      root: File of the map.
+      poses: Pose file of the LiDAR, in the frame of the map.
+      pose_format: Format of the pose file.
+      times: File of timestamps, one for each pose.
+      time_unit: Unit of the times (`times_of`).
+
+    Raises:
+      FileNotFoundError: If `poses` or `times` does not exist.
+      ValueError: If there are no poses, a file is malformed, no pose has points around it, or the map is too large.
+      ImportError: If the map is a .las or .laz file and the extra `las` is not installed.
+    """
+    if poses is None:
+        raise ValueError(
+            f"{root}: expected a point cloud map with the poses of its LiDAR (--poses trajectory.tum), found no poses;"
+            " put single scans into a folder, or read them with read_scan"
+        )
+    path = read_trajectory(poses, format=pose_format, times=times, time_unit=time_unit)
+    unturned = np.tile(np.eye(3), (len(path.positions), 1, 1))
+    world_from_lidar = poses_of(path.positions, unturned if path.rotations is None else path.rotations)
+    cloud = tiled_cloud(cloud_blocks(root), positions=path.positions, reach_m=REACH_M, source=root)
+    kept = _has_points(cloud, path.positions)
+    _check_kept(kept, cloud, path.positions, root, poses)
+    world_from_lidar = _raised(cloud, world_from_lidar, np.flatnonzero(kept), poses)
+    ids = tuple(f"{row:06d}" for row in range(len(kept)))
+    recording = Recording(
+        name=root.stem,
+        ids=ids,
+        positions=world_from_lidar[:, :3, 3],
+        times=path.times,
+        pose_source=path.source,
+        paths=tuple(Path(scan) for scan in ids),
+        read=partial(_read, cloud=cloud, world_from_lidar=world_from_lidar),
+        on_disk=False,
+        world_from_lidar=world_from_lidar,
+        containers=(root,),
+        found=(f"format: {_described(root, cloud)}",),
+    )
+    return recording if kept.all() else only(recording, np.flatnonzero(kept).tolist())
+
+
+def _described(root: Path, cloud: TiledCloud) -> str:
+    points = f"{cloud.read} points, {len(cloud.points)} of them used (near the trajectory, one per voxel, not moving)"
+    return f"point cloud map {root.name}, {points}, {cloud.spacing_m:.2f} m apart; scans computed from it"
+
+
+def _read(
+    path: Path, labels: Path | None, lasers: bool, *, cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"]
+) -> Record:
+    points = _points_at(cloud, world_from_lidar[int(path.name)])
+    return Record(points=visible_points(points, spacing_m=cloud.spacing_m, reach_m=REACH_M))
+
+
+def _points_at(cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "4 4"]) -> np.ndarray:
+    """All points around a pose, in the LiDAR frame."""
+    return cloud.near(world_from_lidar[:3, 3], REACH_M) @ world_from_lidar[:3, :3].astype(np.float32)
+
+
+def _has_points(cloud: TiledCloud, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Whether the map has points around each position."""
+    from scipy.spatial import KDTree  # imported here because the import is slow
+
+    cells = np.unique(np.round(cloud.points / AROUND_M).astype(np.int32), axis=0)
+    if not len(cells):
+        return np.zeros(len(positions), bool)
+    return KDTree(cells * AROUND_M).query(positions - cloud.origin, p=np.inf)[0] < AROUND_M
+
+
+def _check_kept(
+    kept: Bool[np.ndarray, " n"], cloud: TiledCloud, positions: Float[np.ndarray, "n 3"], root: Path, poses: Path
+) -> None:
+    """Raise ValueError if no pose has points around it. Warn if some have none."""
+    if kept.all():
+        return
+    lost = np.flatnonzero(~kept)
+    box = _box(cloud.lowest, cloud.highest)
+    if len(lost) == len(kept):
+        found = _box(positions.min(axis=0), positions.max(axis=0))
+        raise ValueError(
+            f"{poses}: expected poses in the frame of {root.name}, which covers {box}, found poses at {found}"
+        )
+    first = ", ".join(f"{value:.1f}" for value in positions[lost[0]])
+    warn(
+        f"{poses}: expected points of {root.name} within {AROUND_M:g} m of each pose, found none at {len(lost)} of"
+        f" {len(kept)} poses, which are left out, the first in row {lost[0] + 1} at ({first}); the map covers {box}"
+    )
+
+
+def _box(lowest: Float[np.ndarray, "3"], highest: Float[np.ndarray, "3"]) -> str:
+    ends = zip("xyz", lowest, highest, strict=True)
+    return ", ".join(f"{axis} {low:.0f} to {high:.0f} m" for axis, low, high in ends)
+
+
+def _raised(
+    cloud: TiledCloud, world_from_lidar: Float[np.ndarray, "n 4 4"], rows: np.ndarray, poses: Path
+) -> Float[np.ndarray, "n 4 4"]:
+    """Return the poses, or poses above them with a warning if they are at the height of the ground."""
+    checked = rows[np.unique(np.linspace(0, len(rows) - 1, POSES_CHECKED).astype(int))]
+    found = common_mounting(estimate_mounting(_points_at(cloud, world_from_lidar[row])) for row in checked)
+    if found is None or abs(found.height_m) > LOWEST_M:
+        return world_from_lidar
+    raised_m = MODEL_HEIGHT_M - found.height_m
+    warn(
+        f"{poses}: expected poses of the LiDAR, found poses {found.height_m:.2f} m above the ground, as of the robot's"
+        f" base; the scans are computed {raised_m:.2f} m above them"
+    )
+    lidar = np.eye(4)
+    lidar[:3, 3] = raised_m * np.array(found.up)
+    return world_from_lidar @ lidar
+
+
+READER = Reader(
+    layout="*.pcd, *.ply, *.las or *.laz (point cloud map, with poses)",
+    recording_names=recording_names,
+    open=lambda root, name, options: open_recording(
+        root,
+        poses=options.poses,
+        pose_format=options.pose_format,
+        times=options.times,
+        time_unit=options.time_unit,
+    ),
+    knows_mounting=False,
+    takes_poses=True,
+)

@@ -1,0 +1,164 @@
+"""A point cloud map with the trajectory of its LiDAR: scans are computed at the poses."""
+
+import laspy
+import numpy as np
+import pytest
+
+from sglpr_jax.data import open_recording
+from sglpr_jax.data.formats import las
+from sglpr_jax.data.formats.cloud_files import cloud_blocks
+from sglpr_jax.data.readers import cloud_map
+from sglpr_jax.data.readers.cloud_map import REACH_M
+from sglpr_jax.data.tiled_cloud import TILE_M, tiled_cloud
+from sglpr_jax.data.warning import DataWarning
+
+HEIGHT_M = 1.5
+ORIGIN = np.array([1000.0, -2000.0, 40.0])
+"""Where the street begins, as in a frame with large coordinates."""
+
+
+def street():
+    """Ground along x, a house on the left, and a wall behind it that no place of the street shows."""
+    x, y = np.meshgrid(np.arange(-40, 80, 0.2), np.arange(-12, 12, 0.2))
+    ground = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    x, z = np.meshgrid(np.arange(-40, 80, 0.2), np.arange(0, 8, 0.2))
+    house = np.stack([x.ravel(), np.full(x.size, 8.0), z.ravel()], axis=1)
+    return np.concatenate([ground, house, house + np.array([0, 4, 0])]) + ORIGIN
+
+
+def write_pcd(path, points):
+    header = f"FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nPOINTS {len(points)}\nDATA binary\n"
+    path.write_bytes(header.encode() + points.astype("<f8").tobytes())
+    return path
+
+
+def write_ply(path, points):
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    path.write_bytes(f"{header}{properties}end_header\n".encode() + points.astype("<f8").tobytes())
+    return path
+
+
+def write_las(path, points):
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.offsets, header.scales = np.round(points.min(axis=0)), [0.001] * 3
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.write(path)
+    return path
+
+
+def write_tum(path, positions, quaternion=(0, 0, 0, 1)):
+    rows = [[0.5 + 0.1 * i, *position, *quaternion] for i, position in enumerate(positions)]
+    np.savetxt(path, rows, fmt="%.6f")
+    return path
+
+
+def along(count=5, height_m=HEIGHT_M, start=ORIGIN):
+    return start + np.stack([np.arange(count) * 5.0, np.zeros(count), np.full(count, height_m)], axis=1)
+
+
+@pytest.fixture
+def opened(tmp_path):
+    town = write_pcd(tmp_path / "town.pcd", street())
+    way = tmp_path / "way.tum"
+    return lambda positions, **options: open_recording(town, poses=write_tum(way, positions, **options))
+
+
+def test_a_scan_has_the_visible_points_around_its_pose(opened):
+    recording = opened(along())
+    assert (recording.name, recording.ids[2], len(recording)) == ("town", "000002", 5)
+    np.testing.assert_allclose(recording.world_from_lidar[:, :3, 3], along())
+    assert recording.mounting.height_m == pytest.approx(HEIGHT_M, abs=0.02)
+    assert "point cloud map town.pcd" in recording.description[1]
+    points = recording.points(2)
+    assert len(points) > 1000 and np.linalg.norm(points, axis=1).max() <= REACH_M
+    house, behind = (points[np.abs(points[:, 1] - y) < 0.01] for y in (8, 12))
+    assert len(behind) < 0.35 * len(house), "the house hides most of the wall behind it"
+    assert np.ptp(house[:, 0]) > 60
+
+
+def test_points_are_in_the_frame_of_the_lidar(opened):
+    ahead = opened(along()).points(1)
+    left = opened(along(), quaternion=(0, 0, np.sqrt(0.5), np.sqrt(0.5))).points(1)  # 90 degrees
+    assert ahead[:, 1].max() > 7.9 and left[:, 0].max() == pytest.approx(ahead[:, 1].max(), abs=1e-2)
+
+
+@pytest.mark.parametrize("write", [write_pcd, write_ply, write_las])
+def test_every_format_has_the_same_points(write, tmp_path, monkeypatch):
+    points = street()[::50]
+    for module in ("pcd", "ply", "las"):
+        monkeypatch.setattr(f"sglpr_jax.data.formats.{module}.BLOCK_POINTS", 1000)
+    blocks = list(cloud_blocks(write(tmp_path / f"map.{write.__name__[6:]}", points)))
+    assert len(blocks) > 1 and max(map(len, blocks)) == 1000
+    np.testing.assert_allclose(np.concatenate(blocks), points, atol=6e-4)
+
+
+def test_text_is_read_as_one_block(tmp_path):
+    path = tmp_path / "map.pcd"
+    path.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n")
+    np.testing.assert_array_equal(*cloud_blocks(path), [[1, 2, 3], [4, 5, 6]])
+
+
+def test_a_laz_file_needs_lazrs(tmp_path, monkeypatch):
+    monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
+    path = write_las(tmp_path / "map.las", street()[::50]).rename(tmp_path / "map.laz")
+    with pytest.raises(ImportError, match=r"map\.laz: \.laz files need lazrs \(pip install 'sglpr-jax\[las\]'\)"):
+        next(las.las_blocks(path))
+
+
+def test_a_tiled_cloud_has_one_point_per_voxel_near_the_trajectory(tmp_path):
+    rng = np.random.default_rng(5)
+    cloud = rng.uniform([-150, -150, -3], [150, 150, 3], (40_000, 3))
+    positions = np.array([[0.0, 0, 0], [60, 0, 0]])
+    found = tiled_cloud(np.array_split(cloud, 7), positions=positions, reach_m=30.0, source=tmp_path)
+    assert found.read == len(cloud)
+    np.testing.assert_array_equal((found.lowest, found.highest), (cloud.min(axis=0), cloud.max(axis=0)))
+    everything = {tuple(row) for row in cloud.astype(np.float32).tolist()}
+    assert {tuple(row) for row in found.points.tolist()} <= everything
+    voxels = np.floor(found.points.astype(float) / 0.1)
+    assert len(np.unique(voxels, axis=0)) == len(voxels)
+    for position in positions:
+        near = found.near(position, 30.0)
+        assert np.abs(near[:, :2]).max() <= 30 + TILE_M
+        inside = np.abs(cloud[:, :2] - position[:2]).max(axis=1) <= 30
+        expected = np.unique(np.floor(cloud[inside].astype(np.float32).astype(float) / 0.1), axis=0)
+        assert np.count_nonzero(np.abs(near[:, :2]).max(axis=1) <= 30) == pytest.approx(len(expected), abs=2)
+
+
+def test_a_map_needs_poses_in_its_frame(opened, tmp_path):
+    with pytest.raises(ValueError, match=r"town\.pcd: expected a point cloud map with the poses .*found no poses"):
+        open_recording(tmp_path / "town.pcd")
+    for start in (np.zeros(3), ORIGIN + np.array([0, 0, 200])):
+        message = r"way\.tum: expected poses in the frame of town\.pcd, which covers x 960 to 1080 m, .* found poses at"
+        with pytest.raises(ValueError, match=message):
+            opened(along(start=start))
+
+
+def test_poses_without_points_are_left_out(opened):
+    positions = np.concatenate([along(3), along(2, start=ORIGIN + np.array([500, 0, 0]))])
+    with pytest.warns(DataWarning, match=r"expected points .* found none at 2 of 5 poses, .*in row 4 at \(1500"):
+        recording = opened(positions)
+    assert recording.ids == ("000000", "000001", "000002") and len(recording.points(2))
+
+
+def test_poses_of_the_base_are_raised(opened):
+    with pytest.warns(DataWarning, match=r"expected poses of the LiDAR, found poses 0\.0\d m above the ground"):
+        recording = opened(along(height_m=0.05))
+    np.testing.assert_allclose(recording.world_from_lidar[:, 2, 3], ORIGIN[2] + 1.73, atol=0.03)
+    assert recording.mounting.height_m == pytest.approx(1.73, abs=0.03)
+
+
+def test_damaged_and_too_large_maps(tmp_path, monkeypatch):
+    path = tmp_path / "town.pcd"
+    write_pcd(path, street()).write_bytes(path.read_bytes()[:-1])
+    way = write_tum(tmp_path / "way.tum", along())
+    with pytest.raises(ValueError, match=r"town\.pcd: expected a .pcd file of a map.*points of 24 bytes, found"):
+        open_recording(path, poses=way)
+    monkeypatch.setattr("sglpr_jax.data.tiled_cloud.MOST_POINTS", 100)
+    with pytest.raises(ValueError, match=r"town\.pcd: expected at most 100 points in voxels of 0\.1 m .*cut the cloud"):
+        open_recording(write_pcd(path, street()), poses=way)
+    write_pcd(path, np.full((3, 3), np.nan))
+    with pytest.raises(ValueError, match=r"town\.pcd: expected finite points, found none"):
+        open_recording(path, poses=way)
+    assert cloud_map.recording_names(tmp_path) == ()
