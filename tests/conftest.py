@@ -26,21 +26,22 @@ COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or f"{HOME}/.cache") / "sglpr-j
 KEPT = {"JAX_COMPILATION_CACHE_DIR": str(COMPILED), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 jax.config.update("jax_compilation_cache_dir", str(COMPILED))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-os.environ |= KEPT  # for the processes that tests start
+COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+"""XLA's older code generator, on one thread: it compiles a training step in less than half the time."""
+os.environ |= KEPT | {"XLA_FLAGS": f"{COMPILE} {os.environ.get('XLA_FLAGS', '')}"}  # for the processes tests start, too
 
 TESTS = Path(__file__).resolve().parent
-QUICKLY = (
-    "benchmark_programs/test_gpu.py",
-    "benchmark_programs/test_load.py",
-    "benchmark_programs/test_scores.py",
-    "benchmark_programs/test_speed.py",
-    "cli/",
-    "docs/",
-    "training/",
-    "test_wheel.py",
+RUN_LONG = (
+    "benchmark_programs/test_loops.py",
+    "cli/test_loops",
+    "cli/test_map.py",
+    "loops/",
+    "sim/",
 )
-"""Tests of what happens with numbers. XLA compiles their programs without optimizing, in half the time. The tests of
-the numbers themselves compile programs as users do."""
+"""Tests whose programs run for longer than they compile: XLA optimizes them. It compiles the other programs without
+optimizing, in a fifth of the time."""
+AS_USERS_DO = ("models/test_shipped.py",)
+"""Optimized, too: descriptors of the shipped weights."""
 AS_INSTALLED = ("benchmark_programs/", "cli/", "docs/")
 """Tests that run whole programs as users do, without the type checks that the tests of the library have."""
 MOST_GROWTH = 1.5e9
@@ -50,7 +51,7 @@ MOST_GROWTH = 1.5e9
 @pytest.hookimpl(tryfirst=True)  # before fixtures of any scope compile
 def pytest_runtest_setup(item):
     where = item.path.relative_to(TESTS).as_posix()
-    quickly = where.startswith(QUICKLY) and "loops" not in where  # their programs run for longer than they compile
+    quickly = not where.startswith(RUN_LONG + AS_USERS_DO)
     if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") != str(int(quickly)):
         jax.clear_caches()  # of programs compiled the other way
         jax.config.update("jax_disable_most_optimizations", quickly)

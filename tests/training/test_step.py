@@ -18,19 +18,9 @@ from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.state import new_state
 from sglpr_jax.training.step import _chunks, gradients, summarize, train_step
 
+from .conftest import SWIN
+
 FAST_COMPILE = {"xla_backend_optimization_level": 0}
-
-
-@pytest.fixture(scope="session")
-def config(config):
-    """With one block in place of two, which is compiled in half the time: twenty programs are."""
-    backbone = dataclasses.replace(config.model.backbone, depths=(1,))
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, backbone=backbone))
-
-
-@pytest.fixture(scope="session")
-def params(config, random_params):
-    return random_params(config.model)
 
 
 @functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILE)
@@ -247,8 +237,8 @@ def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, ran
 @pytest.mark.slow
 def test_both_passes_over_a_chunk_drop_the_same_branches(config, random_params, make_batch):
     """With stochastic depth, too, the gradient is that of one function, in which every chunk has its own key."""
-    backbone = dataclasses.replace(config.model.backbone, depths=(2,), drop_path=0.5)
-    config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(config.model, backbone=backbone))
+    backbone = dataclasses.replace(SWIN.backbone, drop_path=0.5)
+    config = dataclasses.replace(config, chunk=4, model=dataclasses.replace(SWIN, backbone=backbone))
     params, batch = random_params(config.model), jax.tree.map(jnp.asarray, make_batch(0))
 
     def loss_of(weights, backbone=backbone):
