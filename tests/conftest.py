@@ -4,6 +4,7 @@ import contextlib
 import os
 import resource
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
@@ -35,6 +37,9 @@ RUN_LONG = (
     "benchmark_programs/test_loops.py",
     "cli/test_loops",
     "cli/test_map.py",
+    "docs/test_blocks.py::test_python_runs[README.md]",
+    "docs/test_blocks.py::test_python_runs[docs/guides/loops.md]",
+    "docs/test_blocks.py::test_python_runs[docs/guides/maps.md]",
     "loops/",
     "sim/",
 )
@@ -50,7 +55,7 @@ MOST_GROWTH = 1.5e9
 
 @pytest.hookimpl(tryfirst=True)  # before fixtures of any scope compile
 def pytest_runtest_setup(item):
-    where = item.path.relative_to(TESTS).as_posix()
+    where = item.nodeid.removeprefix(f"{TESTS.name}/")
     quickly = not where.startswith(RUN_LONG + AS_USERS_DO)
     if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") != str(int(quickly)):
         jax.clear_caches()  # of programs compiled the other way
@@ -68,6 +73,24 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no development data at {SHARED} (licences forbid shipping it)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """`once(name, make)` returns a folder that `make(folder)` fills once for all workers of a run. No test changes
+    it."""
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        base = tmp_path_factory.getbasetemp()
+        base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+        folder, whole = base / name, base / f"{name}.whole"
+        with FileLock(base / f"{name}.lock"):
+            if not whole.exists():
+                make(folder)
+                whole.touch()
+        return folder
+
+    return made
 
 
 _freed_at = [0.0]

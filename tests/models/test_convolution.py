@@ -73,7 +73,7 @@ def test_the_gradient_is_xlas(size, strides, circular, shape):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("channels", [3, 6])
-@pytest.mark.parametrize("size, strides, circular", CASES[:5])
+@pytest.mark.parametrize("size, strides, circular", CASES[1:5:3])
 def test_derivatives_are_those_of_finite_differences(size, strides, circular, channels):
     def convolved(x, kernel):  # finite differences are of numpy arrays
         return convolve(jnp.asarray(x), jnp.asarray(kernel), strides, circular)

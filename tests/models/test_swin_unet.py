@@ -26,7 +26,7 @@ def variables(random_variables, images):
 
 @pytest.fixture(scope="module")
 def tokens(variables, images):
-    return MODEL.apply(variables, images)[0]
+    return jax.jit(MODEL.apply)(variables, images)[0]
 
 
 def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, tokens):
@@ -34,7 +34,6 @@ def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, toke
         return MODEL.apply(variables, x)[0]
 
     assert tokens.shape == (3, 8, 8, 8)
-    np.testing.assert_allclose(jax.jit(apply)(images), tokens, atol=2e-5)
     np.testing.assert_allclose(jax.jit(jax.vmap(apply))(images[:, None])[:, 0], tokens, atol=2e-5)
     np.testing.assert_allclose(jax.jit(apply)(images[1:2]), tokens[1:2], atol=2e-5)
 
