@@ -87,6 +87,7 @@ def test_a_second_run_takes_the_descriptors_that_are_there(stress, rings):
     assert clean.stat().st_mtime_ns == written
 
 
+@pytest.mark.slow
 def test_descriptors_of_other_settings_are_never_taken(stress, rings, trained, random_params, tmp_path):
     options = ("--method", "solid", "--corruption", "dropout-0.5")
     _, out = stress(*options, "--data", rings)

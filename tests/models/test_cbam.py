@@ -22,6 +22,7 @@ def to_flax(state):
     return {"channel": channel, "spatial": {"convolution": {"kernel": kernel, "bias": bias}}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tag", "reduction"), [("c32_r16", 16), ("c32_r4", 4), ("c32_r4_nospatial", 4)])
 def test_output_and_gradients_agree(tag, reduction, golden, assert_parity):
     expected = {key.removeprefix(f"{tag}/"): x for key, x in golden("cbam").items() if key.startswith(f"{tag}/")}

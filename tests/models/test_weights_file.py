@@ -63,6 +63,7 @@ def with_fine_blocks(*channels):
     return dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=rings, head=head)
 
 
+@pytest.mark.slow
 def test_a_network_grown_by_fine_blocks_begins_as_the_smaller_one():
     small = sglpr_jax.init(jax.random.key(0), config=with_fine_blocks(5))
     grown = graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks(5, 6)))

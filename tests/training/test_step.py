@@ -53,6 +53,7 @@ def test_chunks_give_the_gradient_and_metrics_of_the_whole_batch(config, params,
     assert np.abs(gradient["place_head"]["netvlad"]["centres"]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_without_labels_the_triplet_loss_is_all_in_chunks_too(config, params, make_batch):
     batch = make_batch(0, images=True)
     gradient, metrics = gradients_of(params, batch, config)
@@ -137,6 +138,7 @@ def test_a_batch_without_one_labelled_place_has_no_segmentation_loss(config, par
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_segmenting_every_second_image_is_as_if_the_others_had_no_labels(config, params, make_batch):
     batch = make_batch(0)
     every_second = batch.replace(labelled=batch.labelled & (np.arange(config.images) % 2 == 0))
@@ -176,6 +178,7 @@ def test_a_term_without_weight_is_not_computed(config, params, make_batch, whole
     np.testing.assert_allclose(metrics["loss"], metrics["triplet"] + share * metrics[kept], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tap", ["tokens", "pixels"])
 def test_the_segmentation_may_learn_alone_and_leaves_descriptors_as_they_are(config, random_params, make_batch, tap):
     head = dataclasses.replace(config.model.head, tap=tap)
@@ -221,6 +224,7 @@ def test_where_nothing_reads_labels_there_are_no_categories(config):
         assert settled.model.categories == categories
 
 
+@pytest.mark.slow
 def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, random_params, make_batch):
     head = dataclasses.replace(config.model.head, input="counts+labels")
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
