@@ -41,6 +41,7 @@ RUN_LONG = (
     "docs/test_blocks.py::test_python_runs[docs/guides/loops.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/maps.md]",
     "loops/",
+    "sim/",
 )
 """Tests whose programs run for longer than they compile: XLA optimizes them. It compiles the other programs without
 optimizing, in a fifth of the time."""

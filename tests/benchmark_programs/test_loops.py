@@ -19,7 +19,7 @@ from .programs import SENSOR, printed
 
 pytestmark = pytest.mark.slow
 CHEAPER = ("--weights", "circular")
-SMALL = ("--scans", "100", "--azimuth-steps", "120", "--towns", "08:3", *CHEAPER)
+SMALL = ("--scans", "100", "--azimuth-steps", "120", "--towns", "08:3")
 
 
 def test_loops_are_scored_on_simulated_drives():
