@@ -230,7 +230,7 @@ def test_a_head_that_reads_labels_learns_from_the_maps_in_chunks_too(config, ran
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, head=head))
     params, batch = random_params(config.model), make_batch(0)
     gradient, metrics = gradients_of(params, batch, config)
-    assert set(metrics) == {"loss", "triplet", "violations"} and set(gradient) == {"place_head"}
+    assert set(metrics) == {"loss", "triplet", "violations"} and set(gradient) == {"patch_embed", "place_head"}
     assert_same(gradients_of(params, batch, dataclasses.replace(config, chunk=4)), (gradient, metrics))
     relabelled = batch.replace(classes=(batch.classes + 1) % 20)
     assert gradients_of(params, relabelled, config)[1]["triplet"] != metrics["triplet"]
