@@ -4,6 +4,7 @@ import contextlib
 import os
 import resource
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.params import Params
@@ -26,21 +28,25 @@ COMPILED = Path(os.environ.get("XDG_CACHE_HOME") or f"{HOME}/.cache") / "sglpr-j
 KEPT = {"JAX_COMPILATION_CACHE_DIR": str(COMPILED), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 jax.config.update("jax_compilation_cache_dir", str(COMPILED))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-os.environ |= KEPT  # for the processes that tests start
+COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+"""XLA's older code generator, on one thread: it compiles a training step in less than half the time."""
+os.environ |= KEPT | {"XLA_FLAGS": f"{COMPILE} {os.environ.get('XLA_FLAGS', '')}"}  # for the processes tests start, too
 
 TESTS = Path(__file__).resolve().parent
-QUICKLY = (
-    "benchmark_programs/test_gpu.py",
-    "benchmark_programs/test_load.py",
-    "benchmark_programs/test_scores.py",
-    "benchmark_programs/test_speed.py",
-    "cli/",
-    "docs/",
-    "training/",
-    "test_wheel.py",
+RUN_LONG = (
+    "benchmark_programs/test_loops.py",
+    "cli/test_loops",
+    "cli/test_map.py",
+    "docs/test_blocks.py::test_python_runs[README.md]",
+    "docs/test_blocks.py::test_python_runs[docs/guides/loops.md]",
+    "docs/test_blocks.py::test_python_runs[docs/guides/maps.md]",
+    "loops/",
+    "sim/",
 )
-"""Tests of what happens with numbers. XLA compiles their programs without optimizing, in half the time. The tests of
-the numbers themselves compile programs as users do."""
+"""Tests whose programs run for longer than they compile: XLA optimizes them. It compiles the other programs without
+optimizing, in a fifth of the time."""
+AS_USERS_DO = ("models/test_shipped.py",)
+"""Optimized, too: descriptors of the shipped weights."""
 AS_INSTALLED = ("benchmark_programs/", "cli/", "docs/")
 """Tests that run whole programs as users do, without the type checks that the tests of the library have."""
 MOST_GROWTH = 1.5e9
@@ -49,8 +55,8 @@ MOST_GROWTH = 1.5e9
 
 @pytest.hookimpl(tryfirst=True)  # before fixtures of any scope compile
 def pytest_runtest_setup(item):
-    where = item.path.relative_to(TESTS).as_posix()
-    quickly = where.startswith(QUICKLY) and "loops" not in where  # their programs run for longer than they compile
+    where = item.nodeid.removeprefix(f"{TESTS.name}/")
+    quickly = not where.startswith(RUN_LONG + AS_USERS_DO)
     if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") != str(int(quickly)):
         jax.clear_caches()  # of programs compiled the other way
         jax.config.update("jax_disable_most_optimizations", quickly)
@@ -67,6 +73,24 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"no development data at {SHARED} (licences forbid shipping it)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """`once(name, make)` returns a folder that `make(folder)` fills once for all workers of a run. No test changes
+    it."""
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        base = tmp_path_factory.getbasetemp()
+        base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+        folder, whole = base / name, base / f"{name}.whole"
+        with FileLock(base / f"{name}.lock"):
+            if not whole.exists():
+                make(folder)
+                whole.touch()
+        return folder
+
+    return made
 
 
 _freed_at = [0.0]

@@ -111,6 +111,7 @@ def test_whoever_comes_second_into_a_folder_is_refused_until_it_is_left(tmp_path
         assert names(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_the_package_works_without_fcntl():
     code = """
 import sys

@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import io
+import json
 import os
 import sys
 from collections.abc import Callable
@@ -62,9 +63,9 @@ def _own_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def town(tmp_path_factory) -> Path:
+def town(once) -> Path:
     """Recordings 00, 05 and 08 of 40 thin scans, with labels; 08 revisits places."""
-    return write_dataset(tmp_path_factory.mktemp("data") / "town", scans=SCANS, sensor=SENSOR)
+    return once("town", lambda root: write_dataset(root, scans=SCANS, sensor=SENSOR))
 
 
 @pytest.fixture(scope="session")
@@ -114,12 +115,16 @@ class Trained(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def trained(town, preset, tmp_path_factory) -> Trained:
+def trained(town, preset, once) -> Trained:
     """The run that several tests look at; nobody changes it."""
-    folder = tmp_path_factory.mktemp("runs") / "tiny-08"
-    ended = run_command("train", "--seq", "08", "--data", town, "--preset", preset, "--out", folder)
-    assert ended.status == 0, ended.error
-    return Trained(folder, ended)
+
+    def make(root: Path) -> None:
+        ended = run_command("train", "--seq", "08", "--data", town, "--preset", preset, "--out", root / "tiny-08")
+        assert ended.status == 0, ended.error
+        (root / "ended.json").write_text(json.dumps(ended))
+
+    root = once("runs", make)
+    return Trained(root / "tiny-08", Ended(*json.loads((root / "ended.json").read_text())))
 
 
 @pytest.fixture

@@ -16,18 +16,12 @@ from .conftest import assert_one_line_error, run_command
 
 BACKBONE = {"backbone", "expand", "place_head"}
 SETTINGS = {  # flags, the parts that have weights, the loss terms beside the triplet's
-    "no CBAM, 34, cross-entropy": (
-        "--model.head.cbam False --model.categories 34 --loss.dice-weight 0",
-        {*BACKBONE, "segmentation_head"},
-        {"cross_entropy"},
-    ),
     "nor NetVLAD, 25, Dice, not turned": (
         "--model.head.cbam False --model.head.pooling mean --model.categories 25 --loss.ce-weight 0 --rotate False",
         {*BACKBONE, "segmentation_head"},
         {"dice"},
     ),
     "triplet alone": ("--loss.ce-weight 0 --loss.dice-weight 0", BACKBONE, set()),
-    "RB": ("--model.head.input counts", {"place_head"}, set()),
     "RS, 6": ("--model.head.input labels --model.categories 6", {"place_head"}, set()),
     "RB+RS, 15": ("--model.head.input counts+labels --model.categories 15", {"place_head"}, set()),
 }

@@ -94,6 +94,7 @@ def test_a_training_can_begin_with_them(command, preset, state, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, begun.weights, given.weights)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_converted_is_one_line(command, preset, state, tmp_path):
     (tmp_path / "swin.pth").write_bytes(b"a pickle")
     file = written(tmp_path / "unet.safetensors", {**state, "more.weight": np.zeros(3, np.float32)})

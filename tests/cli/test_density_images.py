@@ -40,6 +40,7 @@ def described(params: Params, recording: Recording, angles: np.ndarray) -> np.nd
     return np.asarray(sglpr_jax.describe(params, images))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [(), ("--rotate", "--seed", 1)])
 def test_embedding_makes_density_images_of_turned_points(command, params, town, tmp_path, seed):
     folder, out = sglpr_jax.save(params, tmp_path / "weights"), tmp_path / "08.npz"
@@ -52,6 +53,7 @@ def test_embedding_makes_density_images_of_turned_points(command, params, town, 
     assert found.config["model"]["image"] == "density"
 
 
+@pytest.mark.slow
 def test_training_sees_the_same_images(params, town):
     recording = sglpr_jax.open_recording(town, "08")
     config = TrainConfig(

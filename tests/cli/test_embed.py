@@ -174,6 +174,7 @@ def test_weights_beside_a_method_that_has_none_are_refused(embed, town):
     assert_one_line_error(ended, "sglpr: expected --method sglpr with --weights, found solid")
 
 
+@pytest.mark.slow
 def test_without_weights_the_network_has_those_of_the_package(embed, town):
     options = ("--data", town, "--seq", "08")
     ended, found = embed(*options)

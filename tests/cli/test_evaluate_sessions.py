@@ -66,6 +66,7 @@ def test_methods_on_images_and_on_points_read_a_session(days, command, tmp_path,
     np.testing.assert_array_equal(file.positions, open_recording(days.root, DAYS[0]).positions)
 
 
+@pytest.mark.slow
 def test_a_network_reads_a_session_whatever_its_sensor(days, random_params, command, tmp_path):
     save(random_params(model_preset("tiny")), tmp_path / "weights")
     out = tmp_path / "day.npz"

@@ -1,5 +1,6 @@
 """Every preset and every shipped weight describes scans; one of each kind goes through all that takes weights."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,9 @@ import numpy as np
 import pytest
 
 import sglpr_jax
+from sglpr_jax.models.backbones.circular_config import CircularConfig
+from sglpr_jax.models.backbones.sglpr_config import SglprConfig
+from sglpr_jax.models.config import HeadConfig
 from sglpr_jax.sim import write_dataset
 
 from .conftest import SENSOR, Ended, assert_one_line_error, run_command
@@ -15,12 +19,21 @@ from .conftest import SENSOR, Ended, assert_one_line_error, run_command
 pytestmark = pytest.mark.slow
 SHIPPED = "shipped "
 MODELS = (*sglpr_jax.MODELS, *(SHIPPED + name for name in sglpr_jax.shipped_weights()))
-KINDS = ("tiny", "sglpr", "shipped circular")
+SMALL = "small sglpr"
+KINDS = ("tiny", SMALL, "shipped circular")
 """A square image of points, a polar one of densities, and weights without a segmentation head."""
 SCANS = 24
 """Few, and yet so many that the drive comes back to a place."""
 FEW = 3
 """The paper's network takes a second for each."""
+STEM = CircularConfig(fine=(3,), widths=(4, 6), strides=(2, 1), means=(1, 2))
+SMALL_SGLPR = dataclasses.replace(
+    sglpr_jax.model_preset("sglpr"),
+    polar=(16, 32),
+    backbone=SglprConfig(stem=STEM, embed_dim=8, depths=(1, 1), heads=(1, 2)),
+    head=HeadConfig(tap="tokens", channels=(8,), kernels=(3,), strides=(1,), means=(1,), clusters=4),
+    detail=4,
+)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +50,7 @@ def weights_of(random_params, tmp_path_factory) -> Callable[[str], str]:
     def find(name: str) -> str:
         if name.startswith(SHIPPED):
             return name.removeprefix(SHIPPED)
-        params = random_params(sglpr_jax.model_preset(name))
+        params = random_params(SMALL_SGLPR if name == SMALL else sglpr_jax.model_preset(name))
         return str(sglpr_jax.save(params, tmp_path_factory.mktemp("weights") / name))
 
     return find

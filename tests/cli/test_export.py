@@ -80,6 +80,7 @@ def test_an_unknown_name_lists_those_there_are(command, exported, town, tmp_path
     assert_one_line_error(ended, "circularr: expected a folder", "(circular), found neither")
 
 
+@pytest.mark.slow
 def test_whitened_weights_describe_with_the_layer_fitted_to_a_dataset(command, weights, town, tmp_path):
     ended = command("export", "--weights", weights, "--whiten", town, "--out", tmp_path / "out")
     assert ended.status == 0, ended.error

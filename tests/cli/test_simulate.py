@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from sglpr_jax.data import open_recording
 from sglpr_jax.sim import SENSORS
@@ -8,6 +9,7 @@ from .conftest import assert_one_line_error
 THIN = ("--scans", 3, "--azimuth-steps", 40, "--seed", 5)
 
 
+@pytest.mark.slow
 def test_drives_are_written_completed_and_kept(command, tmp_path):
     out = tmp_path / "town"
     first = command("simulate", "--out", out, *THIN, "--seq", "08")
@@ -30,6 +32,7 @@ def test_drives_are_written_completed_and_kept(command, tmp_path):
     assert_one_line_error(other, "simulation.json", "scans 4", "found 3")
 
 
+@pytest.mark.slow
 def test_a_pose_file_and_another_sensor(command, tmp_path):
     rows = np.tile(np.eye(3, 4), (150, 1, 1))
     rows[:, 2, 3] = 0.5 * np.arange(150)

@@ -35,19 +35,19 @@ def stress(command, tmp_path):
 
 @pytest.mark.slow
 def test_everything_on_the_network_and_a_baseline(stress, rings, trained):
-    options = ("--data", rings, "--weights", trained.folder, "--method", "polar-fft", "solid")
+    options = ("--data", rings, "--weights", trained.folder, "--method", "solid")
     ended, out = stress(*options, "--protocol", "pairs-all-f1max", "ssc-recall")
     assert ended.status == 0, ended.error
     names = {"results.json", "config.json", "command.json", "stress.png", "descriptors"}
     assert {path.name for path in out.iterdir()} == names
     names = ["clean", *(corruption.name for corruption in CORRUPTIONS)]
-    files = {f"{name}-{method}.npz" for name in names for method in ("sglpr", "polar-fft", "solid")}
+    files = {f"{name}-{method}.npz" for name in names for method in ("sglpr", "solid")}
     assert {path.name for path in (out / "descriptors").iterdir()} == files
     rows = json.loads((out / "results.json").read_text())
     assert [row["corruption"] for row in rows] == names
     clean = rows[0]["methods"]["solid"]
     for row in rows:
-        assert list(row["methods"]) == ["sglpr", "polar-fft", "solid"]
+        assert list(row["methods"]) == ["sglpr", "solid"]
         for was, found in zip(clean, row["methods"]["solid"], strict=True):
             assert found["counts"] == was["counts"] and found["change"] == found["score"] - was["score"]
             assert f"{found['score']:.3f}" in ended.out
@@ -87,6 +87,7 @@ def test_a_second_run_takes_the_descriptors_that_are_there(stress, rings):
     assert clean.stat().st_mtime_ns == written
 
 
+@pytest.mark.slow
 def test_descriptors_of_other_settings_are_never_taken(stress, rings, trained, random_params, tmp_path):
     options = ("--method", "solid", "--corruption", "dropout-0.5")
     _, out = stress(*options, "--data", rings)

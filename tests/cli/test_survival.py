@@ -90,9 +90,10 @@ def _own_compiled(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def options(images, preset) -> tuple[object, ...]:
-    """Lines of the log and checkpoints fall apart, so that stops come between them."""
+    """Lines of the log and checkpoints fall apart, so that stops come between them. A head alone starts quickly."""
     every = ("--steps", STEPS, "--log-every", 2, "--score-every", SCORE_EVERY)
-    return ("--seq", "06", "--data", images, "--preset", preset, *every)
+    head = ("--model.head.input", "counts", "--model.head.cbam", "False", "--method", "thumbnail")
+    return ("--seq", "06", "--data", images, "--preset", preset, *every, *head)
 
 
 @pytest.fixture(scope="module")

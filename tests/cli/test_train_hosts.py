@@ -28,7 +28,8 @@ def on_two_hosts(*arguments: object) -> list[Ended]:
     """Run `bin/train` in two processes with one device each, and wait for both."""
     command = [sys.executable, "-m", "sglpr_jax.cli.train", *map(str, arguments), "--hosts", "2"]
     command += ["--coordinator", f"127.0.0.1:{free_port()}", "--host-index"]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_force_host_platform_device_count=1"}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=1"
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     hosts = [subprocess.Popen([*command, str(i)], env=environment, **pipes) for i in range(2)]
     try:

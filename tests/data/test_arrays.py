@@ -188,6 +188,7 @@ def test_beside_other_scans_arrays_are_none(tmp_path):
     assert recording.ids == ("0",) and recording.found[-1] == "left aside: 1 .npz"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["npy", "npz", "las"])
 def test_no_flipped_byte_comes_through_as_another_error(tmp_path, kind):
     """Each byte of the headers changed in turn: points, or one ValueError that names the file."""

@@ -199,6 +199,7 @@ def test_one_message_without_rotation_is_dropped_and_the_others_turn(tmp_path):
     np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, np.eye(4)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_poses_once_a_second_with_jitter_reach_all_scans(tmp_path):
     times = np.arange(5.0, 35.0, 0.1)
     stamps = np.arange(4.0, 37.0) + np.random.default_rng(0).uniform(-0.2, 0.2, 33)

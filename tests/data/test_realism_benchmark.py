@@ -51,6 +51,7 @@ def test_total_variation_is_the_share_that_must_move(statistics):
     assert statistics.total_variation(np.array([0.5, 0.5, 0]), np.array([0.5, 0.25, 0.25])) == pytest.approx(25)
 
 
+@pytest.mark.slow
 def test_the_command_writes_tables_and_pictures(kitti_root, bev_root, tmp_path):
     for path in (bev_root / "06/imgs").glob("*.png"):
         Image.fromarray(np.eye(151, dtype=np.uint8)).save(path)

@@ -14,10 +14,13 @@ SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24
 
 
 @pytest.fixture(scope="session")
-def examples(tmp_path_factory) -> Path:
+def examples(once) -> Path:
     """KITTI/ (three recordings of 105 thin scans, about 4 m apart), my_scans/ (five of them), 08.npz and mine.npz, and
     odometry.tum of 08."""
-    folder = tmp_path_factory.mktemp("examples")
+    return once("examples", write_examples)
+
+
+def write_examples(folder: Path) -> None:
     write_dataset(folder / "KITTI", scans=105, sensor=SENSOR)
     (folder / "my_scans").mkdir()
     for scan in sorted((folder / "KITTI/sequences/08/velodyne").glob("*.bin"))[:5]:
@@ -28,7 +31,6 @@ def examples(tmp_path_factory) -> Path:
     recording = sglpr_jax.open_recording(folder / "KITTI", "08")
     poses = sglpr_jax.read_odometry(folder / "KITTI/sequences/08/poses.txt", format="kitti")
     write_tum(folder / "odometry.tum", poses, recording.times)
-    return folder
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ def test_pairs_are_those_that_are_drawn_from_a_list_of_all(seed, most):
     np.testing.assert_array_equal(found, np.sort(expected))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1, 100])
 @pytest.mark.parametrize("distance", ["l2", "cosine"])
 def test_a_score_is_the_one_of_the_plain_computation(make_file, two_laps, monkeypatch, ratio, distance):

@@ -47,6 +47,7 @@ def test_arrays_of_jax_and_lists_are_taken(file):
         evaluate(np.zeros(3), **where)
 
 
+@pytest.mark.slow
 def test_options_stand_in_for_what_a_file_says_itself(file, tmp_path):
     bare = dataclasses.replace(file, positions=None, times=None, pose_source=None)
     assert scores(bare, positions=file.positions, times=file.times) == scores(file)

@@ -17,7 +17,7 @@ from .outcome import ALLOWED, Outcome, outcome
 from .road import Case, FolderRoad, Road
 from .roads import FILE_ROADS, ROADS
 
-CASES = int(os.environ.get("SGLPR_FUZZ_CASES", "2000"))
+CASES = int(os.environ.get("SGLPR_FUZZ_CASES", "1000"))
 SEED = os.environ.get("SGLPR_FUZZ_SEED", "0")
 COUNTS: dict[str, Counter[str]] = {}
 """By road, how many cases ended how."""

@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.sim import Sensor
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
+from sglpr_jax.sim import Sensor, recording
+from sglpr_jax.sim.recording import SimulatedRecording
 
+SCANS = 240
 SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 32)), azimuth_steps=600)
 
 
 @pytest.fixture(scope="session")
 def drive() -> SimulatedRecording:
-    """240 scans, about 1.8 m apart; it comes back the other way."""
-    return simulate_recording("08", scans=240, sensor=SENSOR, seed=3)
+    """240 scans, about 1.8 m apart; it comes back the other way. Each scan is rendered once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "KEPT_SCANS", SCANS)
+        return recording.simulate_recording("08", scans=SCANS, sensor=SENSOR, seed=3)
 
 
 @pytest.fixture(scope="session")

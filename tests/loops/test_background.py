@@ -1,6 +1,7 @@
 """What all images of a moving sensor have in common is not compared."""
 
 import numpy as np
+import pytest
 
 import sglpr_jax
 from sglpr_jax.loops.background import Background
@@ -27,6 +28,7 @@ def test_the_average_is_the_mean_and_then_forgets():
             np.testing.assert_allclose(expected, roots[:3].mean(axis=0))
 
 
+@pytest.mark.slow
 def test_rings_do_not_hold_the_motion():
     params, posts = sglpr_jax.load("circular"), np.random.default_rng(0).uniform(-60, 60, (200, 2))
     without, within = (_moved(params, posts, least) for least in (4, 10_000))

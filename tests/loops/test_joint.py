@@ -52,6 +52,7 @@ def test_of_places_that_repeat_no_loop_is_accepted_and_the_odometry_stays(scene)
     assert not found.inliers.any() and str(found).startswith(f"trajectory not corrected: {len(wrong)} loops need")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_true_loops_are_kept_and_correct_the_drift(seed):
     true = town()

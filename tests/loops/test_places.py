@@ -84,6 +84,7 @@ def test_more_answers_than_places_that_can_be_compared_are_refused(places, param
         places.relocate(params, drive.record(20), candidates=10**9)
 
 
+@pytest.mark.slow
 def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, first, places, params):
     recording, poses = first
     sunday = dataclasses.replace(recording, name="sunday")

@@ -109,6 +109,7 @@ def test_between_two_plain_walls_the_place_along_them_is_unknown(yaw):
     assert is_degenerate(covariance) and position_deviation(covariance) >= 2
 
 
+@pytest.mark.slow
 def test_in_a_town_the_place_is_known(drive, revisit):
     query, match = (square_image(drive.record(frame)) for frame in revisit)
     found = align(query, match)

@@ -93,6 +93,7 @@ def test_turn_and_scale_are_taken_out_first(smooth, degrees, scale):
     assert abs(int(found[0, 0, 0]) - 25) <= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("down", "right"), [(5, 20), (-5, -60), (5, 60)])
 def test_a_scale_beyond_1_8_is_taken_for_its_inverse(down, right):
     polar = np.random.default_rng(0).random((80, 360))

@@ -81,6 +81,7 @@ def real(shared):
     return scans
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ON_POINTS)
 def test_real_loops_rank_above_a_pair_that_is_none(real, name):
     rows = {scan: describe(name, *content)[None] for scan, content in real.items()}

@@ -95,6 +95,7 @@ def test_mean_pooling_is_numpys(random_variables):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_head_for_pixels_reads_counts_and_one_plane_for_each_class(random_params, views):
     config = dataclasses.replace(with_head(CONFIG, input="counts+labels"), field="circle")
     params, (images, labels) = random_params(config), views
@@ -106,6 +107,7 @@ def test_a_head_for_pixels_reads_counts_and_one_plane_for_each_class(random_para
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_polar_head_for_tokens_reads_patches_of_each_class_s_share(random_params, views):
     config = with_head(POLAR, input="labels")
     params, (images, labels) = random_params(config), views
@@ -122,6 +124,7 @@ def test_a_polar_head_for_tokens_reads_patches_of_each_class_s_share(random_para
     np.testing.assert_array_equal(fast_describe(params, images + 1, labels), fast_describe(params, images, labels))
 
 
+@pytest.mark.slow
 def test_labels_work_under_jit_and_vmap_and_with_any_leading_axes(random_params, views):
     params = random_params(with_head(POLAR, input="counts+labels"))
     images, labels = views
@@ -134,6 +137,7 @@ def test_labels_work_under_jit_and_vmap_and_with_any_leading_axes(random_params,
         assert np.abs(changed - together).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["counts+labels", "counts"])
 def test_the_gradient_reaches_every_weight(random_params, views, what):
     config = with_head(POLAR, input=what, pooling="mean")

@@ -1,6 +1,7 @@
 """The average of weights against numpy."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.models.whitening import whitened
 
 
+@functools.cache
 def fresh(seed: int) -> Params:
     return init(jax.random.key(seed), preset="tiny")
 

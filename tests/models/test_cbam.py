@@ -22,6 +22,7 @@ def to_flax(state):
     return {"channel": channel, "spatial": {"convolution": {"kernel": kernel, "bias": bias}}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tag", "reduction"), [("c32_r16", 16), ("c32_r4", 4), ("c32_r4_nospatial", 4)])
 def test_output_and_gradients_agree(tag, reduction, golden, assert_parity):
     expected = {key.removeprefix(f"{tag}/"): x for key, x in golden("cbam").items() if key.startswith(f"{tag}/")}
@@ -56,9 +57,9 @@ def test_jit_and_vmap_agree_and_an_empty_map_has_finite_gradients(random_variabl
     assert variables["params"]["channel"]["mlp_in"]["kernel"].shape == (6, 1)
     expected = module.apply(variables, image)
     np.testing.assert_allclose(jax.jit(module.apply)(variables, image), expected, atol=1e-6)
-    one_by_one = jax.vmap(module.apply, (None, 0))(variables, image[:, None])[:, 0]
+    one_by_one = jax.jit(jax.vmap(module.apply, (None, 0)))(variables, image[:, None])[:, 0]
     np.testing.assert_allclose(one_by_one, expected, atol=1e-6)
-    gradients = jax.grad(lambda v: module.apply(v, jnp.zeros_like(image)).sum())(variables)
+    gradients = jax.jit(jax.grad(lambda v: module.apply(v, jnp.zeros_like(image)).sum()))(variables)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
@@ -78,8 +79,8 @@ def test_a_circular_map_may_be_rolled_along_its_columns_and_no_other(random_vari
     variables = random_variables(CBAM(reduction=3), image)
     rolled = jnp.roll(image, 5, axis=2)
     for circular in (True, False):
-        module = CBAM(reduction=3, circular=circular)
-        difference = module.apply(variables, rolled) - jnp.roll(module.apply(variables, image), 5, axis=2)
+        apply = jax.jit(CBAM(reduction=3, circular=circular).apply)
+        difference = apply(variables, rolled) - jnp.roll(apply(variables, image), 5, axis=2)
         assert (jnp.abs(difference).max() < 1e-5) == circular
     inner, whole = (CBAM(3, circular).apply(variables, image)[:, :, 3:-3] for circular in (True, False))
     np.testing.assert_allclose(inner, whole, atol=1e-6)  # borders apart they are the same

@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.models import sglpr
 from sglpr_jax.models.backbones.circular import CircularDecoder, CircularNet, block_means
 from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import describe, segment
 
 RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
 HEAD = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
 CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=RINGS, detail=6, head=HEAD)
 SPECTRUM = dataclasses.replace(CONFIG, head=dataclasses.replace(HEAD, pooling="spectrum"))
+describe, segment = jax.jit(sglpr.describe), jax.jit(sglpr.segment)
 BEV = jax.random.poisson(jax.random.key(1), 0.7, (3, 32, 32)).astype(jnp.float32)
 
 

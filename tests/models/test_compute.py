@@ -79,6 +79,7 @@ def test_descriptors_and_logits_agree_and_are_float32(params, images):
         assert np.abs(error).max() < 16 * EPSILON * np.abs(logits).max()
 
 
+@pytest.mark.slow
 def test_gradients_are_float32_finite_and_nearly_those_of_float32(params, images):
     def loss(weights, config):
         descriptors, logits, _ = sglpr.forward(Params(weights, config), images)

@@ -31,6 +31,7 @@ def reference(weights, features, image) -> np.ndarray:
     return mixed * 0.5 * (1 + np.asarray(erf(mixed / np.sqrt(2))))
 
 
+@pytest.mark.slow
 def test_detail_is_the_reference(features):
     module = Detail(5)
     variables = jax.jit(module.init)(jax.random.key(1), *features)

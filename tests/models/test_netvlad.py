@@ -30,6 +30,7 @@ def to_flax(state):
     return params
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch_norm", [0, 1])
 @pytest.mark.parametrize("gating", [0, 1])
 def test_output_and_gradients_agree(gating, batch_norm, golden, assert_parity):

@@ -25,6 +25,7 @@ def test_the_map_shrinks_by_each_stride(kernels, strides, sizes):
     assert [seen[f"head_convolution{i}"].shape[1] for i in range(3)] == sizes
 
 
+@pytest.mark.slow
 def test_descriptors_have_length_one_and_do_not_depend_on_their_batch(random_variables):
     module = head((4, 3, 3), (4, 2, 2))
     features = jnp.asarray(np.random.default_rng(0).normal(size=(3, 32, 32, 6)), jnp.float32)
@@ -55,6 +56,7 @@ def test_a_stride_two_convolution_is_centred_on_every_second_pixel(random_variab
     np.testing.assert_allclose(seen["head_convolution0"][0], np.maximum(expected, 0), atol=2e-5)
 
 
+@pytest.mark.slow
 def test_an_empty_map_has_finite_gradients(random_variables):
     module, features = head((4, 3, 3), (4, 2, 2)), jnp.zeros((2, 32, 32, 6))
     variables = random_variables(module, features)

@@ -78,6 +78,7 @@ def test_vmap_agrees(params, images, descriptors):
     np.testing.assert_allclose(mapped(params, images), descriptors, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_reach_image_and_weights_even_from_an_empty_image(params, images):
     loss = jax.grad(lambda p, x: describe(p, x)[..., 0].sum(), (0, 1))
     both = jnp.stack([jnp.zeros((SIZE, SIZE)), images[0].astype(jnp.float32)])

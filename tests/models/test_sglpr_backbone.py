@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
+from sglpr_jax.models import sglpr
 from sglpr_jax.models.backbones.circular_config import CircularConfig
 from sglpr_jax.models.backbones.sglpr import CircularSwin
 from sglpr_jax.models.backbones.sglpr_config import SglprConfig
 from sglpr_jax.models.config import HeadConfig, ModelConfig
 from sglpr_jax.models.heads.place import PlaceHead
 from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.sglpr import describe, forward, segment
+from sglpr_jax.models.sglpr import forward
 from sglpr_jax.models.weights import weight_shapes
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.heat_maps import heat_maps
@@ -29,6 +30,8 @@ CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32
 BEV = jax.random.poisson(jax.random.key(1), 0.7, (3, 32, 32)).astype(jnp.float32)
 POLAR = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
 
+describe, segment = jax.jit(sglpr.describe), jax.jit(sglpr.segment)
+
 
 @pytest.fixture(scope="module")
 def params(random_params):
@@ -37,7 +40,7 @@ def params(random_params):
 
 def test_maps_and_tokens_have_the_shapes_configured(random_variables):
     net = CircularSwin(BACKBONE)
-    tokens, maps, seen = net.apply(random_variables(net, POLAR), POLAR)
+    tokens, maps, seen = jax.jit(net.apply)(random_variables(net, POLAR), POLAR)
     assert tokens.shape == (2, 4, 16, 8)
     assert [m.shape for m in maps] == [(2, 8, 16, 2), (2, 4, 16, 4)]
     assert seen["circular_block1"].shape == (2, 4, 16, 6)
@@ -48,7 +51,8 @@ def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variable
     """Such a window is two coarse tokens wide: four tokens, eight sectors of the image."""
     net = CircularSwin(BACKBONE)
     variables = random_variables(net, POLAR)
-    straight, turned = (net.apply(variables, image)[0] for image in (POLAR, jnp.roll(POLAR, 8, axis=2)))
+    apply = jax.jit(net.apply)
+    straight, turned = (apply(variables, image)[0] for image in (POLAR, jnp.roll(POLAR, 8, axis=2)))
     np.testing.assert_allclose(turned, jnp.roll(straight, 4, axis=2), atol=1e-4)
     assert jnp.abs(straight - jnp.roll(straight, 4, axis=2)).max() > 1e-2
 
@@ -56,8 +60,9 @@ def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variable
 def test_the_head_that_goes_around_does_not_feel_a_shift(random_variables):
     head, features = PlaceHead(HEAD, circular=True), jax.random.normal(jax.random.key(2), (2, 4, 16, 8))
     variables = random_variables(head, features)
-    descriptor, seen = head.apply(variables, features)
-    shifted, seen_shifted = head.apply(variables, jnp.roll(features, 4, axis=2))
+    apply = jax.jit(head.apply)
+    descriptor, seen = apply(variables, features)
+    shifted, seen_shifted = apply(variables, jnp.roll(features, 4, axis=2))
     assert seen["head_convolution1"].shape == (2, 2, 8, 8)
     for name, shift in (("cbam", 4), ("head_convolution1", 2)):
         np.testing.assert_allclose(seen_shifted[name], jnp.roll(seen[name], shift, axis=2), atol=1e-4)
@@ -76,9 +81,9 @@ def test_descriptors_and_logits_under_jit_vmap_and_grad(params):
     whole, logits = describe(params, BEV), segment(params, BEV)
     assert whole.shape == (3, 256) and logits.shape == (3, 32, 32, 20)
     np.testing.assert_allclose(jnp.linalg.norm(whole, axis=-1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(jax.vmap(lambda bev: describe(params, bev))(BEV), whole, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.vmap(lambda bev: describe(params, bev)))(BEV), whole, atol=1e-5)
     np.testing.assert_allclose(jax.jit(jax.vmap(lambda bev: segment(params, bev)))(BEV), logits, atol=1e-4)
-    gradient = jax.grad(lambda bev: describe(params, bev)[..., 0].sum())(jnp.zeros_like(BEV))
+    gradient = jax.jit(jax.grad(lambda bev: describe(params, bev)[..., 0].sum()))(jnp.zeros_like(BEV))
     assert jnp.isfinite(gradient).all()
 
 

@@ -70,6 +70,7 @@ def placeholder(params, tmp_path, monkeypatch) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_every_set_that_ships_is_fit_to():
     assert shipped_weights(), f"{shipped.FOLDER}: expected at least one set of weights"
     for name in shipped_weights():

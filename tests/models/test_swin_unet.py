@@ -26,7 +26,7 @@ def variables(random_variables, images):
 
 @pytest.fixture(scope="module")
 def tokens(variables, images):
-    return MODEL.apply(variables, images)[0]
+    return jax.jit(MODEL.apply)(variables, images)[0]
 
 
 def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, tokens):
@@ -34,7 +34,6 @@ def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, toke
         return MODEL.apply(variables, x)[0]
 
     assert tokens.shape == (3, 8, 8, 8)
-    np.testing.assert_allclose(jax.jit(apply)(images), tokens, atol=2e-5)
     np.testing.assert_allclose(jax.jit(jax.vmap(apply))(images[:, None])[:, 0], tokens, atol=2e-5)
     np.testing.assert_allclose(jax.jit(apply)(images[1:2]), tokens[1:2], atol=2e-5)
 
@@ -64,6 +63,7 @@ def test_stochastic_depth_follows_its_key_and_is_off_outside_training(variables,
     assert np.abs(first - tokens).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height, down", [(4, 0), (8, 2)])
 def test_windows_are_shifted_in_each_direction_that_is_larger_than_them(height, down, random_variables):
     """Against windows gathered token by token, in a circular map; a row may not see one that was rolled in."""
@@ -121,6 +121,7 @@ def test_drop_path_rates_rise_to_the_last_encoder_block(golden):
     np.testing.assert_allclose(rates, golden("tables_masks")["drop_path_full"], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_an_empty_image_has_finite_gradients(variables, images):
     gradients = jax.jit(jax.grad(lambda v: MODEL.apply(v, jnp.zeros_like(images))[0].var()))(variables)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))

@@ -32,6 +32,7 @@ def run(weights: dict, image: jax.Array, labels: jax.Array, config: ModelConfig)
     return 0.4 * ce + 0.6 * dice, {**seen, "up_x4": pixels, "logits": logits, "ce": ce, "dice": dice}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", FILES)
 def test_every_stage_loss_and_gradient_agrees(file, golden, assert_parity, model_config):
     expected = golden(file)

@@ -130,6 +130,7 @@ def test_the_batches_do_not_show_and_are_all_of_one_shape(scans, batch, size):
     assert shapes == {(size, GRID.height, GRID.width)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [None, 3])
 def test_scans_become_density_images_of_the_turned_points(scans, seed):
     cells = Grid(resolution_m=0.4, height=64, width=64)

@@ -25,6 +25,7 @@ CONFIG = dataclasses.replace(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("polar", [None, (8, 32)])
 def test_maps_lie_on_the_grid_of_the_image_and_follow_it(random_params, polar):
     params = random_params(dataclasses.replace(CONFIG, polar=polar, field="circle"))

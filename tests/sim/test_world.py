@@ -134,7 +134,8 @@ def test_the_outskirts_have_walls_to_their_length_and_hills_beside_the_road():
     """Some wall is longer there than any in town, and ground rises out of the plots, off the road."""
     longest, hills = {}, {}
     for scenery in SCENERIES:
-        worlds = [world_of(((0, 0), (600, 0)), seed, scenery) for seed in range(6)]
+        seeds = range(6 if scenery in ("outskirts", "town") else 1)
+        worlds = [world_of(((0, 0), (600, 0)), seed, scenery) for seed in seeds]
         walls = [select(world.scene.boxes, world.scene.boxes.label == FENCE) for world in worlds]
         longest[scenery] = max(
             _longest_run(wall.centre[:, 0], sign * wall.centre[:, 1] > 0) for wall in walls for sign in (1, -1)

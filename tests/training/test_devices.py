@@ -16,7 +16,7 @@ from sglpr_jax.training.step import train_step
 
 @pytest.mark.slow
 def test_eight_devices():
-    flags = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": "--xla_force_host_platform_device_count=8"}
+    flags = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=8"}
     tests = Path(__file__).with_name("eight_devices.py")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tests)]
     ended = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True)

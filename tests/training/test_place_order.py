@@ -84,7 +84,7 @@ def test_both_losses_reach_the_shared_features(mixed, config, params):
     only_semantics = mixed.replace(negatives=np.zeros_like(mixed.negatives))
     for batch in (only_places, only_semantics):
         gradient, _ = gradients_of(params, batch, config)
-        assert np.abs(gradient["backbone"]["patch_embed"]["projection"]["kernel"]).max() > 1e-4
+        assert np.abs(gradient["rings"]["block_0"]["convolution"]["kernel"]).max() > 1e-4
 
 
 @pytest.mark.slow
