@@ -82,7 +82,7 @@ class LoopsCommand:
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
     register: bool = True
-    """Register the full scans of loops in 6 degrees of freedom and check their overlap (extra slam). Images are not
+    """Register the full scans of loops in 6 degrees of freedom and check their overlap. Images are not
     registered."""
     optimize: bool = False
     """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti. The correction of thousands

@@ -109,8 +109,8 @@ def find_loops(
         rejected. Of the remaining loops the largest consistent set is kept.
       model: Model of the probabilities, by default the one shipped for the weights.
       config: Settings of the detector.
-      registered: Register the full scans of each loop in 6 degrees of freedom (extra `slam`). Loops with little overlap
-        are rejected. None registers scans, not images, if the extra is installed.
+      registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
+        are rejected. None registers scans, not images.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
       kept_in: Checkpoint directory. If recording, odometry, weights and settings are the same, the search resumes from
@@ -122,7 +122,7 @@ def find_loops(
     Raises:
       ValueError: If the odometry has another length or shape, if no scan can be read, or if all scans are empty.
       TypeError: If an argument is not a recording, parameters or an array.
-      ImportError: If the extra is not installed.
+      ImportError: If `registered` is True and small-gicp is not installed.
 
     Example:
       found = find_loops(sglpr_jax.open_recording(root, "08"), sglpr_jax.load("sglpr"))

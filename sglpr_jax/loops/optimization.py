@@ -82,7 +82,7 @@ def optimize_trajectory(found: FoundLoops) -> OptimizedTrajectory:
     if risen_m > MOST_RISEN_M:
         warn(
             f"{found.recording.name}: expected heights near those of the odometry, found them moved by up to "
-            f"{risen_m:.1f} m; only registered loops (extra slam) measure heights"
+            f"{risen_m:.1f} m; only registered loops measure heights"
         )
     return corrected
 

@@ -1,4 +1,4 @@
-"""Registration of two scans in 6 degrees of freedom: KISS-Matcher and then GICP (extra `slam`).
+"""Registration of two scans in 6 degrees of freedom: GICP, and KISS-Matcher (extra `slam`) for a first guess.
 
 Neither method detects whether the scans show one place. If GICP starts 3 m off along a road, its result is 3 m off,
 too. The overlap shows such errors. It is the share of the space of one scan that the other scan fills, too.
@@ -69,7 +69,7 @@ def register(
       config: Settings of the registration.
 
     Raises:
-      ImportError: If the extra `slam` is not installed.
+      ImportError: If small-gicp or, without `initial`, KISS-Matcher is not installed.
       ValueError: If a scan has fewer than 100 finite points.
 
     Example:
@@ -157,7 +157,7 @@ def is_installed() -> bool:
 
 
 def check_installed() -> None:
-    """Raise ImportError if the extra `slam` is not installed, before any long work starts."""
+    """Raise ImportError if small-gicp is not installed, before any long work starts."""
     _library("small_gicp")
 
 
