@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import open_with_poses, report_bad_scan
@@ -12,14 +12,13 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from sglpr_jax.cli.loops import LoopsCommand
     from sglpr_jax.data import Recording
     from sglpr_jax.loops.config import DetectorConfig
     from sglpr_jax.loops.find_between import FoundRecordings
 
 
-def search_several(command: "LoopsCommand", config: "DetectorConfig", *, unfinished: Path) -> int:
-    """Search several recordings and write the results. Returns the exit status."""
+def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) -> int:
+    """Search several recordings and write the results. Returns the exit status. `command` is a `LoopsCommand`."""
     from sglpr_jax.evaluation.page.of_loops import PAGE
     from sglpr_jax.evaluation.page.of_recordings import recordings_page
     from sglpr_jax.loops.find_between import find_loops_between
@@ -62,7 +61,7 @@ def search_several(command: "LoopsCommand", config: "DetectorConfig", *, unfinis
     return 0
 
 
-def _opened(command: "LoopsCommand") -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4 4']] | None]":
+def _opened(command: Any) -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4 4']] | None]":
     """Open the recordings, with their odometry if there is one."""
     paths, files = command.recordings, command.odometry_files
     if not files:

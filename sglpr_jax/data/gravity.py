@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
 
 from sglpr_jax.data.mounting import Mounting, estimate_mounting
 from sglpr_jax.data.recording import Recording
@@ -78,9 +77,14 @@ class GroundFilter:
 
 
 def tilts(scans: Sequence[Mounting | None], common: Mounting | None) -> bool:
-    """Whether the mountings of some scans show a sensor that tilts, relative to their median `common`."""
-    seen = [scan for scan in scans if scan is not None]
-    return common is not None and len(seen) > 0 and _spread_deg(seen, common) > TILTS_DEG
+    """Whether the mountings of some scans show a sensor that tilts, relative to their median `common`.
+
+    Scans that show the sensor upside down relative to it are errors and do not count.
+    """
+    if common is None:
+        return False
+    seen = [scan for scan in scans if scan is not None and np.dot(scan.up, common.up) > 0]
+    return len(seen) > 0 and _spread_deg(seen, common) > TILTS_DEG
 
 
 def with_gravity(recording: Recording, common: Mounting) -> Recording:
@@ -167,6 +171,8 @@ def _averaged(
     values: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Weighted Gaussian average of directions along a path."""
+    from scipy.ndimage import gaussian_filter1d  # imported here because the import is slow
+
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     metre = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     sums = np.zeros((metre[-1] + 1, 3))

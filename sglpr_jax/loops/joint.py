@@ -161,12 +161,12 @@ def registered_loops(
     for i, loop in enumerate(loops):
         if should_stop():
             return [*kept, *loops[i:]], rejected
-        found = register(
-            queries.points(loop.query),
-            matches.points(loop.match),
-            initial=loop.match_from_query,
-            initial_covariance=loop.covariance,
-        )
+        query, match = queries.points(loop.query), matches.points(loop.match)
+        try:
+            found = register(query, match, initial=loop.match_from_query, initial_covariance=loop.covariance)
+        except ValueError:  # too few points
+            rejected.append(Rejected(dataclasses.replace(loop, overlap=0.0), "little overlap"))
+            continue
         fine = dataclasses.replace(loop, **found._asdict())
         if found.overlap >= MIN_OVERLAP or (found.overlap >= LITTLE_OVERLAP and agrees(fine, loop)):
             kept.append(fine)

@@ -68,7 +68,7 @@ def found(params, there_and_back, monkeypatch):
     def found(odometry):
         detector = searched(params, there_and_back, odometry)
         monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
-        return find.find_loops(recording, params, odometry=odometry, config=CONFIG)
+        return find.find_loops(recording, params, odometry=odometry, config=CONFIG, registered=False)
 
     return found
 
@@ -115,7 +115,7 @@ def test_loops_that_contradict_the_odometry_are_rejected_and_do_not_keep_the_tru
     assert len(wrong) >= 7 and wrong <= set(alike) and not true & wrong and len(true) >= N - 1
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
     monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
-    whole = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG)
+    whole = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG, registered=False)
     assert {one.loop.query for one in whole.rejected} == wrong and len(whole.loops) >= N - 1
     assert {one.reason for one in whole.rejected} == {"contradicts the odometry"}
     assert str(whole).endswith(f"{len(wrong)} rejected (contradicts the odometry: {len(wrong)})")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.sim.drive import drive_seed, speeds
+from sglpr_jax.sim.ground import relief_height
 from sglpr_jax.sim.placing import footprint_distance
 from sglpr_jax.sim.raw_ids import BUILDING, FENCE, POLE
 from sglpr_jax.sim.repeating import mounted, plan_drive, simulate_repeating
@@ -34,8 +35,8 @@ def nearest_older(recording) -> np.ndarray:
 def low_shapes(world) -> Shapes:
     """What stands beside the vehicle and not above it."""
     joined = Shapes(*(np.concatenate(values) for values in zip(*world.scene, strict=True)))
-    ground = world.ground.relief.amplitude.sum() + HEAD_ROOM_M
-    low = (joined.centre[:, 2] - joined.half[:, 2] < ground) & ~joined.velocity.any(axis=1)
+    above = joined.centre[:, 2] - joined.half[:, 2] - relief_height(world.ground.relief, joined.centre[:, :2])
+    low = (above < HEAD_ROOM_M) & ~joined.velocity.any(axis=1)
     return Shapes(*(values[low] for values in joined))
 
 

@@ -182,6 +182,10 @@ def test_the_tables_of_elevations():
         "vlp16": 16,
         "xt32": 32,
         "os1-64": 64,
+        "os0-32": 32,
+        "m1": 125,
+        "mid360": 20,
+        "avia": 64,
     }
     np.testing.assert_allclose(np.diff(SENSORS["vlp16"].elevations_deg), -2)
     np.testing.assert_allclose(np.diff(SENSORS["xt32"].elevations_deg), -1)
