@@ -32,7 +32,7 @@ VOXEL_M = 0.1
 """Edge of the voxels of a stored scan, in metres. Each voxel holds one point."""
 DIRECTION_DEG = 0.4
 """Edge of a direction of a submap, in degrees of azimuth and elevation. Each direction holds its nearest point."""
-AZIMUTHS = 900
+AZIMUTHS = round(360 / DIRECTION_DEG)
 """Number of directions in a revolution."""
 INDEX_BITS = 22
 """Bits of the number of a point in a sorted key. A submap has at most 4 million points before it is thinned."""

@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.lzf import decompress_lzf
 from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
-from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points, mapped_content, read_content
+from sglpr_jax.data.formats.scan_size import blocks_of, check_points, mapped_content, read_content
 
 _NUMBERS = {
     **{("F", 4): "<f4", ("F", 8): "<f8"},
@@ -90,9 +90,7 @@ def pcd_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
             yield _decode(content).astype(np.float64)
             return
         points = _binary_records(header, body)
-        for start in range(0, len(points), BLOCK_POINTS):
-            block = points[start : start + BLOCK_POINTS]
-            yield np.stack([block[axis].astype(np.float64) for axis in AXES], axis=1)
+        yield from blocks_of(points, AXES)
     except ValueError as error:
         raise ValueError(f"{path}: expected a .pcd file of a map, preferably DATA binary, found {error}") from error
 

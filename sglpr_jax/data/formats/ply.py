@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
-from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points, mapped_content, read_content
+from sglpr_jax.data.formats.scan_size import blocks_of, check_points, mapped_content, read_content
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -81,9 +81,7 @@ def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
             yield _decode(content).astype(np.float64)
             return
         points = _binary_records(body, elements, _ORDERS[order])
-        for start in range(0, len(points), BLOCK_POINTS):
-            block = points[start : start + BLOCK_POINTS]
-            yield np.stack([block[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        yield from blocks_of(points, "xyz")
     except ValueError as error:
         raise ValueError(f"{path}: expected a .ply file of a map, preferably binary, found {error}") from error
 

@@ -1,7 +1,11 @@
-"""Bounds of the size of a scan. Headers may declare any size, so readers check it before they allocate memory."""
+"""Bounds of the size of a scan, and blocks of larger clouds. Headers may declare any size, so it is checked first."""
 
 import mmap
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
 
 MOST_POINTS = 1 << 24
 """Maximum number of points of a scan. A LiDAR of 128 beams returns about 2**18 points a turn."""
@@ -41,3 +45,11 @@ def mapped_content(path: Path) -> memoryview:
     """Return the content of a file of any size, which the system reads when it is used. Files must not be empty."""
     with path.open("rb") as stream:
         return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def blocks_of(records: np.ndarray, axes: Iterable[str]) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the coordinates of records with named fields, `BLOCK_POINTS` points at a time. `axes` names x, y and z."""
+    names = tuple(axes)
+    for start in range(0, len(records), BLOCK_POINTS):
+        block = records[start : start + BLOCK_POINTS]
+        yield np.stack([block[axis].astype(np.float64) for axis in names], axis=1)
