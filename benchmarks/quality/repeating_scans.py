@@ -27,8 +27,8 @@ from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.sceneries.ways import REVISITS, Revisit
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import HDL64E, SENSORS
 

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from sglpr_jax.cli.runtime import parse_command, run
-from sglpr_jax.sim.choices import RATE_HZ, SCANS
+from sglpr_jax.sim.choices import SCANS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,16 +29,19 @@ class SimulateCommand:
     the same streets, partly in the opposite direction, with other parked cars and traffic."""
     scans: int = SCANS
     """Scans of each recording."""
-    rate_hz: float = RATE_HZ
-    """Scans per second of a route. KITTI's rate is 10."""
+    rate_hz: float | None = None
+    """Scans per second of a route. KITTI's rate is 10. None: 4 in towns, or the rate of the scenery."""
     sensor: str | None = None
-    """LiDAR: hdl64e (KITTI's), hdl32e, hdl32e-nclt (NCLT's, upside down), vlp16, xt32 or os1-64. None: hdl64e, or
-    hdl32e-nclt for --sessions."""
+    """LiDAR: hdl64e (KITTI's), hdl32e, hdl32e-nclt (NCLT's, upside down), vlp16, xt32, os0-32, os1-64, m1, mid360 or
+    avia. None: hdl64e, or hdl32e-nclt for --sessions."""
     azimuth_steps: int | None = None
     """Firings per revolution. Fewer firings make smaller files. None: the number of the real sensor."""
     scenery: str = "town"
     """Surroundings of the drive: `town`; `outskirts`, hilly, with long roads between walls, hedges and slopes; `lanes`,
-    roads between overgrown hedges; or `gardens`, streets with front gardens, low fences and old trees."""
+    roads between overgrown hedges; `gardens`, streets with front gardens, low fences and old trees; or surroundings
+    where places repeat, such as `forest`, in which a route stands only for the direction of its revisits."""
+    submap_m: float = 0.0
+    """Travelled distance of submaps, in metres. 0 writes scans."""
     images: bool = False
     """Write BEV density images with label images (NN/imgs, NN/labels, NN/pose.txt) instead of scans and labels."""
     vary: bool = False

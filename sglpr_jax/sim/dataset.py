@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,8 +13,10 @@ from sglpr_jax.files import read_json, replacing
 from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import check_drawing, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
+from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, with_submaps
+from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.routes import ROLES
+from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
 from sglpr_jax.sim.sessions import plan_sessions
@@ -37,8 +40,9 @@ def write_dataset(
     scans: int = 300,
     sensor: Sensor = HDL64E,
     seed: int = 0,
-    rate_hz: float = RATE_HZ,
-    scenery: Scenery = TOWN,
+    rate_hz: float | None = None,
+    scenery: Scenery | str = TOWN,
+    submap_m: float = 0.0,
     layout: str = "scans",
     progress: Progress | None = None,
 ) -> Path:
@@ -47,6 +51,9 @@ def write_dataset(
     Each drive has its own town, which depends on `seed` and the name of the drive. Existing files are kept. The same
     call resumes an interrupted run and gives the same bytes. Files are written atomically.
 
+    In sceneries of `REPEATING`, a route stands only for the direction of its revisits, and the drive is that of
+    `simulate_repeating`.
+
     Arguments:
       root: Output folder.
       names: Routes, from `ROLES`.
@@ -54,8 +61,9 @@ def write_dataset(
       scans: Number of scans of each drive. Along a pose file it is the maximum, see `simulate_recording`.
       sensor: LiDAR.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route. Not used along pose files.
-      scenery: Scenery of the towns.
+      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, or the rate of the scenery.
+      scenery: Scenery of the towns, or a name from `REPEATING`.
+      submap_m: Travelled distance of submaps, in metres (`sglpr_jax.submaps`). 0 writes scans.
       layout: "scans", "images" or "varied", see `LAYOUTS`.
       progress: Function that is called as `progress(name, done, scans)` whenever scans are done.
 
@@ -63,12 +71,16 @@ def write_dataset(
       `root`.
 
     Raises:
-      ValueError: A route or the layout is unknown, two drives have one name, or `scans` is below 2. Or `rate_hz` is
-        not positive, `seed` is negative, or a pose file is malformed. Or `root` holds other files, or a dataset with
-        other settings.
+      ValueError: A route, the scenery or the layout is unknown, two drives have one name, or `scans` is below 2. Or
+        `rate_hz` is not positive, `seed` or `submap_m` is negative, or a pose file is malformed. Or `root` holds other
+        files, or a dataset with other settings. Or the scenery is from `REPEATING`, and there is a pose file, or two
+        routes have revisits in the same direction.
       OSError: A file cannot be read or written. The message names the file.
     """
+    rate_hz = _checked_rate(scenery, names, along, rate_hz)
     check_drawing(rate_hz, seed)
+    if not 0 <= submap_m < math.inf:
+        raise ValueError(f"submap_m: expected metres, at least 0, found {submap_m}")
     files = {**dict.fromkeys(names), **{name_of_path(file): file for file in along}}
     unknown = [name for name in names if name not in ROLES]
     if unknown or scans < 2:
@@ -79,15 +91,40 @@ def write_dataset(
         raise ValueError(f"expected {expected}, found {', '.join(drives)} and {layout}")
     what = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     ways = {f"drive {name}": _fingerprint(file) for name, file in files.items()}
-    _claim(root, {"layout": layout, **what, **_settings(sensor, scenery)}, ways)
-    options = {"sensor": sensor, "scenery": scenery, **what}
+    lengths = {"submap_m": submap_m} if submap_m else {}
+    _claim(root, {"layout": layout, **what, **lengths, **_settings(sensor, scenery)}, ways)
+    options = {"sensor": sensor, "scenery": scenery, "submap_m": submap_m, **what}
     for name, file in files.items():
         count = scans if file is None else len(thinned(read_path(file), scans).times)
-        simulate = functools.partial(simulate_recording, name, along=file, **options)
+        simulate = functools.partial(_recording, name, along=file, **options)
         show = functools.partial(progress, name) if progress else lambda done, scans: None
         ids = tuple(f"{i:06d}" for i in range(count))
         _write_drive(root, name, simulate, ids=ids, layout=LAYOUTS[layout], progress=show)
     return root
+
+
+def _checked_rate(scenery: Scenery | str, names: Sequence[str], along: Sequence[Path], rate_hz: float | None) -> float:
+    """Scans per second, after a check that the scenery has the drives."""
+    if isinstance(scenery, Scenery):
+        return RATE_HZ if rate_hz is None else rate_hz
+    if scenery not in REPEATING:
+        raise ValueError(f"expected a scenery among {', '.join(REPEATING)}, found {scenery!r}")
+    revisits = [ROLES[name].revisit for name in names if name in ROLES]
+    if along or len(set(revisits)) < len(revisits):
+        expected = "no pose files and routes with different revisits, such as 01 06 08"
+        raise ValueError(f"scenery {scenery}: expected {expected}, found {' '.join([*names, *map(str, along)])}")
+    return REPEATING[scenery].rate_hz if rate_hz is None else rate_hz
+
+
+def _recording(
+    name: str, *, along: Path | None, scenery: Scenery | str, submap_m: float, **options
+) -> SimulatedRecording:
+    """Drive of a route or along a pose file, with submaps of `submap_m`."""
+    if isinstance(scenery, str):
+        recording = simulate_repeating(scenery, revisit=ROLES[name].revisit, **options)
+    else:
+        recording = simulate_recording(name, along=along, scenery=scenery, **options)
+    return with_submaps(recording, submap_m)
 
 
 def write_sessions(
@@ -116,9 +153,10 @@ def write_sessions(
     return root
 
 
-def _settings(sensor: Sensor, scenery: Scenery) -> dict:
+def _settings(sensor: Sensor, scenery: Scenery | str) -> dict:
     """Settings that are stored with every dataset."""
-    return {"version": VERSION, "sensor": dataclasses.asdict(sensor), "scenery": dataclasses.asdict(scenery)}
+    surroundings = {"repeating": scenery} if isinstance(scenery, str) else dataclasses.asdict(scenery)
+    return {"version": VERSION, "sensor": dataclasses.asdict(sensor), "scenery": surroundings}
 
 
 def _fingerprint(file: Path | None) -> str:

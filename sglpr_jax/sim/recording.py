@@ -1,5 +1,6 @@
 """Simulated drive as a recording. Its scans are rendered on demand and not stored on disk."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.submap import submaps
 from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import (
     HAND_HEIGHT_M,
@@ -102,6 +104,20 @@ def simulate_recording(
         rng=np.random.default_rng((*seeds, 2)),
         handheld=handheld,
     )
+
+
+def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRecording:
+    """Returns the recording with submaps of `length_m` metres by the true poses, or unchanged with 0 metres."""
+    if not length_m:
+        return recording
+    view = submaps(recording, recording.poses.world_from_lidar, length_m=length_m)
+
+    def render(i: int) -> tuple[np.ndarray, np.ndarray]:
+        record = view.record(i)
+        assert record.points is not None and record.labels is not None
+        return np.pad(record.points, ((0, 0), (0, 1))), record.labels  # submaps have no intensities
+
+    return dataclasses.replace(recording, read=view.read, render=render, found=view.found)
 
 
 def _mounting(height_m: float) -> Mounting | None:

@@ -7,9 +7,10 @@ import numpy as np
 
 from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
+from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING, Repeating
 from sglpr_jax.sim.sceneries.site import build
-from sglpr_jax.sim.sceneries.ways import LAPS, REVISITS, Revisit, way
+from sglpr_jax.sim.sceneries.ways import LAPS, way
 from sglpr_jax.sim.sensor import HDL64E, Sensor
 from sglpr_jax.sim.world import World
 

@@ -8,6 +8,7 @@ the same line both times.
 import dataclasses
 from collections import Counter, defaultdict
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +25,8 @@ They take at least 30 s.
 """
 TRIES, TRIES_PER_LOOP = 100, 30
 
+Revisit = Literal["none", "same", "opposite"]
+REVISITS: tuple[Revisit, ...] = ("none", "same", "opposite")
 Node = tuple[int, int]
 """Crossing of the lattice: column and row."""
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -51,6 +54,11 @@ class Role:
     """Standard deviation of the Gaussian that rounds corners, in metres. Corners have about this radius."""
     roundabouts: float = 0.08
     """Fraction of the crossings that are roundabouts."""
+
+    @property
+    def revisit(self) -> Revisit:
+        """Direction of the revisits, as `simulate_repeating` names it."""
+        return "none" if not self.again else "opposite" if self.opposite else "same"
 
 
 ROLES = {

@@ -9,11 +9,14 @@ from sglpr_jax.sim.choices import RATE_HZ, SCANS
 from sglpr_jax.sim.dataset import VERSION, write_dataset, write_sessions
 from sglpr_jax.sim.drive import name_of_path
 from sglpr_jax.sim.layouts import LAYOUTS
+from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS, Sensor
 
 ROUTES = ("00", "05", "08")
-"""Default routes."""
+"""Default routes in towns."""
+REVISITED = ("01", "06", "08")
+"""Default routes where places repeat: without revisits, in the same and in the opposite direction."""
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 AZIMUTH_STEPS = 900
 """Firings per revolution in the default datasets."""
@@ -65,8 +68,9 @@ def simulate(
     sensor: str | None = None,
     azimuth_steps: int | None = None,
     seed: int = 0,
-    rate_hz: float = RATE_HZ,
+    rate_hz: float | None = None,
     scenery: str = "town",
+    submap_m: float = 0.0,
     images: bool = False,
     vary: bool = False,
     on_start: Callable[[Simulated], None] = lambda dataset: None,
@@ -87,8 +91,10 @@ def simulate(
       sensor: Name from `SENSORS`. None is hdl64e, or hdl32e-nclt with `sessions`.
       azimuth_steps: Firings per revolution. None is the sensor's own number.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route.
-      scenery: Name from `SCENERIES`.
+      rate_hz: Scans per second of a route. None is 4 in towns, or the rate of the scenery.
+      scenery: Name from `SCENERIES` (towns), or from `REPEATING`. In the latter, a route stands only for the direction
+        of its revisits.
+      submap_m: Travelled distance of submaps, in metres. 0 writes scans.
       images: Whether to write density images with label images instead of scans.
       vary: Whether the images show scans that are rotated about z, some of them with lost points. See `sim.variety`.
       on_start: Function that is called with the dataset's description after all arguments are checked.
@@ -109,9 +115,14 @@ def simulate(
     if sessions and (along or images or len(routes or ()) > 1):
         found = f"{len(routes or ())} routes, {len(along)} pose files, images {images}"
         raise ValueError(f"with sessions, expected at most one route, no pose files and no images, found {found}")
-    if scenery not in SCENERIES:
-        raise ValueError(f"expected a scenery among {', '.join(SCENERIES)}, found {scenery!r}")
-    chosen = routes if routes is not None else () if along or sessions else ROUTES
+    known = SCENERIES if sessions else {**SCENERIES, **REPEATING}
+    if scenery not in known:
+        raise ValueError(f"expected a scenery among {', '.join(known)}, found {scenery!r}")
+    if sessions and submap_m:
+        raise ValueError(f"with sessions, expected no submaps, found submaps of {submap_m:g} m")
+    chosen = (
+        routes if routes is not None else () if along or sessions else ROUTES if scenery in SCENERIES else REVISITED
+    )
     names = tuple(sessions) or (*chosen, *map(name_of_path, along))
     if vary and not images:
         raise ValueError("vary: expected images, found scans; vary changes scans before they are converted to images")
@@ -124,11 +135,14 @@ def simulate(
         start()  # here, because all arguments are checked before the first progress
         on_progress(names.index(name) * scans + done * scans // count)
 
-    options = {"scans": scans, "sensor": lidar, "seed": seed, "rate_hz": rate_hz, "scenery": SCENERIES[scenery]}
+    options = {"scans": scans, "sensor": lidar, "seed": seed, "progress": progress}
     if sessions:
-        write_sessions(out, dates=sessions, route=next(iter(chosen), "00"), progress=progress, **options)
+        rate_hz = RATE_HZ if rate_hz is None else rate_hz
+        town = SCENERIES[scenery]
+        write_sessions(out, dates=sessions, route=next(iter(chosen), "00"), rate_hz=rate_hz, scenery=town, **options)
     else:
-        write_dataset(out, names=chosen, along=along, layout=layout, progress=progress, **options)
+        options |= {"rate_hz": rate_hz, "scenery": SCENERIES.get(scenery, scenery), "submap_m": submap_m}
+        write_dataset(out, names=chosen, along=along, layout=layout, **options)
     return dataset
 
 

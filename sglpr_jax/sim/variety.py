@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from sglpr_jax.data.corruption.corruptions import Corruption, corrupt
+from sglpr_jax.data.corruption.laser_rings import ring_numbers
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.views import rotated
 
@@ -48,8 +49,17 @@ def _left(points: Float32[np.ndarray, "n 3"], rng: np.random.Generator) -> Bool[
     kind, strength = rng.random(), rng.random()
     if kind < THINNED:
         corruption = Corruption("dropout", MOST_LOST * strength)
-    elif kind < THINNED + FEWER_BEAMS:
+    elif kind < THINNED + FEWER_BEAMS and _has_rings(points):
         corruption = Corruption("beams", BEAMS[int(len(BEAMS) * strength)])
     else:
         corruption = Corruption("clean")
     return corrupt(points, corruption, rng=rng)[1]
+
+
+def _has_rings(points: Float32[np.ndarray, "n 3"]) -> bool:
+    """Whether the points are those of rings. Submaps and sensors of other patterns keep all points instead."""
+    try:
+        ring_numbers(points)
+    except ValueError:
+        return False
+    return True

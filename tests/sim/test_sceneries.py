@@ -8,10 +8,11 @@ from sglpr_jax.sim.ground import relief_height
 from sglpr_jax.sim.placing import footprint_distance
 from sglpr_jax.sim.raw_ids import BUILDING, FENCE, POLE
 from sglpr_jax.sim.repeating import mounted, plan_drive, simulate_repeating
+from sglpr_jax.sim.routes import REVISITS
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sceneries.site import HEAD_ROOM_M, build, distances, striped_ground
 from sglpr_jax.sim.sceneries.site import Strip as GroundStrip
-from sglpr_jax.sim.sceneries.ways import REVISITS, STEP_M, ring, road, rows, way
+from sglpr_jax.sim.sceneries.ways import STEP_M, ring, road, rows, way
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.shapes import Shapes
 

@@ -1,11 +1,14 @@
 """A simulated dataset in one call says what it writes, and completes what is there."""
 
+import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sglpr_jax.data import open_recording, recording_names
-from sglpr_jax.sim import simulate
+from sglpr_jax.data.submap import submaps
+from sglpr_jax.sim import SENSORS, simulate, simulate_repeating
 from sglpr_jax.sim.simulation import default_dataset, default_sessions
 
 THIN = {"scans": 3, "azimuth_steps": 40, "sensor": "vlp16"}
@@ -22,6 +25,22 @@ def test_towns_are_written_with_what_they_are_told_beforehand(tmp_path):
     assert told[1] == ()
     both = simulate(tmp_path / "town", routes=["08", "00"], **THIN, on_progress=done.append)
     assert recording_names(both.root) == ("00", "08") and done[-1] == 6 and done == sorted(done)
+
+
+def test_submaps_of_a_scenery_where_places_repeat(tmp_path):
+    options = {"scans": 4, "azimuth_steps": 40, "sensor": "vlp16", "scenery": "tunnel", "submap_m": 1000.0}
+    found = simulate(tmp_path, routes=["08"], **options)
+    sensor = dataclasses.replace(SENSORS["vlp16"], azimuth_steps=40)
+    drive = simulate_repeating("tunnel", scans=4, sensor=sensor, revisit="opposite")
+    expected = submaps(drive, drive.poses.world_from_lidar, length_m=1000.0)
+    written = open_recording(found.root, "08", sensor_height="auto")
+    for i in range(4):
+        np.testing.assert_array_equal(written.points(i), expected.points(i))
+        np.testing.assert_array_equal(written.record(i).labels, expected.record(i).labels)
+    assert len(written.points(3)) > len(drive.points(3))
+    assert written.positions == pytest.approx(drive.positions, abs=1e-5)
+    with pytest.raises(ValueError, match=r"submap_m 1000.0 \(found 10.0\)|submap_m 10.0 \(found 1000.0\)"):
+        simulate(tmp_path, routes=["08"], **{**options, "submap_m": 10.0})
 
 
 def test_days_of_one_town(tmp_path):
@@ -46,6 +65,10 @@ def test_what_does_not_go_together_is_refused(tmp_path):
         ({"seed": -1}, "seed: expected"),
         ({"rate_hz": 0.0}, "rate_hz: expected"),
         ({"scans": 1}, "2 scans or more"),
+        ({"submap_m": -1.0}, "submap_m: expected"),
+        ({"sessions": ["2012-01-15"], "submap_m": 5.0}, "expected no submaps"),
+        ({"scenery": "forest", "routes": ["00", "05"]}, "different revisits"),
+        ({"scenery": "wood"}, "found 'wood'"),
     ],
 )
 def test_nothing_is_told_of_a_dataset_that_cannot_be(tmp_path, changes, error):

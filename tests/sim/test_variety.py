@@ -62,6 +62,15 @@ def test_some_scans_stay_whole_some_lose_rings_and_some_lose_points_of_all_rings
     np.testing.assert_allclose(np.median(share_left), 0.525, atol=0.12)
 
 
+def test_a_scan_without_rings_keeps_all_points_or_loses_random_ones():
+    rng = np.random.default_rng(1)
+    left = []
+    for _ in range(60):
+        points = rng.uniform(-20, 20, (500, 3)).astype(np.float32)
+        left.append(len(vary(points, np.arange(500), None)[1]) / 500)
+    assert 0.4 < np.mean(np.array(left) == 1) < 0.8 and min(left) < 0.5
+
+
 def test_the_scan_alone_decides(varied):
     points, turned, labels = varied[7]
     again, same = vary(points.copy(), np.arange(len(points)), None)

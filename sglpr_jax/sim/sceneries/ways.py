@@ -1,12 +1,12 @@
 """Lines for surroundings where places repeat: roads, rings and rows, and the path of a vehicle along them."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from sglpr_jax.sim.routes import resampled, travelled
+from sglpr_jax.sim.routes import Revisit, resampled, travelled
 
 STEP_M = 0.1
 """Distance between two points of a line, in metres."""
@@ -17,8 +17,6 @@ LAPS = 1.5
 SWAY_WAVELENGTH_M = (15.0, 60.0)
 
 Line = Float[np.ndarray, "_ 2"]
-Revisit = Literal["none", "same", "opposite"]
-REVISITS: tuple[Revisit, ...] = ("none", "same", "opposite")
 
 
 class Rows(NamedTuple):
