@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -14,6 +14,9 @@ from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.models.params import Params
 
 UNFINISHED = ".unfinished"
@@ -29,6 +32,7 @@ class MapCommand:
     Example:
       bin/map my_scans --poses poses.tum --out town.safetensors
       bin/map today --poses today.tum --add-to town.safetensors --out town.safetensors
+      bin/map other --poses other.tum --add-to town.safetensors --frame align --out town.safetensors
       bin/map town.pcd --poses trajectory.tum --out town.safetensors
     """
 
@@ -44,7 +48,11 @@ class MapCommand:
     """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
     recognises tum and .g2o."""
     add_to: Path | None = None
-    """Existing map in the same world frame, made with the same weights. The new map also contains its places."""
+    """Existing map, made with the same weights. The new map also contains its places."""
+    frame: Literal["check", "same", "align"] = "check"
+    """World frame of --poses, with --add-to. `check`: that of the existing map, and common places must agree. `same`:
+    that of the existing map, without a check. `align`: any frame; the transform to the existing map is estimated from
+    common places."""
     spacing_m: NotNegative = SPACING_M
     """Minimum distance between places, in metres. Scans closer to the last place are skipped."""
     weights: str = DEFAULT_WEIGHTS
@@ -70,8 +78,9 @@ def write_map(command: MapCommand) -> int:
 
 
 def _add_places(command: MapCommand, params: "Params") -> int:
+    from sglpr_jax.loops.map_recording import map_recording
     from sglpr_jax.loops.place_names import poses_by_id
-    from sglpr_jax.loops.places import PlaceMap, map_recording
+    from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.loops.unfinished import remove
     from sglpr_jax.models.weights import weights_hash
 
@@ -93,8 +102,10 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             on_progress=show,
         )
     stopped = scans < len(recording)
-    if len(places):
-        whole = places if before is None else before.merged(places, drive=poses_by_id(recording, poses))
+    if stopped and before is not None and command.frame == "align":
+        print("the new map is not aligned and added before it is complete")
+    elif len(places):
+        whole = places if before is None else _added(command, before, places, poses_by_id(recording, poses))
         if stopped and _holds_more(command.out, len(whole)):
             print(f"{command.out}: unchanged, because it has more places than the {len(whole)} found until now")
         else:
@@ -108,6 +119,28 @@ def _add_places(command: MapCommand, params: "Params") -> int:
         return stop.exit_status
     remove(unfinished)
     return 0
+
+
+def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]) -> "PlaceMap":
+    """The existing map with the places of the new one, in the frame that the flag states."""
+    from sglpr_jax.loops.map_alignment import align_maps, check_one_frame, without_known_places
+
+    if command.frame == "check":
+        check_one_frame(before, new)
+    if command.frame != "align":
+        return before.merged(new, drive=drive)
+    new = without_known_places(before, new)
+    if not len(new):
+        return before
+    found = align_maps(before, new)
+    if found is None:
+        raise ValueError(
+            f"{command.add_to}: expected places in common with {command.recording} to align the two world frames, "
+            "found too few"
+        )
+    print(f"{command.recording}: {found}")
+    world_from_new = found.frames.match_from_query
+    return before.merged(new.moved(world_from_new), drive={id: world_from_new @ pose for id, pose in drive.items()})
 
 
 def _holds_more(path: Path, places: int) -> bool:

@@ -3,29 +3,25 @@
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.gravity import GroundFilter, with_odometry
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.gravity import GroundFilter
+from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.fields import check_value
-from sglpr_jax.loops.add_scans import add_scans
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig
-from sglpr_jax.loops.given import check_is, given_poses, given_record
+from sglpr_jax.loops.given import given_record
 from sglpr_jax.loops.loop import planar_loop
-from sglpr_jax.loops.mountings import mountings_of, upright_from_lidar
+from sglpr_jax.loops.mountings import upright_from_lidar
 from sglpr_jax.loops.place_file import REQUIRED, read_places, write_places
-from sglpr_jax.loops.place_names import Content, free_names, place_names
-from sglpr_jax.loops.place_scans import PlaceScans
+from sglpr_jax.loops.place_names import Content, free_names
 from sglpr_jax.loops.pose_search import Peak, occupied, query_spectra, search_spectra, within_reach
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.relocated import Relocated, with_shared_probability
@@ -33,7 +29,6 @@ from sglpr_jax.loops.rivals import MAP_RIVALS, distance_share, rival_places, riv
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.shortlist import shortlist
 from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.upright import check_level
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
@@ -85,6 +80,8 @@ class PlaceMap:
           spacing_m: Minimum distance of consecutive places, in metres.
           on_progress: Called with the number of scans done.
         """
+        from sglpr_jax.loops.map_recording import map_recording  # imports this module
+
         return map_recording(recording, params, poses, spacing_m=spacing_m, on_progress=on_progress).places
 
     def mounting(self, row: int = -1) -> Mounting:
@@ -173,12 +170,25 @@ class PlaceMap:
         if len(self) and not isinstance(record, Record) and given.points is not None:
             given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
         seen = finder.seen(given)
+        return self.relocate_seen(seen, weights_hash=finder.index.weights_hash, model=model, candidates=candidates)
+
+    def relocate_seen(
+        self, seen: Seen, *, weights_hash: str | None, model: LoopModel | None = None, candidates: int = CANDIDATES
+    ) -> list[Relocated]:
+        """Locate a described scan in the map. The arguments and answers are those of `relocate`.
+
+        Arguments:
+          seen: Description of the scan.
+          weights_hash: Hash of the weights that described it.
+          model: Model of the probabilities, by default the one shipped for the weights.
+          candidates: Maximum number of poses.
+        """
         image = seen.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
-        exclude = np.full(len(self), finder.is_empty(image))
+        exclude = np.full(len(self), np.count_nonzero(image) < CandidateConfig().min_cells)
         nearest = max(candidates, CandidateConfig().further)
-        found = self.index.query(seen.descriptor, nearest, exclude=exclude, weights_hash=finder.index.weights_hash)
+        found = self.index.query(seen.descriptor, nearest, exclude=exclude, weights_hash=weights_hash)
         rows, distances = (values[found.rows >= 0] for values in found)
         if not len(rows):
             return []
@@ -190,6 +200,33 @@ class PlaceMap:
             for i, k in enumerate(chosen.tolist())
         ]
         return with_shared_probability(answers)[:candidates]
+
+    def seen(self, row: int) -> Seen:
+        """Description of the scan at a place."""
+        return Seen(self.index.descriptors[row], self.images[row], self.mounting(row))
+
+    def some(self, rows: Sequence[int]) -> "PlaceMap":
+        """Return a map of some of the places.
+
+        Arguments:
+          rows: Numbers of the places.
+        """
+        index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
+        ids, positions = [self.index.ids[row] for row in rows], self.world_from_place[rows, :3, 3]
+        index.add(self.index.descriptors[rows], ids=ids, positions=positions)
+        arrays = {name: getattr(self, name)[rows] for name in REQUIRED}
+        return PlaceMap(index, **arrays, mounting_deviations=self._deviations[rows])
+
+    def moved(self, world_from_old: Float[np.ndarray, "4 4"]) -> "PlaceMap":
+        """Return the map in another world frame.
+
+        Arguments:
+          world_from_old: Pose of the old world frame in the new one.
+        """
+        poses = world_from_old @ self.world_from_place
+        index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
+        index.add(self.index.descriptors, ids=self.index.ids, positions=poses[:, :3, 3])
+        return dataclasses.replace(self, index=index, world_from_place=poses)
 
     def save(self, path: Path | str) -> None:
         """Write the map atomically to one file: an index file with additional arrays (`place_file.ARRAYS`)."""
@@ -253,106 +290,3 @@ class PlaceMap:
         query = upright[0] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
         expected = [(inverse(upright[1:]) @ query, np.full(len(rows), RivalConfig().agree_m))]
         return distance_share(distance, apart[rows], expected), rival_share(found, float(peak.correlation), expected)
-
-
-class Mapped(NamedTuple):
-    """Map of a recording, with the scans that were skipped."""
-
-    places: PlaceMap
-    scans: int
-    """Number of processed scans: all, unless the run was stopped."""
-    skipped: tuple[str, ...]
-    """Ids of scans that cannot be read."""
-
-
-def map_recording(
-    recording: Recording,
-    params: Params,
-    poses: ArrayLike,
-    *,
-    spacing_m: float = SPACING_M,
-    on_bad_scan: OnBadScan | None = None,
-    kept_in: Path | str | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
-    on_progress: Callable[[int], None] = lambda done: None,
-) -> Mapped:
-    """Create the map of a recording with known poses.
-
-    The id of a place is `RECORDING/SCAN`. Scans that are almost empty are skipped.
-
-    Arguments:
-      recording: The scans.
-      params: Weights of the model that describes them.
-      poses: Pose of the LiDAR in the world at each scan.
-      spacing_m: Minimum distance of consecutive places, in metres. Scans nearer to the last place are not read.
-      on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped. Without it the error is
-        raised.
-      kept_in: Checkpoint directory. With the same recording, poses, weights and spacing, the run resumes from it. The
-        directory is not removed.
-      should_stop: If it returns True, the run ends and returns the map of the processed scans.
-      on_progress: Called with the number of processed scans.
-
-    Raises:
-      ValueError: If the poses have another length or shape, or if all scans are empty.
-      TypeError: If an argument is not a recording, parameters or an array.
-    """
-    check_is(recording, Recording, by="open_recording")
-    poses = given_poses(poses, of="poses")
-    if len(poses) != len(recording) or not len(recording):
-        raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
-    check_level(poses, mountings_of(recording), name=recording.name)
-    recording = with_odometry(recording, poses)
-    finder = CandidateFinder(params)
-    chosen = PlaceScans(finder, poses[:, :3, 3], spacing_m)
-    seen_scans: list[Seen | None] = []
-
-    def add(seen: Seen | None, compared: Compared | None) -> None:
-        seen_scans.append(seen)
-        finder.add_seen(seen, compared=Compared([], None))
-
-    add_scans(
-        recording,
-        finder,
-        add,
-        rows=chosen.unseen(),
-        kept_in=kept_in,
-        on_bad_scan=on_bad_scan,
-        should_stop=should_stop,
-        on_progress=on_progress,
-        poses=poses,
-        spacing_m=spacing_m,
-    )
-    on_progress(chosen.done)
-    if not chosen.rows and chosen.done == len(recording):
-        raise ValueError(
-            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
-        )
-    skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
-    return Mapped(_places(finder.index, recording, poses, chosen, seen_scans), chosen.done, skipped)
-
-
-def _places(
-    like: Index,
-    recording: Recording,
-    poses: Float[np.ndarray, "n 4 4"],
-    chosen: PlaceScans,
-    seen: Sequence[Seen | None],
-) -> PlaceMap:
-    """Map of the chosen scans of a recording."""
-    index = Index.empty(like.width, weights_hash=like.weights_hash)
-    places = [one for one in (seen[frame] for frame in chosen.frames) if one is not None]
-    names, rows = place_names(recording), chosen.rows
-    ids = [names[row] for row in rows]
-    descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, like.width)
-    index.add(descriptors, ids=ids, positions=poses[rows, :3, 3])
-    images = [one.image for one in places]
-    sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
-    mountings = np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4)
-    deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
-    return PlaceMap(
-        index,
-        np.stack(images) if images else np.zeros((0, 0, 0), np.uint8),
-        poses[rows],
-        mountings,
-        np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN
-    )

@@ -10,10 +10,11 @@ from rich.console import Console
 import sglpr_jax
 from sglpr_jax.cli.relocalize import _table
 from sglpr_jax.data import open_recording
-from sglpr_jax.loops import places
+from sglpr_jax.loops import map_recording as recorded
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.loop_files import write_tum
-from sglpr_jax.loops.places import PlaceMap, Relocated, map_recording
+from sglpr_jax.loops.map_recording import map_recording
+from sglpr_jax.loops.places import PlaceMap, Relocated
 from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.index import Index
@@ -97,7 +98,7 @@ def test_ctrl_c_keeps_what_was_found_and_the_same_command_goes_on(command, town,
     out, other = tmp_path / "town.safetensors", tmp_path / "whole.safetensors"
     run = ("map", town, "--seq", "08", "--poses", poses, "--spacing-m", "0")
     assert command(*run, "--out", other).status == 0
-    monkeypatch.setattr(places, "map_recording", stopped)
+    monkeypatch.setattr(recorded, "map_recording", stopped)
     add_to = ()
     for stop_at, words in ((10, "10 places, 10 of them from 10 of 40"), (25, "25 places, 15 of them from 25 of 40")):
         ended = command(*run, *add_to, "--out", out)
@@ -135,12 +136,31 @@ def test_a_stopped_map_of_a_name_that_is_taken_ends_as_if_not_stopped(command, t
     assert command(*run, "--add-to", before, "--out", whole).status == 0
     shutil.copy(before, out)
     with monkeypatch.context() as patch:
-        patch.setattr(places, "map_recording", stopped)
+        patch.setattr(recorded, "map_recording", stopped)
         assert command(*run, "--add-to", out, "--out", out).status == 130
     assert command(*run, "--add-to", out, "--out", out).status == 0
     assert out.read_bytes() == whole.read_bytes()
     names = PlaceMap.load(out).index.ids
     assert names[0] == "08/000000" and names[1:] == [f"08~2/{scan:06d}" for scan in range(40)]
+
+
+@pytest.mark.slow
+def test_a_map_of_another_frame_is_aligned_or_rejected(command, town, poses, tmp_path):
+    values = np.loadtxt(poses)
+    values[:, 1] += 500
+    np.savetxt(tmp_path / "moved.tum", values)
+    before, out = tmp_path / "before.safetensors", tmp_path / "out.safetensors"
+    run = ("map", town, "--seq", "08", "--spacing-m", "0", "--poses")
+    assert command(*run, poses, "--out", before).status == 0
+    add = (*run, tmp_path / "moved.tum", "--add-to", before, "--out", out)
+    assert_one_line_error(command(*add), "places that are 500.0 m away from where the existing map has them")
+    assert not out.exists()
+    ended = command(*add, "--frame", "align")
+    assert ended.status == 0 and f"{SCANS} places, 0 of them" in ended.out
+    np.testing.assert_allclose(PlaceMap.load(out).world_from_place, PlaceMap.load(before).world_from_place)
+    assert command(*add, "--frame", "same").status == 0 and len(PlaceMap.load(out)) == 2 * SCANS
+    other = ("map", town, "--seq", "00", "--poses", poses, "--add-to", before, "--out", out, "--frame", "align")
+    assert_one_line_error(command(*other), "expected places in common with", "found too few")
 
 
 def test_two_processes_do_not_make_one_map(command, town, poses, tmp_path):

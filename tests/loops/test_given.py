@@ -17,7 +17,8 @@ from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.given import check_is, given_pose, given_poses, given_record, given_time
-from sglpr_jax.loops.places import PlaceMap, map_recording
+from sglpr_jax.loops.map_recording import map_recording
+from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.models.params import Params

@@ -15,7 +15,8 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import rotated
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import unfinished
-from sglpr_jax.loops.places import PlaceMap, map_recording
+from sglpr_jax.loops.map_recording import map_recording
+from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.transforms import inverse, yaw_of
 from sglpr_jax.retrieval.index import Index
 

@@ -1,0 +1,129 @@
+"""Creation of the map of a recording with known poses. It can skip unreadable scans, stop and resume."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from sglpr_jax.data.gravity import with_odometry
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import OnBadScan
+from sglpr_jax.loops.add_scans import add_scans
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.choices import SPACING_M
+from sglpr_jax.loops.given import check_is, given_poses
+from sglpr_jax.loops.mountings import mountings_of
+from sglpr_jax.loops.place_names import place_names
+from sglpr_jax.loops.place_scans import PlaceScans
+from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.upright import check_level
+from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.index import Index
+
+
+class Mapped(NamedTuple):
+    """Map of a recording, with the scans that were skipped."""
+
+    places: PlaceMap
+    scans: int
+    """Number of processed scans: all, unless the run was stopped."""
+    skipped: tuple[str, ...]
+    """Ids of scans that cannot be read."""
+
+
+def map_recording(
+    recording: Recording,
+    params: Params,
+    poses: ArrayLike,
+    *,
+    spacing_m: float = SPACING_M,
+    on_bad_scan: OnBadScan | None = None,
+    kept_in: Path | str | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Mapped:
+    """Create the map of a recording with known poses.
+
+    The id of a place is `RECORDING/SCAN`. Scans that are almost empty are skipped.
+
+    Arguments:
+      recording: The scans.
+      params: Weights of the model that describes them.
+      poses: Pose of the LiDAR in the world at each scan.
+      spacing_m: Minimum distance of consecutive places, in metres. Scans nearer to the last place are not read.
+      on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped. Without it the error is
+        raised.
+      kept_in: Checkpoint directory. With the same recording, poses, weights and spacing, the run resumes from it. The
+        directory is not removed.
+      should_stop: If it returns True, the run ends and returns the map of the processed scans.
+      on_progress: Called with the number of processed scans.
+
+    Raises:
+      ValueError: If the poses have another length or shape, or if all scans are empty.
+      TypeError: If an argument is not a recording, parameters or an array.
+    """
+    check_is(recording, Recording, by="open_recording")
+    poses = given_poses(poses, of="poses")
+    if len(poses) != len(recording) or not len(recording):
+        raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
+    check_level(poses, mountings_of(recording), name=recording.name)
+    recording = with_odometry(recording, poses)
+    finder = CandidateFinder(params)
+    chosen = PlaceScans(finder, poses[:, :3, 3], spacing_m)
+    seen_scans: list[Seen | None] = []
+
+    def add(seen: Seen | None, compared: Compared | None) -> None:
+        seen_scans.append(seen)
+        finder.add_seen(seen, compared=Compared([], None))
+
+    add_scans(
+        recording,
+        finder,
+        add,
+        rows=chosen.unseen(),
+        kept_in=kept_in,
+        on_bad_scan=on_bad_scan,
+        should_stop=should_stop,
+        on_progress=on_progress,
+        poses=poses,
+        spacing_m=spacing_m,
+    )
+    on_progress(chosen.done)
+    if not chosen.rows and chosen.done == len(recording):
+        raise ValueError(
+            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
+        )
+    skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
+    return Mapped(_map_of(finder.index, recording, poses, chosen, seen_scans), chosen.done, skipped)
+
+
+def _map_of(
+    like: Index,
+    recording: Recording,
+    poses: Float[np.ndarray, "n 4 4"],
+    chosen: PlaceScans,
+    seen: Sequence[Seen | None],
+) -> PlaceMap:
+    """Map of the chosen scans of a recording."""
+    index = Index.empty(like.width, weights_hash=like.weights_hash)
+    places = [one for one in (seen[frame] for frame in chosen.frames) if one is not None]
+    names, rows = place_names(recording), chosen.rows
+    ids = [names[row] for row in rows]
+    descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, like.width)
+    index.add(descriptors, ids=ids, positions=poses[rows, :3, 3])
+    images = [one.image for one in places]
+    sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
+    mountings = np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4)
+    deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
+    return PlaceMap(
+        index,
+        np.stack(images) if images else np.zeros((0, 0, 0), np.uint8),
+        poses[rows],
+        mountings,
+        np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN
+    )
