@@ -71,7 +71,7 @@ def _candidate(queries: CandidateFinder, matches: CandidateFinder, row: int) -> 
     spectra = query_spectra(seen.image, config=matches.verification)
     images = [stored.image(one) for one in compared.tolist()]
     peaks = matches.search(spectra, images, config.candidates + config.elsewhere)
-    compared, peaks = matches.with_further(seen, spectra, compared, peaks, np.zeros(len(stored), bool))
+    compared, peaks = matches.with_further(seen, spectra, compared, peaks, np.zeros(len(stored), bool), fit=matches.fit)
     best = int(np.argmax(peaks.correlation))
     peak, match_row = peaks.one(best), int(compared[best])
     query, match = int(queries.stored.frames[row]), int(stored.frames[match_row])

@@ -1,6 +1,6 @@
 """Candidate matches of a scan: description, retrieval of earlier scans, and comparison of images."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -230,12 +230,9 @@ class CandidateFinder:
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows):
             return Compared([], link)
-        rows, found = self.with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded)
-        fit = found.correlation
-        if pose is not None:  # floors of a building look alike
-            poses, way = self.motion.poses, self.motion.travelled
-            fit = fit - 2 * on_other_floor(poses, way, self.stored.frames[rows], found, self.drift)
-        best = int(np.argmax(fit))
+        fit = self.fit if pose is None else self.fit_on_floor
+        rows, found = self.with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded, fit=fit)
+        best = int(np.argmax(fit(rows, found)))
         return Compared([self._candidate(seen, spectra, rows, found, best)], link)
 
     def similar(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
@@ -246,6 +243,15 @@ class CandidateFinder:
         excluded = excluded | self.about(int(rows[0]))
         return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
 
+    def fit(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
+        """How well each compared scan fits: its correlation."""
+        return found.correlation
+
+    def fit_on_floor(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
+        """The correlation, and -2 added on another floor by odometry, because floors of a building look alike."""
+        other = on_other_floor(self.motion.poses, self.motion.travelled, self.stored.frames[rows], found, self.drift)
+        return found.correlation - 2 * other
+
     def with_further(
         self,
         seen: Seen,
@@ -253,10 +259,12 @@ class CandidateFinder:
         rows: Int[np.ndarray, " k"],
         found: Peak,
         excluded: Bool[np.ndarray, " n"],
+        *,
+        fit: Callable[[Int[np.ndarray, " k"], Peak], Float[np.ndarray, " k"]],
     ) -> tuple[Int[np.ndarray, " j"], Peak]:
         """Compared scans and their peaks, with further scans if none of the compared ones fits well."""
         config = self.config
-        if found.correlation.max() >= config.good_correlation:
+        if fit(rows, found).max() >= config.good_correlation:
             return rows, found
         pool = self.nearest(seen.descriptor, config.further, excluded)
         pool = pool[~np.isin(pool, rows)]

@@ -43,3 +43,16 @@ def test_places_with_distant_descriptors_are_found_by_further_comparisons(images
     wrong = (descriptors[0] + 0.1 * descriptors[-1]).astype(np.float32)
     [candidate] = finder.add_seen(Seen(wrong / np.linalg.norm(wrong), query, None))
     assert (candidate.match == TRUE) == found
+
+
+def test_a_good_fit_on_another_floor_does_not_end_the_search(images, query):
+    config = CandidateConfig(candidates=1, elsewhere=0, further=PLACES, exclude_frames=1, min_travelled_m=0.0)
+    finder = CandidateFinder(sglpr_jax.load("circular"), config=config)
+    descriptors = np.eye(PLACES, finder.index.width, dtype=np.float32)
+    upstairs = [images[TRUE], *images[1:]]  # the first place has the same walls as the true one, 8 m higher
+    for frame, (image, descriptor) in enumerate(zip(upstairs, descriptors, strict=True)):
+        pose = np.eye(4)
+        pose[:3, 3] = frame % 3, 0.0, 0.0 if frame else 8.0
+        finder.add_seen(Seen(descriptor, image, None), odometry=pose)
+    [candidate] = finder.add_seen(Seen(descriptors[0], query, None), odometry=np.eye(4))
+    assert candidate.match == TRUE
