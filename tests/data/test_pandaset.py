@@ -90,7 +90,7 @@ def test_no_pickle_is_opened(root, monkeypatch, tmp_path):
     (root / "001" / "lidar" / "00.pkl.gz").write_bytes(pickle.dumps(Bomb()))
     assert recording_names(root) == ("001",)
     with pytest.raises(
-        ValueError, match=r"expected scans as \.npy, found 3 pickles .* docs/guides/own-data\.md says how"
+        ValueError, match=r"expected scans as \.npy, found 3 pickles .* docs/reference/files\.md says how"
     ):
         open_recording(root)
     np.save(root / "001" / "lidar" / "00.npy", np.array([Bomb()]), allow_pickle=True)

@@ -1,7 +1,7 @@
 """Reader of PandaSet with scans converted to .npy. The original pickles are not opened, since they can execute code.
 
 - `001/lidar/00.pkl.gz`: the original scan, a pickle.
-- `001/lidar/00.npy`: the converted scan (docs/guides/own-data.md): x, y, z of the LiDAR on the roof, in world axes.
+- `001/lidar/00.npy`: the converted scan (docs/reference/files.md): x, y, z of the LiDAR on the roof, in world axes.
 - `001/lidar/poses.json`: position and heading of that LiDAR, one row for each scan.
 - `001/lidar/timestamps.json`: timestamps in seconds.
 
@@ -48,7 +48,7 @@ def open_recording(root: Path, name: str) -> Recording:
     if not paths and pickles:
         raise ValueError(
             f"{folder}: expected scans as .npy, found {len(pickles)} pickles (*{PICKLES}), which are not opened because"
-            " they can execute code; docs/guides/own-data.md says how to convert them"
+            " they can execute code; docs/reference/files.md says how to convert them"
         )
     if not paths:
         raise FileNotFoundError(f"{folder}: expected scans (*.npy), found none")
