@@ -38,8 +38,9 @@ class SimulateCommand:
     """Firings per revolution. Fewer firings make smaller files. None: the number of the real sensor."""
     scenery: str = "town"
     """Surroundings of the drive: `town`; `outskirts`, hilly, with long roads between walls, hedges and slopes; `lanes`,
-    roads between overgrown hedges; `gardens`, streets with front gardens, low fences and old trees; or surroundings
-    where places repeat, such as `forest`, in which a route stands only for the direction of its revisits."""
+    roads between overgrown hedges; or `gardens`, streets with front gardens, low fences and old trees. Surroundings
+    where places repeat, such as `forest`, are possible, too. There, a route stands only for the direction of its
+    revisits."""
     submap_m: float = 0.0
     """Travelled distance of submaps, in metres. 0 writes scans."""
     images: bool = False
