@@ -26,7 +26,8 @@ import sglpr_jax
 from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
-from sglpr_jax.loops.candidates import Candidate, Compared
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import settled

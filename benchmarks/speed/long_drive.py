@@ -22,7 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.pose_search import Peak

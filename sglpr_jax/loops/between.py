@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import expit, logit
 
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.motion import Motion
@@ -67,11 +68,13 @@ def _candidate(queries: CandidateFinder, matches: CandidateFinder, row: int) -> 
     """The best match of the stored scan `row`."""
     config, stored = matches.config, matches.stored
     seen = Seen(queries.index.descriptors[row], queries.stored.image(row), None)
-    compared = matches.similar(seen.descriptor, np.zeros(len(stored), bool))
+    compared = matches.comparer.similar(seen.descriptor, np.zeros(len(stored), bool))
     spectra = query_spectra(seen.image, config=matches.verification)
     images = [stored.image(one) for one in compared.tolist()]
-    peaks = matches.search(spectra, images, config.candidates + config.elsewhere)
-    compared, peaks = matches.with_further(seen, spectra, compared, peaks, np.zeros(len(stored), bool), fit=matches.fit)
+    peaks = matches.comparer.search(spectra, images, config.candidates + config.elsewhere)
+    compared, peaks = matches.comparer.with_further(
+        seen, spectra, compared, peaks, np.zeros(len(stored), bool), fit=matches.comparer.fit
+    )
     best = int(np.argmax(peaks.correlation))
     peak, match_row = peaks.one(best), int(compared[best])
     query, match = int(queries.stored.frames[row]), int(stored.frames[match_row])
@@ -90,13 +93,15 @@ def _candidate(queries: CandidateFinder, matches: CandidateFinder, row: int) -> 
             about = {"count": count, "exclude_s": config.exclude_s, "config": rules}
             rows = rivals_around(seen.descriptor, descriptors, frames, frame, finder.motion, **about)
             others = [finder.stored.image(one) for one in rows.tolist()]
-            found = matches.search(spectra, others, rules.of_query + rules.of_match)
+            found = matches.comparer.search(spectra, others, rules.of_query + rules.of_match)
             expected = [expected_poses(finder.motion, frame, frames[rows], frame_from_query, config=rules)]
             apart = np.linalg.norm(descriptors[rows] - seen.descriptor, axis=1)
             here = distance_share(distance, apart, expected, config=rules)
             shares = np.fmax(shares, (here, rival_share(found, correlation, expected, config=rules)))
-        far = ~matches.about(match_row)[compared] & matches.motion.same(match, stored.frames[compared])
-        shares = np.fmax(shares, matches.shares(seen, match, distance, peak, compared[far], peaks.some(far), []))
+        far = ~matches.comparer.about(match_row)[compared] & matches.motion.same(match, stored.frames[compared])
+        shares = np.fmax(
+            shares, matches.comparer.shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
+        )
     cells = min(occupied(one, matches.verification) for one in (seen.image, image))
     evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
     return Candidate(query, match, alignment, evidence)

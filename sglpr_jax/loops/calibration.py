@@ -155,7 +155,7 @@ class _Places:
         found = finder.index.query(query.descriptor, RIVALS, exclude=~elsewhere).rows
         rows = [row, *found[found >= 0].tolist()]
         spectra = query_spectra(query.image, config=finder.verification)
-        peaks = finder.search(spectra, [self.images[k] for k in rows], 1 + RIVALS)
+        peaks = finder.comparer.search(spectra, [self.images[k] for k in rows], 1 + RIVALS)
         peak = peaks.one(0)
         share = rival_share(peaks.some(slice(1, None)), float(peak.correlation), [])
         fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))

@@ -14,7 +14,8 @@ from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.times import PROOF, doubt, unit_change
 from sglpr_jax.fields import check_value
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.drift import deviations

@@ -16,7 +16,8 @@ from sglpr_jax.data.scan_stream import OnBadScan, check_readable
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.add_scans import add_scans
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import check_is, given_poses

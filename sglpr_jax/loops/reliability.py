@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.same_place import NEGATIVE_M
 

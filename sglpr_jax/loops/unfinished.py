@@ -21,7 +21,8 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import alone_in, read_json, replacing, write_json, writing
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.seen import Seen

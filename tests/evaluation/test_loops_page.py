@@ -8,7 +8,7 @@ from recordings import of_images
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page.of_loops import loops_page
-from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.optimization import OptimizedTrajectory

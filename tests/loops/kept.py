@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sglpr_jax.loops import unfinished
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.seen import Seen

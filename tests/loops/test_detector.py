@@ -7,7 +7,8 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.record import Record
-from sglpr_jax.loops.candidates import Candidate, CandidateFinder, Compared
+from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, RivalConfig, SequenceConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from recordings import of_images
 
-from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.explanation import why_few_queries, why_none
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop, Reason, Rejected

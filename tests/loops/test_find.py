@@ -13,7 +13,8 @@ from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import find
-from sglpr_jax.loops.candidates import Candidate, Compared
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import check_odometry

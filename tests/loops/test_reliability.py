@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sglpr_jax.loops.candidates import Candidate
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.reliability import EDGES, reliability, reliability_of
 

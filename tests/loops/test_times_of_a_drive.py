@@ -17,7 +17,8 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.candidates import Candidate, Compared
+from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.explanation import why_few_queries
