@@ -34,6 +34,7 @@ from .data.density_image import density_bev as density_bev
 from .data.gravity import GroundFilter as GroundFilter
 from .data.mounting import Mounting as Mounting
 from .data.mounting import estimate_mounting as estimate_mounting
+from .data.scaled import scaled as scaled
 from .data.submap import SubmapBuilder as SubmapBuilder
 from .data.submap import submaps as submaps
 from .evaluation.scoring import Evaluation as Evaluation

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from benchmarks.quality.loops import drifted
 from sglpr_jax.data.record import Record
+from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.seen import Seen
@@ -36,13 +37,18 @@ class RenderedDrive(NamedTuple):
     """Frames farther apart than this show different places."""
     about: dict[str, str]
     """Scenery, revisit, sensor and seed."""
+    scale: int = 1
+    """Factor that all lengths, also those of the poses, were multiplied by."""
 
     def odometry(self, kind: Odometry) -> Float[np.ndarray, "n 4 4"] | None:
         """The true poses, the same with drift (`loops.drifted`), or None."""
         if kind == "none":
             return None
         poses = self.world_from_lidar
-        return poses if kind == "exact" else drifted(poses, seed=int(self.about["seed"]))
+        if kind == "exact":
+            return poses
+        real = scaled_poses(poses, 1 / self.scale)
+        return scaled_poses(drifted(real, seed=int(self.about["seed"])), self.scale)
 
 
 def read(path: Path, params: Params | None = None) -> RenderedDrive:
@@ -51,13 +57,14 @@ def read(path: Path, params: Params | None = None) -> RenderedDrive:
         images, descriptors, poses, times, other_m = (
             file[name] for name in ("images", "descriptors", "world_from_lidar", "times", "other_m")
         )
+        scale = int(file["scale"]) if "scale" in file else 1
         about = {name: str(file[name]) for name in ("scenery", "revisit", "sensor", "seed")}
     if params is None:
         seen = [Seen(descriptor, image, None) for descriptor, image in zip(descriptors, images, strict=True)]
     else:
         finder = CandidateFinder(params)
         seen = [finder.seen(Record(image=image)) for image in images]
-    return RenderedDrive(path.stem, seen, poses, times, float(other_m), about)
+    return RenderedDrive(path.stem, seen, scaled_poses(poses, scale), times, scale * float(other_m), about, scale)
 
 
 def compared(

@@ -109,7 +109,7 @@ def searched(path: Path, *, odometry: Odometry, optimized: bool, weights: str) -
         pose = None if given is None else given[i]
         detector.add_seen(seen, time=float(times[i]), odometry=pose, compared=frame)
     loops = detector.loops if given is None else accepted(detector.supported, given)[0]
-    revisited = revisits(poses[:, :3, 3], times, min(REVISIT_M, other_m / 2))
+    revisited = revisits(poses[:, :3, 3], times, min(REVISIT_M * drive.scale, other_m / 2))
     apart = distances([(loop.query, loop.match) for loop in loops], poses)
     right = {loop.query for loop, metres in zip(loops, apart, strict=True) if metres <= other_m}
     pairs = distances([(one.query, one.match) for one in detector.candidates], poses)

@@ -7,6 +7,7 @@ Each drive becomes a file SCENERY-REVISIT-SENSOR-SEED.npz with these arrays, n s
 
     descriptors (n, 256) float32, images (n, h, w) uint8, world_from_lidar (n, 4, 4), times (n,)
     scenery, sensor, revisit: names; seed; other_m: frames farther apart than this show different places
+    scale: factor for lengths of the images; poses and other_m are in real metres
 
 Files that exist are skipped. The towns are `simulate_recording`'s, on a route that has these revisits.
 """
@@ -23,6 +24,8 @@ import numpy as np
 import tyro
 
 import sglpr_jax
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.scaled import scaled
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
@@ -37,7 +40,7 @@ ROUTES: dict[Revisit, tuple[str, ...]] = {"none": ("01", "04"), "same": ("06", "
 HIDDEN_DEG = (60.0, 300.0, 91.0)
 """Azimuths that a sensor of 120 degrees does not see, and the elevation below which they are hidden."""
 LIDARS = {
-    **{name: SENSORS[name] for name in ("hdl64e", "hdl32e", "vlp16")},
+    **{name: SENSORS[name] for name in ("hdl64e", "hdl32e", "vlp16", "os0-32")},
     "hdl64e-120": dataclasses.replace(HDL64E, shadows_deg=(HIDDEN_DEG,)),
 }
 OTHER_M = 20.0
@@ -65,6 +68,7 @@ def main(
     revisits: tuple[Revisit, ...] = REVISITS,
     scans: int = 300,
     azimuth_steps: int = 900,
+    scale: Scale = 1,
     weights: str = "sglpr",
     workers: int = 1,
     out: Path = Path("build/repeating"),
@@ -74,10 +78,11 @@ def main(
     Args:
         sceneries: names of sceneries that repeat, and of towns.
         seeds: one drive for each.
-        sensors: hdl64e, hdl32e, vlp16, or hdl64e-120, which sees 120 degrees.
+        sensors: hdl64e, hdl32e, vlp16, os0-32, or hdl64e-120, which sees 120 degrees.
         revisits: whether and how the vehicle returns.
         scans: number of scans of each drive.
         azimuth_steps: firings of the sensor per turn.
+        scale: factor for all lengths before a scan is described; another scale needs another folder.
         weights: the model that describes the scans.
         workers: number of processes.
         out: the folder.
@@ -87,17 +92,18 @@ def main(
     drives = [drive for drive in drives if not (out / drive.file).exists()]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         count = len(drives)
-        work = pool.map(write, drives, *([value] * count for value in (scans, azimuth_steps, weights, out)))
+        work = pool.map(write, drives, *([value] * count for value in (scans, azimuth_steps, scale, weights, out)))
         for number, line in enumerate(work, 1):
             print(f"{number}/{count} {line}", flush=True)
 
 
-def write(drive: Drive, scans: int, azimuth_steps: int, weights: str, out: Path) -> str:
+def write(drive: Drive, scans: int, azimuth_steps: int, scale: Scale, weights: str, out: Path) -> str:
     """Render a drive, write its file, and return a line about it."""
     if (out / drive.file).exists():
         return f"{drive.file}: exists"
     begin = time.perf_counter()
-    recording = record(drive, scans, azimuth_steps)
+    simulated = record(drive, scans, azimuth_steps)
+    recording = scaled(simulated, scale)
     finder = CandidateFinder(sglpr_jax.load(weights))
     seen = [finder.seen(recording.record(i, labels=False)) for i in range(len(recording))]
     town = drive.scenery in SCENERIES
@@ -106,8 +112,9 @@ def write(drive: Drive, scans: int, azimuth_steps: int, weights: str, out: Path)
             file,
             descriptors=np.stack([one.descriptor for one in seen]),
             images=np.stack([one.image for one in seen]),
-            world_from_lidar=recording.poses.world_from_lidar,
-            times=recording.poses.times,
+            world_from_lidar=simulated.poses.world_from_lidar,
+            times=simulated.poses.times,
+            scale=np.array(scale),
             other_m=OTHER_M if town else REPEATING[drive.scenery].other_m,
             **{name: np.array(value) for name, value in drive._asdict().items()},
         )

@@ -21,7 +21,7 @@ from benchmarks.quality.two_recordings import Poses, Search, judged, report
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.readable import only
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.find import searched
+from sglpr_jax.loops.find import prepared, searched
 from sglpr_jax.loops.find_between import between_searches
 from sglpr_jax.loops.transforms import inverse, travelled
 from sglpr_jax.models.params import Params
@@ -102,12 +102,11 @@ def _search(params: Params, data: Path, window: tuple[str, int], true: Float[np.
     whole = sglpr_jax.open_recording(data, window[0])
     recording = only(whole, list(range(window[1], window[1] + step * len(true), step)))
     return searched(
-        recording,
+        prepared(recording, inverse(true[0]) @ true, DetectorConfig(), registered=False),
         params,
-        odometry=inverse(true[0]) @ true,
         model=None,
-        config=DetectorConfig(),
         registered=False,
+        scale=1,
         on_bad_scan=None,
         kept_in=None,
         should_stop=lambda: False,

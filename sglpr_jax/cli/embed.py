@@ -5,8 +5,9 @@ from pathlib import Path
 
 import tyro
 
-from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan
+from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions, report_bad_scan, resolved_scale
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
+from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import NETWORK, MethodName
 
@@ -34,6 +35,9 @@ class EmbedCommand:
     """The network, or a handcrafted method, which needs no weights. Some methods need points; ssc also needs labels."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
+    scale: ScaleChoice = 1
+    """Factor for all lengths before scans are described. 2 or 4 enlarges places that are small in an image, such as
+    rooms. `auto` is 4 if most points are less than 8 m away, otherwise 1."""
     rotate: bool = False
     """Rotate every scan about z by its own random angle."""
     seed: CountOrNone = 0
@@ -46,6 +50,7 @@ class EmbedCommand:
 
 def embed_recording(command: EmbedCommand) -> Path:
     """Run the command. Returns the path of the descriptor file."""
+    from sglpr_jax.data.scaled import scaled
     from sglpr_jax.files import check_writable  # slow imports, not needed for --help
     from sglpr_jax.methods.registry import method_named
     from sglpr_jax.models.weights_file import load
@@ -60,6 +65,7 @@ def embed_recording(command: EmbedCommand) -> Path:
     check_writable(command.out)
     params = None if command.weights is None else load(command.weights)
     recording = command.submap.open(command.source, command.data)
+    recording = scaled(recording, resolved_scale(command.scale, recording))
     method = method_named(command.method, params, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         file = embed(

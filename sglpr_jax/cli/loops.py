@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.recording import PosedRecordingOptions, SubmapOptions, open_with_poses, report_bad_scan
+from sglpr_jax.cli.recording import (
+    PosedRecordingOptions,
+    SubmapOptions,
+    open_with_poses,
+    report_bad_scan,
+    resolved_scale,
+)
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
 from sglpr_jax.cli.several_loops import search_several
+from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.choices import (
     DRIFT_DEG_PER_100M,
@@ -81,6 +88,9 @@ class LoopsCommand:
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
+    scale: ScaleChoice = 1
+    """Factor for all lengths while scans are compared. 2 or 4 enlarges places that are small in an image, such as
+    rooms. Results are in metres. `auto` is 4 if most points are less than 8 m away, otherwise 1."""
     register: bool = True
     """Register the full scans of loops in 6 degrees of freedom and check their overlap. Images are not
     registered."""
@@ -195,6 +205,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         (path,) = command.odometry_files
         recording, odometry = open_with_poses(source, root, path, format=command.odometry_format)
     recording = command.submap.submaps(recording, odometry)
+    scale = resolved_scale(command.scale, recording)
     register = command.register and can_register(recording)
     if command.register and not register:
         print(f"{recording.name}: loops are not registered, {_why_not(recording)}", file=sys.stderr)
@@ -207,6 +218,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
             odometry=odometry,
             config=config,
             registered=register,
+            scale=scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=command.out / UNFINISHED,
             should_stop=stop,
@@ -217,7 +229,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     corrected = optimize_trajectory(found) if command.optimize else None
     page = {PAGE: loops_page(found, optimized=corrected)}
     paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses, texts=page)
-    paths.append(record_command(command, command.out))
+    paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
     print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
     if corrected is not None:
         print(corrected)

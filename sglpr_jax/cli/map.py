@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sglpr_jax.cli.recording import RecordingOptions, SubmapOptions, open_with_poses, report_bad_scan
+from sglpr_jax.cli.recording import RecordingOptions, SubmapOptions, open_with_poses, report_bad_scan, resolved_scale
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -59,6 +60,10 @@ class MapCommand:
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
     source: tyro.conf.OmitArgPrefixes[RecordingOptions] = RecordingOptions()
     submap: tyro.conf.OmitArgPrefixes[SubmapOptions] = SubmapOptions()
+    scale: ScaleChoice = 1
+    """Factor for all lengths before scans are described. 2 or 4 enlarges places that are small in an image, such as
+    rooms. The map stores it, and its poses are in metres. `auto` is 4 if most points are less than 8 m away, otherwise
+    1."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
 
@@ -78,17 +83,23 @@ def write_map(command: MapCommand) -> int:
 
 
 def _add_places(command: MapCommand, params: "Params") -> int:
+    from sglpr_jax.files import naming
     from sglpr_jax.loops.map_recording import map_recording
     from sglpr_jax.loops.place_names import poses_by_id
     from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.loops.unfinished import remove
     from sglpr_jax.models.weights import weights_hash
+    from sglpr_jax.retrieval.index_rows import check_scale
 
     before = None
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     recording, poses = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
     recording = command.submap.submaps(recording, poses)
+    scale = resolved_scale(command.scale, recording)
+    if before is not None:
+        with naming(f"{command.add_to}"):
+            check_scale(scale, before.scale)
     unfinished = command.out.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         places, scans, skipped = map_recording(
@@ -96,6 +107,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
             params,
             poses,
             spacing_m=command.spacing_m,
+            scale=scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=unfinished,
             should_stop=stop,

@@ -5,7 +5,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sglpr_jax.data.choices import Gravity, PoseChoice, PoseFormat, ScanFormat, SensorHeight, TimeUnit
+from sglpr_jax.data.choices import (
+    Gravity,
+    PoseChoice,
+    PoseFormat,
+    Scale,
+    ScaleChoice,
+    ScanFormat,
+    SensorHeight,
+    TimeUnit,
+)
 from sglpr_jax.fields import NotNegative, Positive
 from sglpr_jax.loops.choices import OdometryFormat
 
@@ -131,6 +140,17 @@ def open_with_poses(
     if recording is not opened:
         print(recording.found[-1], file=sys.stderr)
     return recording, poses
+
+
+def resolved_scale(choice: ScaleChoice, *recordings: "Recording") -> Scale:
+    """Return the stated scale or, with `auto`, the smallest of those chosen for the recordings, and print it."""
+    from sglpr_jax.data.scaled import chosen_scale  # slow import, not needed for --help
+
+    if choice != "auto":
+        return choice
+    scale: Scale = min(chosen_scale(one) for one in recordings)
+    print(f"scale: {scale}, chosen by the ranges of the scans", file=sys.stderr)
+    return scale
 
 
 def report_bad_scan(scan: str, error: Exception) -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
-from sglpr_jax.data.choices import ScanFormat, SensorHeight
+from sglpr_jax.data.choices import Scale, ScanFormat, SensorHeight
 from sglpr_jax.fields import CountOrNone
 from sglpr_jax.loops.choices import CANDIDATES, PlaceCount
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
@@ -55,16 +55,19 @@ class RelocalizeCommand:
     sensor_height: SensorHeight = "auto"
     """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scan.
     `auto` takes the mounting of the map's last place or, with --frame, that of the recording."""
+    scale: Scale | None = None
+    """Scale that the map must have (--scale of bin/map). By default, the scale of the map is used."""
     submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
 
 
 def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     """Run the command. Returns the answers, the most probable first."""
-    from sglpr_jax.files import check_writable, write_json  # slow imports, not needed for --help
+    from sglpr_jax.files import check_writable, naming, write_json  # slow imports, not needed for --help
     from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.loops.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
+    from sglpr_jax.retrieval.index_rows import check_scale
 
     if command.out is not None:
         check_writable(command.out)
@@ -72,6 +75,8 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
         raise ValueError(f"{command.scan}: expected --frame of a recording with --submap-m, found a single scan")
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
+    with naming(command.map):
+        check_scale(places.scale if command.scale is None else command.scale, places.scale)
     name = command.scan.name
     if command.frame is None:
         record = read_query(command.scan, places, format=command.format, sensor_height=command.sensor_height)

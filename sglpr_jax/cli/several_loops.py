@@ -1,11 +1,12 @@
 """bin/loops with several recordings: loops within and between them, and the transforms between their frames."""
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sglpr_jax.cli.config_file import record_command
-from sglpr_jax.cli.recording import open_with_poses, report_bad_scan
+from sglpr_jax.cli.recording import open_with_poses, report_bad_scan, resolved_scale
 from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) 
 
     params = load(command.weights)
     recordings, odometry = _opened(command)
+    scale = resolved_scale(command.scale, *recordings)
     steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
     with stop_on_signal() as stop, progress_bar(f"loops of {len(recordings)} recordings", steps) as show:
         found = find_loops_between(
@@ -37,6 +39,7 @@ def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) 
             odometry=odometry,
             config=config,
             registered=None if command.register else False,
+            scale=scale,
             on_bad_scan=report_bad_scan if command.skip_bad else None,
             kept_in=unfinished,
             should_stop=stop,
@@ -47,7 +50,7 @@ def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) 
     corrected = optimize_recordings(found) if command.optimize else None
     page = {PAGE: recordings_page(found, optimized=corrected)}
     paths = write_several(found, command.out, optimized=corrected, texts=page)
-    paths.append(record_command(command, command.out))
+    paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
     _report(found)
     for one in () if corrected is None else corrected.corrections:
         print(one)

@@ -34,3 +34,7 @@ layout does not define the mounting and the sensor tilts, as in a hand."""
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 """Unit of times in text files and from Python. "auto" expects seconds and rejects times whose steps contradict this. It
 ignores row numbers (0, 1, 2, ...)."""
+Scale = Literal[1, 2, 4]
+"""Factor for all lengths of a recording before images are computed. Rooms need more than 1 to fill an image."""
+ScaleChoice = Literal["auto", 1, 2, 4]
+"""Scale, or "auto", which chooses it from the ranges of the scans."""

@@ -6,11 +6,13 @@ sensors are rotated to be gravity-aligned and shifted to this height.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
+
+from sglpr_jax.data.choices import Scale
 
 MODEL_HEIGHT_M = 1.73
 """Sensor height that all shipped weights assume, in metres: that of KITTI's Velodyne and of the simulator."""
@@ -89,6 +91,11 @@ class Mounting:
         with np.errstate(invalid="ignore"):
             turned = points.astype(np.float64) @ self.upright_from_lidar.T
         return (turned + np.array([0, 0, self.height_m - MODEL_HEIGHT_M])).astype(np.float32)
+
+    def scaled(self, scale: Scale) -> "Mounting":
+        """The same mounting with its height and the deviation of the height multiplied by `scale`."""
+        deviation = None if self.height_deviation_m is None else scale * self.height_deviation_m
+        return replace(self, height_m=scale * self.height_m, height_deviation_m=deviation)
 
     def __str__(self) -> str:
         hangs = self.up[2] < 0

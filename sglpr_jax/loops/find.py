@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
@@ -27,6 +28,7 @@ from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.reasons import counted, listed
 from sglpr_jax.loops.registration import check_installed, is_installed
+from sglpr_jax.loops.scale import Search, divided_loop, divided_rejected
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
@@ -56,6 +58,8 @@ class FoundLoops:
     """Settings of the search."""
     empty: int = 0
     """Number of searched scans that are almost empty."""
+    scale: Scale = 1
+    """Factor for all lengths during the search. Loops, odometry and settings are in metres; candidates are scaled."""
 
     @property
     def drift(self) -> DriftModel:
@@ -74,7 +78,18 @@ class FoundLoops:
         why = f" ({listed(counted(self.rejected))})" if self.rejected else ""
         skipped = f", {len(self.skipped)} scans skipped" if self.skipped else ""
         left = f", {self.unregistered} not registered" if self.unregistered else ""
-        return f"{found}, {len(self.rejected)} rejected{why}{left}{skipped}"
+        scale = f", scale {self.scale}" if self.scale != 1 else ""
+        return f"{found}, {len(self.rejected)} rejected{why}{left}{skipped}{scale}"
+
+    def divided(self, given: Search, scale: Scale) -> "FoundLoops":
+        """Results in metres of a search whose input `given` was multiplied by `scale`."""
+        return dataclasses.replace(
+            self,
+            **given._asdict(),
+            loops=tuple(divided_loop(loop, scale) for loop in self.loops),
+            rejected=tuple(divided_rejected(one, scale) for one in self.rejected),
+            scale=scale,
+        )
 
     def without_degenerate(self) -> "FoundLoops":
         """Reject the loops whose position is uncertain by more than 1 m in some horizontal direction
@@ -93,6 +108,7 @@ def find_loops(
     model: LoopModel | None = None,
     config: DetectorConfig = DetectorConfig(),
     registered: bool | None = None,
+    scale: Scale = 1,
     on_bad_scan: OnBadScan | None = None,
     kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -112,6 +128,9 @@ def find_loops(
       config: Settings of the detector.
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
         are rejected. None registers scans, not images.
+      scale: Factor for all lengths during the search, 1, 2 or 4, for places that are small in an image, such as rooms.
+        Results are in metres. Of the settings, `near_m`, `keyframe_m` and `drift` are in metres, and the other lengths
+        are those of the scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
       kept_in: Checkpoint directory. If recording, odometry, weights and settings are the same, the search resumes from
@@ -130,35 +149,38 @@ def find_loops(
     """
     check_is(recording, Recording, by="open_recording")
     registered = can_register(recording) if registered is None else registered
-    return searched(
-        recording,
+    given = prepared(recording, odometry, config, registered=registered)
+    found, _ = searched(
+        given.scaled(scale),
         params,
-        odometry=checked_odometry(recording, odometry, registered=registered),
         model=model,
-        config=config,
         registered=registered,
+        scale=scale,
         on_bad_scan=on_bad_scan,
         kept_in=kept_in,
         should_stop=should_stop,
         on_progress=on_progress,
-    )[0]
+    )
+    return found.divided(given, scale)
 
 
 def searched(
-    recording: Recording,
+    given: Search,
     params: Params,
     *,
-    odometry: Float[np.ndarray, "n 4 4"] | None,
     model: LoopModel | None,
-    config: DetectorConfig,
     registered: bool,
+    scale: Scale,
     on_bad_scan: OnBadScan | None,
     kept_in: Path | str | None,
     should_stop: Callable[[], bool],
     on_progress: Callable[[int], None],
 ) -> tuple[FoundLoops, CandidateFinder]:
-    """Do the same as `find_loops` with checked arguments, and also return the finder with images and motion."""
-    recording = recording if odometry is None else with_odometry(recording, odometry)
+    """Do the same as `find_loops` with checked and scaled arguments, and also return the finder with images and motion.
+
+    The results are scaled, too.
+    """
+    recording, odometry, config = given
     detector = LoopDetector(params, model=model, config=config)
     add_scans(
         recording,
@@ -174,7 +196,9 @@ def searched(
         acceptance=_acceptance(detector),
     )
     _check_scans(detector.finder, recording)
-    loops, rejected = _accepted(detector, recording, odometry, registered=registered, should_stop=should_stop)
+    loops, rejected = _accepted(
+        detector, recording, odometry, registered=registered, scale=scale, should_stop=should_stop
+    )
     missing = detector.finder.missing
     found = FoundLoops(
         recording,
@@ -204,10 +228,8 @@ def _acceptance(detector: LoopDetector) -> str | None:
     return hashlib.sha256(repr((detector.config, detector.model)).encode()).hexdigest()[:16]
 
 
-def checked_odometry(
-    recording: Recording, odometry: ArrayLike | None, *, registered: bool
-) -> Float[np.ndarray, "n 4 4"] | None:
-    """Check recording and odometry before any work, and return the odometry as an array."""
+def prepared(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Search:
+    """Check recording and odometry before any work. Return the odometry as an array, and gravity of scans by it."""
     if recording.times is not None and (doubted := doubt(recording.times)):
         warn(f"{recording.name}: expected times in seconds, found {doubted}; 30 s decide which frames are recent")
     poses = None if odometry is None else given_poses(odometry, of="odometry")
@@ -221,7 +243,8 @@ def checked_odometry(
         check_installed()
     if poses is not None:
         check_level(poses, mountings_of(recording), name=recording.name)
-    return poses
+        recording = with_odometry(recording, poses)
+    return Search(recording, poses, config)
 
 
 def _add(
@@ -252,6 +275,7 @@ def _accepted(
     odometry: Float[np.ndarray, "n 4 4"] | None,
     *,
     registered: bool,
+    scale: Scale,
     should_stop: Callable[[], bool],
 ) -> tuple[tuple[Loop, ...], tuple[Rejected, ...]]:
     """Joint acceptance of the loops of a detector. Returns accepted and rejected loops, and warns of wrong odometry."""
@@ -263,7 +287,7 @@ def _accepted(
     rejected = _in_order([*rejected, *(one for one in detector.rejected if one.loop.query not in supported)])
     if odometry is not None:
         name, mounting = recording.name, mountings_of(recording)
-        check_odometry(name, detector.by_scans, loops, rejected, odometry, config, mounting=mounting)
+        check_odometry(name, detector.by_scans, loops, rejected, odometry, config, mounting=mounting, scale=scale)
     return tuple(loops), rejected
 
 

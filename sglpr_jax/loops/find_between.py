@@ -10,13 +10,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.between import candidates_between, probable_loops
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.common_places import Joined, accepted_between
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
-from sglpr_jax.loops.find import FoundLoops, can_register, checked_odometry, searched
+from sglpr_jax.loops.find import FoundLoops, can_register, prepared, searched
 from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.joint import registered_loops
@@ -25,6 +27,7 @@ from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import mountings_of, upright_from_lidar
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.reasons import counted, listed
+from sglpr_jax.loops.scale import divided_covariance, divided_loop, divided_rejected, scaled_config
 from sglpr_jax.loops.transforms import inverse, moved_covariance
 from sglpr_jax.loops.upright import lidar_pose, upright_odometry
 from sglpr_jax.models.params import Params
@@ -66,6 +69,15 @@ class FoundBetween:
     compared: int
     """Number of scans of the later recording that were compared with the earlier one."""
 
+    def divided(self, scale: Scale) -> "FoundBetween":
+        """Results in metres of a search whose input was multiplied by `scale`."""
+        return dataclasses.replace(
+            self,
+            loops=tuple(divided_loop(loop, scale) for loop in self.loops),
+            rejected=tuple(divided_rejected(one, scale) for one in self.rejected),
+            aligned=tuple(_divided_alignment(one, scale) for one in self.aligned),
+        )
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FoundRecordings:
@@ -102,6 +114,13 @@ class FoundRecordings:
         return f"{names}: {len(one.loops)} loops, {len(one.rejected)} rejected{why}; {said}"
 
 
+def _divided_alignment(one: AlignedParts, scale: Scale) -> AlignedParts:
+    alignment = FrameAlignment(
+        scaled_poses(one.alignment.match_from_query, 1 / scale), divided_covariance(one.alignment.covariance, scale)
+    )
+    return dataclasses.replace(one, alignment=alignment)
+
+
 def _without_degenerate(one: FoundBetween) -> FoundBetween:
     kept = tuple(loop for loop in one.loops if not loop.is_degenerate)
     others = [Rejected(loop, "degenerate") for loop in one.loops if loop.is_degenerate]
@@ -130,6 +149,7 @@ def find_loops_between(
     model: LoopModel | None = None,
     config: DetectorConfig = DetectorConfig(),
     registered: bool | None = None,
+    scale: Scale = 1,
     on_bad_scan: OnBadScan | None = None,
     kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -151,6 +171,7 @@ def find_loops_between(
       model: See `find_loops`, also for the other arguments.
       config: Settings of the detector.
       registered: Register the full scans of each loop. None registers them if all recordings can be registered.
+      scale: Factor for all lengths during the search, the same for all recordings.
       on_bad_scan: Called with id and error of a scan that cannot be read.
       kept_in: Checkpoint directory. It gets a folder for each recording.
       should_stop: If it returns True, the search ends with the loops that were found.
@@ -176,19 +197,18 @@ def find_loops_between(
     for recording in recordings:
         check_is(recording, Recording, by="open_recording")
     registered = all(map(can_register, recordings)) if registered is None else registered
-    checked = [
-        checked_odometry(recording, poses, registered=registered)
+    inputs = [
+        prepared(recording, poses, config, registered=registered)
         for recording, poses in zip(recordings, given, strict=True)
     ]
     steps, searches = 0, []
-    for number, (recording, poses) in enumerate(zip(recordings, checked, strict=True)):
+    for number, (recording, one_given) in enumerate(zip(recordings, inputs, strict=True)):
         one = searched(
-            recording,
+            one_given.scaled(scale),
             params,
-            odometry=poses,
             model=model,
-            config=config,
             registered=registered,
+            scale=scale,
             on_bad_scan=on_bad_scan,
             kept_in=None if kept_in is None else Path(kept_in) / f"{number}",
             should_stop=should_stop,
@@ -202,14 +222,15 @@ def find_loops_between(
             match,
             query,
             searches,
-            config=config,
+            config=scaled_config(config, scale),
             registered=registered,
             should_stop=should_stop,
             on_progress=lambda done, before=steps: on_progress(before + done),
         )
-        between.append(pair)
+        between.append(pair.divided(scale))
         steps += len(recordings[query])
-    return FoundRecordings(tuple(found for found, _ in searches), tuple(between), stopped=should_stop())
+    within = tuple(found.divided(one_given, scale) for (found, _), one_given in zip(searches, inputs, strict=True))
+    return FoundRecordings(within, tuple(between), stopped=should_stop())
 
 
 def between_searches(

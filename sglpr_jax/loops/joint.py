@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig, DriftModel
@@ -17,6 +18,7 @@ from sglpr_jax.loops.loop import Loop, Reason, Rejected
 from sglpr_jax.loops.mountings import AnyMounting, mountings_of
 from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.registration import register
+from sglpr_jax.loops.scale import scaled_drift
 from sglpr_jax.loops.transforms import inverse, travelled
 
 MIN_OVERLAP = 0.6
@@ -74,6 +76,7 @@ def check_odometry(
     odometry: Float[np.ndarray, "n 4 4"],
     config: DetectorConfig,
     mounting: AnyMounting = None,
+    scale: Scale = 1,
 ) -> None:
     """Warns if the odometry contradicts most of the frames that have a loop.
 
@@ -87,6 +90,7 @@ def check_odometry(
       odometry: Pose of the LiDAR at each frame.
       config: Settings of the detector.
       mounting: Mounting of the LiDAR, or that at each frame.
+      scale: Factor by which loops, odometry and settings were multiplied.
     """
     against = [one.loop for one in rejected if one.reason == "contradicts the odometry"]
     agreeing = {one.query for one in loops} | {one.loop.query for one in rejected} - {one.query for one in against}
@@ -98,21 +102,26 @@ def check_odometry(
         f"{name}: the odometry contradicts the loops of {contrary} of {len(frames)} frames; these loops are rejected."
     )
     if against:
-        said += f" {_readings(against, odometry, config, mounting)}"
+        said += f" {_readings(against, odometry, config, mounting, scale)}"
     warn(f"{said} Check also that the poses belong to these scans and use these axes: {AXES}")
 
 
 def _readings(
-    against: Sequence[Loop], odometry: Float[np.ndarray, "n 4 4"], config: DetectorConfig, mounting: AnyMounting
+    against: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"],
+    config: DetectorConfig,
+    mounting: AnyMounting,
+    scale: Scale,
 ) -> str:
     """Both explanations of loops that contradict the odometry, with the drift that would explain them."""
     found = deviations(against, odometry, drift=config.drift, mounting=mounting)
     drift = config.drift.scaled(float(f"{np.median(found):.2g}"))
     pairs = agree(against, odometry, mounting=mounting, drift=drift, config=config.consistency)
     members = [against[i] for i in largest_consistent_set(pairs)]
+    stated, drift = (scaled_drift(one, 1 / scale) for one in (config.drift, drift))
     percent, degrees = 100 * drift.metres_per_metre, 100 * drift.degrees_per_metre
     return (
-        f"Either places repeat, or the odometry drifts by about {drift}, not by {config.drift}: {len(members)} of "
+        f"Either places repeat, or the odometry drifts by about {drift}, not by {stated}: {len(members)} of "
         f"{len(against)} loops would then be consistent (separate parts of the drive with at least three of them: "
         f"{stretches(members, odometry)}). If it drifts that much, state it: --drift-percent {percent:.3g} "
         f"--drift-deg-per-100m {degrees:.3g}."

@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.add_scans import add_scans
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
@@ -42,6 +44,7 @@ def map_recording(
     poses: ArrayLike,
     *,
     spacing_m: float = SPACING_M,
+    scale: Scale = 1,
     on_bad_scan: OnBadScan | None = None,
     kept_in: Path | str | None = None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -56,6 +59,8 @@ def map_recording(
       params: Weights of the model that describes them.
       poses: Pose of the LiDAR in the world at each scan.
       spacing_m: Minimum distance of consecutive places, in metres. Scans nearer to the last place are not read.
+      scale: Factor for all lengths before scans are described, 1, 2 or 4, for places that are small in an image, such
+        as rooms. Poses of the map are in metres.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped. Without it the error is
         raised.
       kept_in: Checkpoint directory. With the same recording, poses, weights and spacing, the run resumes from it. The
@@ -82,7 +87,7 @@ def map_recording(
         finder.add_seen(seen, compared=Compared([], None))
 
     add_scans(
-        recording,
+        scaled(recording, scale),
         finder,
         add,
         rows=chosen.unseen(),
@@ -99,22 +104,22 @@ def map_recording(
             f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
         )
     skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
-    return Mapped(_map_of(finder.index, recording, poses, chosen, seen_scans), chosen.done, skipped)
+    index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
+    return Mapped(_map_of(index, recording, poses, chosen, seen_scans), chosen.done, skipped)
 
 
 def _map_of(
-    like: Index,
+    index: Index,
     recording: Recording,
     poses: Float[np.ndarray, "n 4 4"],
     chosen: PlaceScans,
     seen: Sequence[Seen | None],
 ) -> PlaceMap:
-    """Map of the chosen scans of a recording."""
-    index = Index.empty(like.width, weights_hash=like.weights_hash)
+    """Map of the chosen scans of a recording, with an index without places."""
     places = [one for one in (seen[frame] for frame in chosen.frames) if one is not None]
     names, rows = place_names(recording), chosen.rows
     ids = [names[row] for row in rows]
-    descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, like.width)
+    descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, index.width)
     index.add(descriptors, ids=ids, positions=poses[rows, :3, 3])
     images = [one.image for one in places]
     sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]

@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import GroundFilter
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
@@ -32,6 +34,7 @@ from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.retrieval.index_rows import check_scale
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,6 +69,7 @@ class PlaceMap:
         poses: ArrayLike,
         *,
         spacing_m: float = SPACING_M,
+        scale: Scale = 1,
         on_progress: Callable[[int], None] = lambda done: None,
     ) -> "PlaceMap":
         """Create the map of a recording with known poses.
@@ -78,11 +82,13 @@ class PlaceMap:
           params: Weights of the model that describes them.
           poses: Pose of the LiDAR in the world at each scan.
           spacing_m: Minimum distance of consecutive places, in metres.
+          scale: Factor for all lengths before scans are described, 1, 2 or 4.
           on_progress: Called with the number of scans done.
         """
         from sglpr_jax.loops.map_recording import map_recording  # imports this module
 
-        return map_recording(recording, params, poses, spacing_m=spacing_m, on_progress=on_progress).places
+        options = {"spacing_m": spacing_m, "scale": scale, "on_progress": on_progress}
+        return map_recording(recording, params, poses, **options).places
 
     def mounting(self, row: int = -1) -> Mounting:
         """Mounting of the sensor at a place, by default the last one."""
@@ -98,6 +104,11 @@ class PlaceMap:
         height, *up = np.median(self.mountings, axis=0)
         mean = Mounting(float(height), tuple((np.array(up) / np.linalg.norm(up)).tolist()))
         return GroundFilter(mean).add(points)
+
+    @property
+    def scale(self) -> Scale:
+        """Factor for all lengths of the described scans (`data.scaled`). Poses and mountings are in metres."""
+        return self.index.scale
 
     @property
     def tilts(self) -> bool:
@@ -120,8 +131,9 @@ class PlaceMap:
             complete, so that its places get the same ids as in the complete map.
 
         Raises:
-          ValueError: If the maps were made with other weights or have images of another size.
+          ValueError: If the maps were made with other weights or another scale, or have images of another size.
         """
+        check_scale(self.scale, other.scale)
         if other.images.shape[1:] != self.images.shape[1:]:
             raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
         known = set(self._contents())
@@ -130,7 +142,7 @@ class PlaceMap:
         coming |= zip(other.index.ids, other._contents(), strict=True)
         taken = dict(zip(self.index.ids, self._contents(), strict=True))
         new_ids = free_names([other.index.ids[row] for row in new], coming, taken=taken)
-        index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
+        index = self.index.without_places()
         for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
             places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
             index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
@@ -169,7 +181,7 @@ class PlaceMap:
         given = given_record(record)
         if len(self) and not isinstance(record, Record) and given.points is not None:
             given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
-        seen = finder.seen(given)
+        seen = finder.seen(scaled_record(given, self.scale))
         return self.relocate_seen(seen, weights_hash=finder.index.weights_hash, model=model, candidates=candidates)
 
     def relocate_seen(
@@ -178,7 +190,7 @@ class PlaceMap:
         """Locate a described scan in the map. The arguments and answers are those of `relocate`.
 
         Arguments:
-          seen: Description of the scan.
+          seen: Description of the scan, with the scale of the map.
           weights_hash: Hash of the weights that described it.
           model: Model of the probabilities, by default the one shipped for the weights.
           candidates: Maximum number of poses.
@@ -193,17 +205,17 @@ class PlaceMap:
         if not len(rows):
             return []
         model = default_model(self.index.weights_hash) if model is None else model
-        spectra = query_spectra(image)
+        spectra, scaled_map = query_spectra(image), self._scaled()
         chosen, peaks = self._compared(image, spectra, rows, candidates)
         answers = [
-            self._answer(seen, spectra, int(rows[k]), float(distances[k]), peaks.one(i), model)
+            scaled_map._answer(seen, spectra, int(rows[k]), float(distances[k]), peaks.one(i), model)
             for i, k in enumerate(chosen.tolist())
         ]
-        return with_shared_probability(answers)[:candidates]
+        return [one.divided(self.scale) for one in with_shared_probability(answers)[:candidates]]
 
     def seen(self, row: int) -> Seen:
-        """Description of the scan at a place."""
-        return Seen(self.index.descriptors[row], self.images[row], self.mounting(row))
+        """Description of the scaled scan at a place."""
+        return Seen(self.index.descriptors[row], self.images[row], self.mounting(row).scaled(self.scale))
 
     def some(self, rows: Sequence[int]) -> "PlaceMap":
         """Return a map of some of the places.
@@ -211,7 +223,7 @@ class PlaceMap:
         Arguments:
           rows: Numbers of the places.
         """
-        index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
+        index = self.index.without_places()
         ids, positions = [self.index.ids[row] for row in rows], self.world_from_place[rows, :3, 3]
         index.add(self.index.descriptors[rows], ids=ids, positions=positions)
         arrays = {name: getattr(self, name)[rows] for name in REQUIRED}
@@ -224,7 +236,7 @@ class PlaceMap:
           world_from_old: Pose of the old world frame in the new one.
         """
         poses = world_from_old @ self.world_from_place
-        index = Index.empty(self.index.width, weights_hash=self.index.weights_hash, distance=self.index.distance)
+        index = self.index.without_places()
         index.add(self.index.descriptors, ids=self.index.ids, positions=poses[:, :3, 3])
         return dataclasses.replace(self, index=index, world_from_place=poses)
 
@@ -238,6 +250,18 @@ class PlaceMap:
         """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
         index, arrays = read_places(path, weights_hash=weights_hash)
         return cls(index, **arrays)
+
+    def _scaled(self) -> "PlaceMap":
+        """The same map with poses and mountings of its scaled scans."""
+        if self.scale == 1:
+            return self
+        deviations = self.mounting_deviations
+        return dataclasses.replace(
+            self,
+            world_from_place=scaled_poses(self.world_from_place, float(self.scale)),
+            mountings=self.mountings * np.array([self.scale, 1, 1, 1]),
+            mounting_deviations=None if deviations is None else deviations * np.array([self.scale, 1]),
+        )
 
     def _contents(self) -> Iterator[tuple[bytes, bytes]]:
         """Descriptor and pose of each place, as bytes."""

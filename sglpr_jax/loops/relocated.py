@@ -7,7 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.scale import divided_loop
 from sglpr_jax.same_place import NEGATIVE_M
 
 
@@ -25,6 +28,11 @@ class Relocated(NamedTuple):
     def probability(self) -> float:
         """Probability that the scan shows the place."""
         return self.loop.probability
+
+    def divided(self, scale: Scale) -> "Relocated":
+        """The same pose in metres, of scans that were multiplied by `scale`."""
+        pose = scaled_poses(self.world_from_query, 1 / scale)
+        return self._replace(world_from_query=pose, loop=divided_loop(self.loop, scale))
 
 
 def with_shared_probability(answers: Sequence[Relocated]) -> list[Relocated]:

@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.scaled import SCALE
+from sglpr_jax.fields import check_value
 from sglpr_jax.files import json_in_short, naming, parse_json, replacing
 from sglpr_jax.numpy_files import read_arrays
 from sglpr_jax.retrieval.distances import distance_function
@@ -77,6 +80,13 @@ class DescriptorFile:
         return len(self.ids)
 
     @property
+    def scale(self) -> Scale:
+        """Factor for all lengths of the scans (`data.scaled`). Raises ValueError if that in `config` is invalid."""
+        found = self.config.get(SCALE, 1)
+        check_value(found, Scale, SCALE)
+        return found
+
+    @property
     def recorded(self) -> np.ndarray:
         """Mask over all scans of the recording, including skipped ones: whether each scan is in this file.
 
@@ -129,11 +139,11 @@ class DescriptorFile:
 
 
 def check_same_method(a: DescriptorFile, b: DescriptorFile) -> None:
-    """Raise ValueError unless the descriptors of two files can be compared: same method, model and weights.
+    """Raise ValueError unless the descriptors of two files can be compared: same method, model, weights and scale.
 
     The recordings and the rotations may differ.
     """
-    for what in ("numbers", "distance", "method", "model", "weights"):
+    for what in ("numbers", "distance", "method", "model", "weights", "scale"):
         ours, theirs = _made_by(a)[what], _made_by(b)[what]
         if ours != theirs:
             raise ValueError(
@@ -150,6 +160,7 @@ def _made_by(file: DescriptorFile) -> dict[str, Any]:
         "method": config["method"],
         "model": json.loads(json.dumps([config["model"], config["grid"]])),  # Tuples become lists, as in a file.
         "weights": file.weights_hash,
+        "scale": file.scale,
     }
 
 

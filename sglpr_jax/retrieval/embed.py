@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int32, Num
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import SCALE, scale_of
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
 from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.data.views import View, classes_of, rotated, view
@@ -205,7 +206,8 @@ def _file(
     sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
     skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
     submaps = {name: value for name, value in recording.read_options.items() if name == SUBMAPS}
-    config = {"data": recording.name, **sensor, **submaps, **method.about, "rotation_seed": rotation_seed}
+    scale = {SCALE: scale_of(recording)} if scale_of(recording) != 1 else {}
+    config = {"data": recording.name, **sensor, **submaps, **scale, **method.about, "rotation_seed": rotation_seed}
     return DescriptorFile(
         sequence=recording.name,
         ids=tuple(recording.ids[row] for row in rows),

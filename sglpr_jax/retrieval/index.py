@@ -16,8 +16,9 @@ import safetensors
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.fields import Size
+from sglpr_jax.fields import Size, check_value
 from sglpr_jax.files import in_short, naming, parse_json, replacing
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.retrieval.descriptor_file import COLUMNS, DescriptorFile
@@ -37,8 +38,8 @@ from sglpr_jax.schema import check_about, check_columns, check_texts
 
 FORMAT = "sglpr-jax index 1"
 """Format in every file."""
-ABOUT = {"width": Size, "weights_hash": str, "distance": str, "ids": list}
-"""JSON values in the header of every file."""
+ABOUT = {"width": Size, "weights_hash": str, "distance": str, "scale": Scale, "ids": list}
+"""JSON values in the header of every file. Older files have no scale, which is 1."""
 TYPES = ("F32", "F64", "U8", "I64")
 """Types of arrays in every file, also of the additional arrays of `to_bytes`, in the terms of safetensors."""
 SPARE = 16
@@ -71,19 +72,28 @@ class Index:
         default_factory=lambda: GrowingArray(np.empty(0, np.float32)), repr=False
     )
     """Squared lengths of the descriptors, up to the last query."""
+    scale: Scale = 1
+    """Scale of the described scans (`data.scaled`)."""
 
     @classmethod
-    def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2") -> "Index":
-        """Create an index without places. Raises ValueError if the distance is unknown or `width` is below 1."""
+    def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2", scale: Scale = 1) -> "Index":
+        """Create an index without places. Raises ValueError if distance or scale is unknown or `width` is below 1."""
         distance_function(distance)
+        check_value(scale, Scale, "scale")
         if width < 1:
             raise ValueError(f"expected a descriptor width of 1 or more, found {width}")
-        return cls(width, weights_hash, distance, [], {"descriptors": GrowingArray(np.empty((0, width), np.float32))})
+        columns = {"descriptors": GrowingArray(np.empty((0, width), np.float32))}
+        return cls(width, weights_hash, distance, [], columns, scale=scale)
+
+    def without_places(self) -> "Index":
+        """Create an index without places, for descriptors that can be compared with those of this index."""
+        return Index.empty(self.width, weights_hash=self.weights_hash, distance=self.distance, scale=self.scale)
 
     @classmethod
     def of(cls, file: DescriptorFile) -> "Index":
         """Create an index from the places of a descriptor file."""
-        index = cls.empty(file.descriptors.shape[1], weights_hash=file.weights_hash, distance=file.distance)
+        about = {"weights_hash": file.weights_hash, "distance": file.distance, "scale": file.scale}
+        index = cls.empty(file.descriptors.shape[1], **about)
         index.add_file(file)
         return index
 
@@ -149,8 +159,8 @@ class Index:
         self.ids = [name for name, kept in zip(self.ids, flags, strict=True) if kept]
 
     def add_file(self, file: DescriptorFile) -> None:
-        """Add the places of a descriptor file. Raises ValueError if another model or method made it."""
-        self.add(**places_of(file, distance=self.distance))
+        """Add the places of a descriptor file. Raises ValueError if another model, method or scale made it."""
+        self.add(**places_of(file, distance=self.distance, scale=self.scale))
 
     def query(
         self,
@@ -206,8 +216,8 @@ class Index:
     def to_bytes(self, more: Mapping[str, np.ndarray] | None = None) -> bytes:
         """Return the content of the file that `save` writes, with additional arrays that `load_with` returns."""
         arrays = {name: values.rows for name, values in self._columns.items()} | dict(more or {})
-        about = {"format": FORMAT, "width": self.width, "weights_hash": self.weights_hash, "distance": self.distance}
-        text = json.dumps({**about, "ids": self.ids})
+        about = {name: getattr(self, name) for name in ABOUT}
+        text = json.dumps({"format": FORMAT, **about})
         arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
         return tensors_as_bytes(arrays, {"about": text, "sha256": _checksum(text, arrays)})
 
@@ -231,7 +241,9 @@ class Index:
         path = Path(path)
         about, arrays = _read(path)
         columns = {name: GrowingArray(arrays.pop(name)) for name in COLUMNS if name in arrays}
-        index = cls(about["width"], about["weights_hash"], about["distance"], about["ids"], columns)
+        index = cls(
+            about["width"], about["weights_hash"], about["distance"], about["ids"], columns, scale=about["scale"]
+        )
         with naming(path):
             check_weights(index.weights_hash, weights_hash)
         return index, arrays
@@ -283,6 +295,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     if metadata.get("sha256") != _checksum(text, arrays):
         raise ValueError(f"{path}: expected an index with a valid checksum, found a damaged one")
     about = parse_json(text, source=f"{path}, `about`")
+    about = {"scale": 1, **about} if isinstance(about, dict) else about
     with naming(path):
         _check_index(about, arrays)
     return about, arrays

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sglpr_jax.data.choices import Scale
 from sglpr_jax.files import in_short
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
@@ -75,11 +76,12 @@ def new_places(
     return NewPlaces(names, columns)
 
 
-def places_of(file: DescriptorFile, *, distance: str) -> dict[str, Any]:
+def places_of(file: DescriptorFile, *, distance: str, scale: Scale = 1) -> dict[str, Any]:
     """Return the places of a descriptor file as arguments of an index's `add`.
 
-    Raises ValueError if `distance` does not compare its descriptors.
+    Raises ValueError if `distance` does not compare its descriptors, or if its scans have another scale.
     """
+    check_scale(scale, file.scale)
     if file.distance != distance:
         raise ValueError(f"expected descriptors compared by {distance}, found {file.distance}")
     about = {"times": file.times, "positions": file.positions, "weights_hash": file.weights_hash}
@@ -124,6 +126,15 @@ def check_weights(expected: str, found: str | None) -> None:
         raise ValueError(
             f"expected descriptors of the weights {expected[:12] or '(none)'}, "
             f"found those of {found[:12] or '(none)'}: descriptors of different models are not comparable"
+        )
+
+
+def check_scale(expected: Scale, found: Scale) -> None:
+    """Raise ValueError if descriptors come from scans of another scale."""
+    if found != expected:
+        raise ValueError(
+            f"expected scale {expected}, found scale {found}: descriptors of scans with different scales are not "
+            "comparable"
         )
 
 

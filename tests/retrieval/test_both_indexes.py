@@ -65,6 +65,8 @@ def test_descriptors_of_another_model_are_refused(new: New):
     ):
         with pytest.raises(ValueError, match="expected descriptors of the weights abc, found those of xyz"):
             refused()
+    with pytest.raises(ValueError, match="expected scale 1, found scale 2"):
+        index.add_file(dataclasses.replace(file_of(3), config={"scale": 2}))
     with pytest.raises(ValueError, match="compared by l2, found cosine"):
         index.add_file(dataclasses.replace(file_of(3, weights_hash="abc"), distance="cosine"))
     with pytest.raises(ValueError, match=r"shape \(1, 8\), found \(1, 9\)"):

@@ -198,6 +198,7 @@ def test_what_stands_in_about_has_its_type(tmp_path, file, name, value):
         ({"config": {"method": "m2dp"}}, "method"),
         ({"config": {"method": "sglpr", "model": {"polar": [64, 128]}}}, "model"),
         ({"descriptors": np.ones((3, 5), np.float32)}, "numbers"),
+        ({"config": {"method": "sglpr", "model": {"polar": (64, 256)}, "scale": 2}}, "scale"),
     ],
 )
 def test_descriptors_of_another_method_or_model_cannot_be_compared(file, change, what):

@@ -1,5 +1,6 @@
 """The index answers as numpy does over all pairs, grows, and comes back from its file or says why not."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -57,6 +58,16 @@ def test_it_comes_back_from_its_file_and_goes_on_growing(tmp_path):
         np.testing.assert_array_equal(getattr(again, name), getattr(index, name))
     again.add(draw(1, seed=9)[0], ids="new", times=151.0, positions=np.zeros(3))
     assert again.query(draw(1, seed=9)[0]).rows.tolist() == [300] and again.ids[-1] == "new" and len(index) == 300
+
+
+def test_places_of_scans_with_another_scale_are_refused(tmp_path):
+    scaled = dataclasses.replace(file_of(3), config={"scale": 4})
+    Index.of(scaled).save(tmp_path / "rooms.safetensors")
+    rooms = Index.load(tmp_path / "rooms.safetensors")
+    rooms.add_file(scaled)
+    assert rooms.scale == 4 and len(rooms) == 6
+    with pytest.raises(ValueError, match="expected scale 4, found scale 1: descriptors of scans with different scales"):
+        rooms.add_file(file_of(3))
 
 
 def test_equal_places_are_equal_bytes():

@@ -5,12 +5,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sglpr_jax.sim.sceneries.campus import campus
 from sglpr_jax.sim.sceneries.car_park import car_park
 from sglpr_jax.sim.sceneries.corridor import corridor
 from sglpr_jax.sim.sceneries.field import field
 from sglpr_jax.sim.sceneries.forest import forest
 from sglpr_jax.sim.sceneries.garage import garage
 from sglpr_jax.sim.sceneries.highway import LANE_M, highway
+from sglpr_jax.sim.sceneries.indoor import indoor
 from sglpr_jax.sim.sceneries.orchard import orchard
 from sglpr_jax.sim.sceneries.rooms import rooms, rooms_equal
 from sglpr_jax.sim.sceneries.row_houses import row_houses
@@ -57,11 +59,13 @@ REPEATING = {
     "corridor": Repeating(corridor, (0.5, 1.0), other_m=5.0, **_ROBOT),
     "rooms_equal": Repeating(rooms_equal, (0.45, 0.7), other_m=4.0, **{**_ROBOT, "right_m": 0.0, "sway_m": 0.05}),
     "rooms": Repeating(rooms, (0.45, 0.7), other_m=4.0, **{**_ROBOT, "right_m": 0.0, "sway_m": 0.05}),
+    "indoor": Repeating(indoor, (0.8, 1.2), other_m=5.0, **{**_ROBOT, "right_m": 0.1, "sway_m": 0.1}),
     "warehouse": Repeating(warehouse, (1.0, 1.6), other_m=4.0, **{**_ROBOT, "height_m": 1.0}),
     "orchard": Repeating(orchard, (3.5, 6.0), clearance_m=0.5, right_m=0.2, sway_m=0.15),
     "vineyard": Repeating(vineyard, (3.5, 6.0), clearance_m=0.8, right_m=0.2, sway_m=0.15),
     "row_houses": Repeating(row_houses, (6.0, 9.0), right_m=0.2, sway_m=0.2),
     "field": Repeating(field, (7.0, 12.0)),
+    "campus": Repeating(campus, (1.1, 1.7), **{**_ROBOT, "rate_hz": 1.0, "right_m": 0.5, "height_m": 0.6}),
     "forest": Repeating(forest, (1.0, 1.6), rate_hz=1.0, clearance_m=0.6, right_m=0.2, sway_m=0.3, height_m=1.6),
 }
 """Sceneries by the names that `simulate_repeating` accepts."""

@@ -1,0 +1,121 @@
+"""Scale of a recording: its scans are multiplied by a factor, so that the places of a small sensor fill an image.
+
+An image shows 25 m in each direction, in cells of 0.4 m. With a factor of 4, it shows 6.25 m in cells of 0.1 m. The
+weights, the descriptors and the model of the probabilities stay as they are.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.fields import check_value
+
+SCALE = "scale"
+"""Name of the read option that states the scale of a recording."""
+
+SCANS = 11
+"""Number of scans from which the scale is chosen, spread over the recording."""
+FAR_M = 8.0
+"""Minimum range of scans that are not scaled, in metres (`chosen_scale`). Outdoors and in garages it is 12 m or more,
+and in corridors and rooms 3 to 7 m."""
+NEAR_SCALE: Scale = 4
+"""Scale of recordings with shorter ranges."""
+
+
+def scaled(recording: Recording, scale: Scale) -> Recording:
+    """Return a recording whose points and sensor heights are multiplied by `scale`.
+
+    Scans are scaled when they are read. Positions, times and poses are those of the recording.
+
+    Arguments:
+      recording: Recording of scans or of submaps.
+      scale: Factor. 1 returns the recording unchanged.
+
+    Raises:
+      ValueError: If the factor is not 1, 2 or 4, or if a recording of ready-made images has a factor other than 1.
+    """
+    check_value(scale, Scale, "scale")
+    if scale == 1:
+        return recording
+    if recording.has_images:
+        raise ValueError(f"sequence {recording.name}: expected scans to scale by {scale}, found ready-made images")
+    each = recording.mountings
+    return dataclasses.replace(
+        recording,
+        read=_ScaledReader(recording, scale),
+        on_disk=False,
+        mounting=_scaled_mounting(recording.mounting, scale),
+        mountings=None if each is None else tuple(_scaled_mounting(mounting, scale) for mounting in each),
+    )
+
+
+def chosen_scale(recording: Recording) -> Scale:
+    """Choose the scale of a recording from how far its sensor sees.
+
+    The range of a scan is the 90 % quantile of the horizontal distances of its points. If the median range of some
+    scans is below `FAR_M`, the scale is `NEAR_SCALE`, otherwise 1. Recordings of images have scale 1.
+    """
+    if recording.has_images:
+        return 1
+    rows = np.unique(np.linspace(0, len(recording) - 1, SCANS).astype(int)) if len(recording) else ()
+    ranges = [found for row in rows if (found := _range_m(recording, int(row))) is not None]
+    return NEAR_SCALE if ranges and np.median(ranges) < FAR_M else 1
+
+
+def _range_m(recording: Recording, row: int) -> float | None:
+    """90 % quantile of the horizontal distances of a scan, or None if it cannot be read or is empty."""
+    try:
+        points = recording.points(row)
+    except (ValueError, OSError):
+        return None
+    distances = np.hypot(*points[np.isfinite(points).all(axis=1), :2].T)
+    return float(np.quantile(distances, 0.9)) if len(distances) else None
+
+
+def scale_of(recording: Recording) -> int:
+    """Scale of the scans of a recording."""
+    return int(recording.read_options.get(SCALE, "1"))
+
+
+def scaled_record(record: Record, scale: Scale) -> Record:
+    """Return a scan with its points and the height of its sensor multiplied by `scale`.
+
+    Raises ValueError if the record is a ready-made image and the factor is not 1.
+    """
+    if scale == 1:
+        return record
+    if record.points is None:
+        raise ValueError(f"{record.name or 'record'}: expected points to scale by {scale}, found an image")
+    points = record.points * np.float32(scale)
+    return dataclasses.replace(record, points=points, mounting=_scaled_mounting(record.mounting, scale))
+
+
+def scaled_poses(poses: Float[np.ndarray, "*n 4 4"], factor: float) -> Float[np.ndarray, "*n 4 4"]:
+    """Return poses with their translations multiplied by `factor`."""
+    found = np.array(poses, np.float64)
+    found[..., :3, 3] *= factor
+    return found
+
+
+def _scaled_mounting(mounting: Mounting | None, scale: Scale) -> Mounting:
+    """The mounting of scaled scans. None stands for `MODEL_HEIGHT_M`."""
+    return (mounting or Mounting(MODEL_HEIGHT_M)).scaled(scale)
+
+
+class _ScaledReader:
+    """Reads scans and multiplies their points by a factor."""
+
+    def __init__(self, recording: Recording, scale: Scale):
+        self._read = recording.read
+        self._scale: Scale = scale
+        self.keywords = {**recording.read_options, SCALE: str(scale)}
+        """Read options, which identify a recording (`Recording.read_options`)."""
+
+    def __call__(self, path: Path, label_path: Path | None, lasers: bool) -> Record:
+        return scaled_record(self._read(path, label_path, lasers), self._scale)

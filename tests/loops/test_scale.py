@@ -1,0 +1,102 @@
+"""Results of scaled scans are in metres."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import of_scans
+
+import sglpr_jax
+from sglpr_jax.data.scaled import scaled_poses
+from sglpr_jax.loops import find
+from sglpr_jax.loops.config import DetectorConfig, DriftModel
+from sglpr_jax.loops.drift import deviations
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.loops.scale import Search, divided_loop, scaled_config, scaled_drift
+from sglpr_jax.loops.transforms import inverse, transform
+
+from .drives import loop_at
+from .test_find import CONFIG, N, searched
+
+SCALE = 4
+
+
+@pytest.fixture(scope="module")
+def params():
+    return sglpr_jax.load("circular")
+
+
+@pytest.fixture(scope="module")
+def there_and_back() -> np.ndarray:
+    """Poses along a bend and back beside it, 0.5 m apart."""
+    there = np.stack([transform(5 * np.sin(a), 5 - 5 * np.cos(a), a) for a in np.arange(N) / 10])
+    aside = np.stack([transform(0.0, 0.8 + 0.5 * np.sin(i), np.pi) for i in np.arange(N)])
+    return np.concatenate([there, (there @ aside)[::-1]])
+
+
+def test_loops_of_scaled_scans_are_in_metres(params, there_and_back, monkeypatch):
+    large = scaled_poses(there_and_back, float(SCALE))
+    detector = searched(params, large, large)
+    recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
+    monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
+    found = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG, registered=False, scale=SCALE)
+    assert len(found.loops) >= N - 1 and str(found).endswith(", scale 4")
+    for loop, one in zip(found.loops, sorted(detector.loops, key=lambda one: one.query), strict=False):
+        true = inverse(there_and_back[loop.match]) @ there_and_back[loop.query]
+        np.testing.assert_allclose(loop.match_from_query, true, atol=1e-6)
+        np.testing.assert_allclose(loop.covariance[:3, :3], one.covariance[:3, :3] / SCALE**2)
+        np.testing.assert_allclose(loop.covariance[3:, 3:], one.covariance[3:, 3:])
+    np.testing.assert_array_equal(found.odometry, there_and_back)
+    assert found.recording is recording and found.config is CONFIG and found.scale == SCALE
+
+
+def test_a_division_does_not_change_how_improbable_an_error_is():
+    loop = loop_at(9, 2, transform(3.0, 1.0, 0.4), np.random.default_rng(0))
+    half = divided_loop(loop, 2)
+    error = np.array([0.3, -0.2, 0.1, 0.01, 0.02, -0.03])
+    small = error / [2, 2, 2, 1, 1, 1]
+    assert error @ loop.information @ error == pytest.approx(small @ half.information @ small)
+
+
+def test_odometry_drifts_as_much_at_any_scale(there_and_back):
+    """Only the deviation of the comparison itself belongs to the images."""
+    drift = DriftModel(degrees_per_metre=0.1, position_m=1e-3, height_m=1e-3)
+    loops = [Loop(2 * N - 1 - i, i, transform(0.1, 1.0, 3.0), 1e-9 * np.eye(6), 1.0) for i in range(0, N - 5, 5)]
+    large = [divided_loop(loop, 1) for loop in loops]
+    for loop in large:
+        loop.match_from_query[:3, 3] *= SCALE
+    expected = deviations(loops, there_and_back, drift=drift)
+    found = deviations(large, scaled_poses(there_and_back, float(SCALE)), drift=scaled_drift(drift, float(SCALE)))
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
+def test_settings_of_the_user_are_real_metres():
+    config = DetectorConfig(near_m=100.0, keyframe_m=0.5)
+    found = Search(of_scans({}), np.eye(4)[None], config).scaled(2).config
+    assert (found.near_m, found.keyframe_m) == (200.0, 1.0) and found.candidates == config.candidates
+    assert scaled_config(config, 1) == config
+
+
+def test_scans_are_located_in_a_map_of_their_scale(params, tmp_path):
+    """A hall of 12 m with a few things: each place finds itself, and scale and metres come back from the file."""
+    rng = np.random.default_rng(3)
+    things = rng.uniform([-2, -6], [10, 6], (25, 2))
+    xy = np.repeat(things, 60, axis=0) + rng.normal(0, 0.06, (1500, 2))
+    world = np.column_stack([xy, rng.uniform(0.2, 1.5, 1500)])
+    poses = np.stack([transform(float(x), 0.0, 0.0) for x in (0.0, 2.0, 4.0)])
+    poses[:, 2, 3] = 0.5
+    scans = {Path(f"{i}.bin"): (world - pose[:3, 3]).astype(np.float32) for i, pose in enumerate(poses)}
+    recording = of_scans(scans, mounting=sglpr_jax.Mounting(0.5))
+    made = PlaceMap.of(recording, params, poses, spacing_m=0.0, scale=SCALE)
+    made.save(tmp_path / "hall.safetensors")
+    places = PlaceMap.load(tmp_path / "hall.safetensors")
+    assert places.scale == SCALE and places.mounting().height_m == 0.5
+    query = transform(2.3, 0.2, 0.0)
+    query[2, 3] = 0.5
+    best = places.relocate(params, (world - query[:3, 3]).astype(np.float32))[0]
+    assert best.place.endswith("/1")
+    np.testing.assert_allclose(best.world_from_query, query, atol=0.06)
+    np.testing.assert_allclose(best.loop.match_from_query[:3, 3], [0.3, 0.2, 0.0], atol=0.06)
+    with pytest.raises(ValueError, match="expected scale 4, found scale 1: descriptors of scans with different scales"):
+        places.merged(PlaceMap.of(recording, params, poses, spacing_m=0.0))
