@@ -22,7 +22,7 @@ SCALE = "scale"
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
-"""Minimum range of scans that are not scaled, in metres (`chosen_scale`). Outdoors and in garages it is 12 m or more,
+"""Minimum range of scans that are not scaled, in metres (`typical_range_m`). Outdoors and in garages it is 12 m or more,
 and in corridors and rooms 3 to 7 m."""
 NEAR_SCALE: Scale = 4
 """Scale of recordings with shorter ranges."""
@@ -56,16 +56,21 @@ def scaled(recording: Recording, scale: Scale) -> Recording:
 
 
 def chosen_scale(recording: Recording) -> Scale:
-    """Choose the scale of a recording from how far its sensor sees.
+    """Choose the scale of a recording by `typical_range_m`: `NEAR_SCALE` below `FAR_M`, otherwise 1.
 
-    The range of a scan is the 90 % quantile of the horizontal distances of its points. If the median range of some
-    scans is below `FAR_M`, the scale is `NEAR_SCALE`, otherwise 1. Recordings of images have scale 1.
+    Recordings of images have scale 1.
     """
-    if recording.has_images:
-        return 1
+    return 1 if recording.has_images or typical_range_m(recording) >= FAR_M else NEAR_SCALE
+
+
+def typical_range_m(recording: Recording) -> float:
+    """How far the sensor sees: the 90 % quantile of the horizontal distances in a scan, and its median over some scans.
+
+    Returns infinity if no scan can be read.
+    """
     rows = np.unique(np.linspace(0, len(recording) - 1, SCANS).astype(int)) if len(recording) else ()
     ranges = [found for row in rows if (found := _range_m(recording, int(row))) is not None]
-    return NEAR_SCALE if ranges and np.median(ranges) < FAR_M else 1
+    return float(np.median(ranges)) if ranges else float("inf")
 
 
 def _range_m(recording: Recording, row: int) -> float | None:
