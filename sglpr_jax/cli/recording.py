@@ -143,7 +143,7 @@ def open_with_poses(
 
 
 def resolved_scale(choice: ScaleChoice, *recordings: "Recording") -> Scale:
-    """Return the stated scale or, with `auto`, the smallest of those chosen for the recordings, and print it."""
+    """Return the stated scale or, with `auto`, the smallest scale that fits a recording, and print it."""
     from sglpr_jax.data.scaled import chosen_scale  # slow import, not needed for --help
 
     if choice != "auto":

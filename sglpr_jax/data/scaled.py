@@ -22,8 +22,8 @@ SCALE = "scale"
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
-"""Minimum range of scans that are not scaled, in metres (`typical_range_m`). Outdoors and in garages it is 12 m or more,
-and in corridors and rooms 3 to 7 m."""
+"""Minimum range of scans that are not scaled, in metres (`typical_range_m`). Outdoors and in garages the range is 12 m
+or more, and in corridors and rooms 3 to 7 m."""
 NEAR_SCALE: Scale = 4
 """Scale of recordings with shorter ranges."""
 

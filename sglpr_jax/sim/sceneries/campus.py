@@ -23,7 +23,7 @@ LAWN_M = 6.0
 
 
 def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
-    """Buildings 42 to 52 m apart, with a path between each two. A closed path goes around one building."""
+    """Buildings 42 to 52 m apart, with a path between each two. A closed path leads around one building."""
     pitch = rng.uniform(42, 52)
     line, count = _around(pitch) if closed else _along(length_m, pitch)
     columns, lines = np.arange(-MORE, ROW + MORE), np.arange(-MORE - 1, count + MORE)

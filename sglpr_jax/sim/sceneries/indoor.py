@@ -60,7 +60,7 @@ def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """Wings of 22 to 30 m with rooms of 3 to 8 m, halls, glass fronts, and a branch in the middle of each wing.
 
     Six of ten wings have the rooms of the first wing, partly with the same furniture. The path visits one room in each
-    wing. A closed path goes around two wings.
+    wing. A closed path leads through two wings.
     """
     floor = Floor(*rng.uniform((22, 1.0, 4.2, 2.5), (30, 1.4, 6.0, 3.2)).tolist())
     count = 2 if closed else int(np.ceil(length_m / (floor.run_m + floor.pitch_m))) + 1
