@@ -194,7 +194,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     else:
         (path,) = command.odometry_files
         recording, odometry = open_with_poses(source, root, path, format=command.odometry_format)
-    recording = command.submap.submaps(recording, odometry)
+    recording = command.submap.prepared(recording, odometry)
     register = command.register and can_register(recording)
     if command.register and not register:
         print(f"{recording.name}: loops are not registered, {_why_not(recording)}", file=sys.stderr)

@@ -88,7 +88,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     recording, poses = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
-    recording = command.submap.submaps(recording, poses)
+    recording = command.submap.prepared(recording, poses)
     unfinished = command.out.with_suffix(UNFINISHED)
     with stop_on_signal() as stop, progress_bar(f"map {recording.name}", len(recording)) as show:
         places, scans, skipped = map_recording(

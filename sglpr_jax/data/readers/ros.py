@@ -24,7 +24,7 @@ from sglpr_jax.data.formats.trajectory import check_height, check_order
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.record import Record, found_record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
@@ -250,7 +250,7 @@ def _read(
     time, nth = where[path.name]
     with naming(f"scan {path.name}"):
         found = bag.cloud(topic, time, nth)
-    return Record(points=found.points, lasers=found.lasers if lasers else None)
+    return found_record(found, lasers=lasers)
 
 
 READER = Reader(
