@@ -1,5 +1,6 @@
 """Bags of both ROSes and mcap for the tests: messages of any type at any time."""
 
+import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
 """What a bag of each kind is called."""
 
 
+@functools.cache
 def typestore(kind: str) -> Any:
     """The messages of a ROS, with those of tf and of both drivers of Livox."""
     types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
