@@ -30,10 +30,13 @@ class RecordingOptions:
     """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scans.
     `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
     gravity: Gravity = dataclasses.field(default="auto", kw_only=True)
-    """`recording`: one height and tilt for all scans. `scan`: height and tilt of each scan, for a sensor in a hand.
-    `auto` chooses by the tilt of some scans, or `recording` if the layout or --sensor-height defines the mounting."""
+    """`recording`: one height and tilt for all scans. `scan`: height and tilt of each scan, for a sensor in a hand,
+    from its ground and the IMU of a bag. `auto` chooses by the tilt of some scans, or `recording` if the layout or
+    --sensor-height defines the mounting."""
     pose_topic: str | None = None
     """Pose topic of a bag that has several, for example /odom."""
+    imu_topic: str | None = dataclasses.field(default=None, kw_only=True)
+    """IMU topic of a bag, for the gravity of each scan. By default, the one beside the topic of the LiDAR is used."""
     time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)
     """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
     contradict this, and ignores row numbers (0, 1, 2, ...)."""

@@ -102,7 +102,7 @@ def _mean_rotations(turns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3
 def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
     """Return a recording whose scans have no motion within them: scan i is seen from pose i.
 
-    Scans are corrected when they are read. A scan without a neighbour within a second stays as it is.
+    Scans are corrected when they are read. A scan without a neighbour within a second is not changed.
 
     Arguments:
       recording: Recording of scans with times, whose points have times (`Record.point_times`).

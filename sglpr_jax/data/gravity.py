@@ -137,9 +137,9 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
 def _ups_by_imu(
     recording: Recording, ground: Sequence[Mounting | None]
 ) -> tuple[list[Float[np.ndarray, "3"] | None], str]:
-    """Up at each scan by the IMU, and its source in words. All are None if the IMU contradicts the ground.
+    """Up at each scan by the IMU, or None without samples, and its source in words.
 
-    Scans at times without samples have the mean of the scans that have ground.
+    An IMU that contradicts the ground is not used for any scan.
     """
     without: list[Float[np.ndarray, 3] | None] = [None] * len(recording)
     read = None if recording.read_ups is None else recording.read_ups()

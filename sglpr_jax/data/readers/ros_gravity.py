@@ -41,7 +41,7 @@ def ups_of_scans(
       topic: Topic of the IMU.
       scans: Times of the scans.
       lidar: Frame of the LiDAR.
-      required: Whether an IMU without gravity is an error. Otherwise it is a `DataWarning`, and the result is None.
+      required: Whether an IMU without gravity is an error. Otherwise the function warns and returns None.
 
     Raises:
       ValueError: If the bag is broken, or if `required` and the IMU does not measure gravity.
