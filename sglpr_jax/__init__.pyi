@@ -31,6 +31,8 @@ from .data import (
     recording_names as recording_names,
 )
 from .data.density_image import density_bev as density_bev
+from .data.deskew import deskew as deskew
+from .data.deskew import deskewed as deskewed
 from .data.gravity import GroundFilter as GroundFilter
 from .data.mounting import Mounting as Mounting
 from .data.mounting import estimate_mounting as estimate_mounting

@@ -1,5 +1,6 @@
 """Bags of both ROSes and mcap for the tests: messages of any type at any time."""
 
+import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,15 @@ LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflec
 LIVOX = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 )
+CODES = {"u4": 6, "f4": 7, "f8": 8}
+"""Codes of PointField by numpy type."""
 CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FILES = {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}
 """What a bag of each kind is called."""
 
 
+@functools.cache
 def typestore(kind: str) -> Any:
     """The messages of a ROS, with those of tf and of both drivers of Livox."""
     types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
@@ -57,19 +61,22 @@ def transforms(kind: str, seconds: float, found: Iterable[tuple[str, str, Any, A
     )
 
 
-def cloud(kind: str, seconds: float, points: np.ndarray) -> Any:
-    """A PointCloud2 of x, y, z at this time."""
-    store, points = typestore(kind).types, np.ascontiguousarray(points, "<f4")
+def cloud(kind: str, seconds: float, points: np.ndarray, **more: np.ndarray) -> Any:
+    """A PointCloud2 of x, y, z and more fields at this time."""
+    store = typestore(kind).types
+    columns = {**dict(zip("xyz", np.asarray(points, "<f4").T, strict=True)), **more}
+    records = np.rec.fromarrays(list(columns.values()), names=list(columns))
     field = store["sensor_msgs/msg/PointField"]
+    layout = {name: (records.dtype[name].str[1:], records.dtype.fields[name][1]) for name in columns}
     return store[CLOUD](
         header=header(kind, seconds, "lidar"),
         height=1,
         width=len(points),
-        fields=[field(name=axis, offset=4 * at, datatype=7, count=1) for at, axis in enumerate("xyz")],
+        fields=[field(name=name, offset=at, datatype=CODES[of], count=1) for name, (of, at) in layout.items()],
         is_bigendian=False,
-        point_step=12,
-        row_step=12 * len(points),
-        data=points.view(np.uint8).reshape(-1),
+        point_step=records.itemsize,
+        row_step=records.nbytes,
+        data=np.frombuffer(records.tobytes(), np.uint8),
         is_dense=True,
     )
 

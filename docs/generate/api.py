@@ -4,7 +4,10 @@ import sglpr_jax
 
 GROUPS = {
     "From a scan to a descriptor": ["load", "read_scan", "scan_image", "describe", "segment", "forward", "Outputs"],
-    "Recordings": ["open_recording", "recording_names", "Recording", "Record", "submaps", "SubmapBuilder", "scaled"],
+    "Recordings": [
+        *("open_recording", "recording_names", "Recording", "Record"),
+        *("deskewed", "deskew", "submaps", "SubmapBuilder", "scaled"),
+    ],
     "Finding places again": ["embed", "DescriptorFile", "nearest", "Nearest", "Index", "FleetIndex"],
     "Scores": ["evaluate", "Evaluation"],
     "Loops": ["find_loops", "find_loops_between", "LoopDetector", "Loop"],

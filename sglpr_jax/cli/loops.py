@@ -204,7 +204,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     else:
         (path,) = command.odometry_files
         recording, odometry = open_with_poses(source, root, path, format=command.odometry_format)
-    recording = command.submap.submaps(recording, odometry)
+    recording = command.submap.prepared(recording, odometry)
     scale = resolved_scale(command.scale, recording)
     register = command.register and can_register(recording)
     if command.register and not register:

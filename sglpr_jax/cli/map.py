@@ -95,7 +95,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
     recording, poses = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
-    recording = command.submap.submaps(recording, poses)
+    recording = command.submap.prepared(recording, poses)
     scale = resolved_scale(command.scale, recording)
     if before is not None:
         with naming(f"{command.add_to}"):

@@ -39,10 +39,13 @@ class RecordingOptions:
     """Height of the sensor above the ground, in metres. `estimate` estimates the height and the tilt from the scans.
     `auto` estimates them only if the layout (a plain folder, a bag) does not define them."""
     gravity: Gravity = dataclasses.field(default="auto", kw_only=True)
-    """`recording`: one height and tilt for all scans. `scan`: height and tilt of each scan, for a sensor in a hand.
-    `auto` chooses by the tilt of some scans, or `recording` if the layout or --sensor-height defines the mounting."""
+    """`recording`: one height and tilt for all scans. `scan`: height and tilt of each scan, for a sensor in a hand,
+    from its ground and the IMU of a bag. `auto` chooses by the tilt of some scans, or `recording` if the layout or
+    --sensor-height defines the mounting."""
     pose_topic: str | None = None
     """Pose topic of a bag that has several, for example /odom."""
+    imu_topic: str | None = dataclasses.field(default=None, kw_only=True)
+    """IMU topic of a bag, for the gravity of each scan. By default, the one beside the topic of the LiDAR is used."""
     time_unit: TimeUnit = dataclasses.field(default="auto", kw_only=True)
     """Unit of the times in text files: times.txt, tum and csv. `auto` expects seconds, reports times whose steps
     contradict this, and ignores row numbers (0, 1, 2, ...)."""
@@ -73,7 +76,11 @@ class PosedRecordingOptions(RecordingOptions):
 
 @dataclasses.dataclass(frozen=True)
 class SubmapOptions:
-    """Submaps in place of single scans."""
+    """Scans without the motion within them, and submaps in place of single scans."""
+
+    deskew: bool = False
+    """Remove the motion within each scan, before submaps are built. The points need times, and the scans need times and
+    poses with rotations."""
 
     submap_m: NotNegative = 0.0
     """Travelled distance of a submap, in metres. 0 uses single scans. The scans of a submap are laid together in the
@@ -81,42 +88,51 @@ class SubmapOptions:
     submap_keyframe_m: Positive = 1.0
     """Minimum distance between the scans of a submap, in metres."""
 
-    def submaps(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
-        """Return the recording with submaps by the poses, or else by the poses of its bag. Raises ValueError without
-        poses."""
-        if self.submap_m == 0:
+    @property
+    def flag(self) -> str | None:
+        """Name of a given flag that needs poses, or None."""
+        return "--submap-m" if self.submap_m else "--deskew" if self.deskew else None
+
+    def prepared(self, recording: "Recording", poses: "Float[np.ndarray, 'n 4 4'] | None") -> "Recording":
+        """Return the recording deskewed and with submaps, as selected, by the poses or else by the poses of its bag.
+
+        Raises ValueError without poses.
+        """
+        if self.flag is None:
             return recording
-        from sglpr_jax.data.submap import submaps  # slow import, not needed for --help
+        from sglpr_jax.data.deskew import deskewed  # slow imports, not needed for --help
+        from sglpr_jax.data.submap import submaps
 
         poses = recording.world_from_lidar if poses is None else poses
         if poses is None:
             raise ValueError(
-                f"{recording.name}: expected poses with rotations for --submap-m, found none; state a file with "
+                f"{recording.name}: expected poses with rotations for {self.flag}, found none; state a file with "
                 "--odometry"
             )
-        found = submaps(recording, poses, length_m=self.submap_m, keyframe_m=self.submap_keyframe_m)
-        print(found.found[-1], file=sys.stderr)
+        still = deskewed(recording, poses) if self.deskew else recording
+        found = submaps(still, poses, length_m=self.submap_m, keyframe_m=self.submap_keyframe_m)
+        print(*found.found[len(recording.found) :], sep="\n", file=sys.stderr)
         return found
 
 
 @dataclasses.dataclass(frozen=True)
 class OdometrySubmapOptions(SubmapOptions):
-    """Submaps in place of single scans, and the poses that they are built with."""
+    """Deskewed scans and submaps, and the poses that these are made with."""
 
     odometry: Path | None = None
-    """Poses for --submap-m: file with a pose for each scan, or tum file with poses at other times, which are
-    interpolated. By default, the poses of a bag are used."""
+    """Poses for --submap-m and --deskew: file with a pose for each scan, or tum file with poses at other times, which
+    are interpolated. By default, the poses of a bag are used."""
     odometry_format: OdometryFormat = "auto"
     """Format of --odometry. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
     recognises tum and .g2o."""
 
     def open(self, source: RecordingOptions, root: Path) -> "Recording":
-        """Open a recording, with submaps if these are selected. Scans without a pose are then removed."""
-        if self.odometry is not None and self.submap_m == 0:
-            raise ValueError(f"{self.odometry}: expected --submap-m with --odometry, found 0")
-        if self.odometry is None or self.submap_m == 0:
-            return self.submaps(source.open(root), None)
-        return self.submaps(*open_with_poses(source, root, self.odometry, format=self.odometry_format))
+        """Open a recording, deskewed and with submaps if these are selected. Scans without a pose are then removed."""
+        if self.odometry is None:
+            return self.prepared(source.open(root), None)
+        if self.flag is None:
+            raise ValueError(f"{self.odometry}: expected --submap-m or --deskew with --odometry, found neither")
+        return self.prepared(*open_with_poses(source, root, self.odometry, format=self.odometry_format))
 
 
 def open_with_poses(

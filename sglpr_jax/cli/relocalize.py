@@ -71,8 +71,8 @@ def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
 
     if command.out is not None:
         check_writable(command.out)
-    if command.frame is None and command.submap.submap_m:
-        raise ValueError(f"{command.scan}: expected --frame of a recording with --submap-m, found a single scan")
+    if command.frame is None and command.submap.flag:
+        raise ValueError(f"{command.scan}: expected --frame with {command.submap.flag}, found a single scan")
     params = load(command.weights)
     places = PlaceMap.load(command.map, weights_hash=weights_hash(params))
     with naming(command.map):

@@ -68,12 +68,12 @@ def _opened(command: Any) -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4
     """Open the recordings, with their odometry if there is one."""
     paths, files = command.recordings, command.odometry_files
     if not files:
-        return [command.submap.submaps(command.source.open(path), None) for path in paths], None
+        return [command.submap.prepared(command.source.open(path), None) for path in paths], None
     opened = [
         open_with_poses(command.source, path, file, format=command.odometry_format)
         for path, file in zip(paths, files, strict=True)
     ]
-    return [command.submap.submaps(*one) for one in opened], [poses for _, poses in opened]
+    return [command.submap.prepared(*one) for one in opened], [poses for _, poses in opened]
 
 
 def _report(found: "FoundRecordings") -> None:

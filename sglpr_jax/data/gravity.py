@@ -1,7 +1,7 @@
-"""Gravity of each scan of a sensor that tilts, as in a hand: from the ground of the scans, and from odometry.
+"""Gravity of each scan of a sensor that tilts, as in a hand: from the ground of the scans, an IMU, and odometry.
 
 The ground of one scan gives height and up (`estimate_mounting`). `GroundFilter` replaces ground that contradicts the
-scans before. With odometry, up is averaged over the ground of some metres of path.
+scans before. With an IMU, the ground must agree with the IMU. With odometry, up is averaged over some metres of path.
 """
 
 import dataclasses
@@ -23,6 +23,13 @@ SPREAD_DEG, SPREAD_M = 8.0, 0.15
 """Standard deviations of a sensor in a hand about its mean, for a stream whose scans are not known in advance."""
 LEAST_SPREAD_DEG, LEAST_SPREAD_M = 2.0, 0.05
 """Minimum of these standard deviations."""
+IMU_TILT_DEG, SLOPE_DEG = 1.0, 1.0
+"""Standard deviations of up about each horizontal axis from an IMU, and of the ground relative to this up: roads have
+slopes."""
+IMU_APART_DEG = 10.0
+"""Maximum median angle between up by an IMU and by the ground. Beyond it, the axes of the IMU are wrong."""
+LEAST_SHARE = 0.5
+"""Minimum share of scans with samples of the IMU."""
 MEMORY = 0.8
 """Share of the deviation from the mean that remains until the next scan. A hand turns within a second."""
 GATE = 4.6
@@ -55,6 +62,8 @@ class GroundFilter:
           spread_m: Standard deviation of the height about its mean, in metres.
         """
         self.mean = mean
+        self.followed = 0
+        """Number of scans whose ground was used."""
         self._spread = np.array([np.radians(spread_deg)] * 2 + [spread_m]) ** 2
         self._noise = np.array([np.radians(GROUND_TILT_DEG)] * 2 + [GROUND_HEIGHT_M]) ** 2
         self._state, self._variance = np.zeros(3), self._spread
@@ -63,17 +72,28 @@ class GroundFilter:
         """Estimate the mounting at the next scan from its points (n, 3), in metres."""
         return self.update(estimate_mounting(points, near=self.mean))
 
-    def update(self, ground: Mounting | None) -> Mounting:
-        """Add the mounting by the ground of the next scan, or None for a scan without ground."""
-        predicted, variance = MEMORY * self._state, MEMORY**2 * self._variance + (1 - MEMORY**2) * self._spread
+    def update(self, ground: Mounting | None, *, up: Float[np.ndarray, "3"] | None = None) -> Mounting:
+        """Add the mounting by the ground of the next scan, or None for a scan without ground.
+
+        Arguments:
+          ground: Mounting, or None.
+          up: Direction of up in the LiDAR frame by an IMU, which replaces the mean. Use it for all scans or for none.
+        """
+        mean, spread, noise = self.mean, self._spread, self._noise
+        if up is not None:
+            mean = dataclasses.replace(mean, up=tuple(up.tolist()))
+            spread = np.array([*[np.radians(IMU_TILT_DEG) ** 2] * 2, spread[2]])
+            noise = np.array([*[np.radians(SLOPE_DEG) ** 2] * 2, noise[2]])
+        predicted, variance = MEMORY * self._state, MEMORY**2 * self._variance + (1 - MEMORY**2) * spread
         if ground is not None:
-            ahead = _apart(ground, self.mean) - predicted
-            if np.sum(ahead**2 / (variance + self._noise)) <= GATE**2:
-                gain = variance / (variance + self._noise)
+            ahead = _apart(ground, mean) - predicted
+            if np.sum(ahead**2 / (variance + noise)) <= GATE**2:
+                self.followed += 1
+                gain = variance / (variance + noise)
                 predicted, variance = predicted + gain * ahead, variance * (1 - gain)
         self._state, self._variance = predicted, variance
         tilt_deg = float(np.degrees(np.sqrt(variance[:2].mean())))
-        return _beside(self.mean, predicted, float(np.sqrt(variance[2])), tilt_deg)
+        return _beside(mean, predicted, float(np.sqrt(variance[2])), tilt_deg)
 
 
 def tilts(scans: Sequence[Mounting | None], common: Mounting | None) -> bool:
@@ -105,13 +125,36 @@ def with_gravity(recording: Recording, common: Mounting) -> Recording:
         spread_deg=max(float(np.degrees(spread[:2].max())), LEAST_SPREAD_DEG),
         spread_m=max(float(spread[2]), LEAST_SPREAD_M),
     )
-    mountings = tuple(filtered.update(scan) for scan in ground)
-    followed = sum((one.tilt_deviation_deg or 0.0) <= GROUND_TILT_DEG for one in mountings)
+    ups, source = _ups_by_imu(recording, ground)
+    mountings = tuple(filtered.update(scan, up=up) for scan, up in zip(ground, ups, strict=True))
     found = (
         f"gravity: the sensor tilts by {_spread_deg(seen, mean):.0f} degrees about its mean; height and tilt of each "
-        f"scan from the ground in {followed} of {len(ground)} scans"
+        f"scan from the ground in {filtered.followed} of {len(ground)} scans{source}"
     )
-    return dataclasses.replace(recording, mountings=mountings, found=(*recording.found, found))
+    return dataclasses.replace(recording, mountings=mountings, read_ups=None, found=(*recording.found, found))
+
+
+def _ups_by_imu(
+    recording: Recording, ground: Sequence[Mounting | None]
+) -> tuple[list[Float[np.ndarray, "3"] | None], str]:
+    """Up at each scan by the IMU, or None without samples, and its source in words.
+
+    An IMU that contradicts the ground is not used for any scan.
+    """
+    without: list[Float[np.ndarray, 3] | None] = [None] * len(recording)
+    read = None if recording.read_ups is None else recording.read_ups()
+    if read is None:
+        return without, ""
+    ups, source = read
+    found = [up if np.isfinite(up).all() else None for up in ups]
+    share = np.mean([up is not None for up in found])
+    if share < LEAST_SHARE:
+        return without, f"; {source}, has samples at only {share:.0%} of the scans and is not used"
+    both = [(up, scan.up) for up, scan in zip(found, ground, strict=True) if up is not None and scan is not None]
+    apart = np.median(_angles_deg(*np.array(both).swapaxes(0, 1))) if both else 0.0
+    if apart > IMU_APART_DEG:
+        return without, f"; {source}, is {apart:.0f} degrees apart from the ground and is not used"
+    return found, f" and from {source}"
 
 
 def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:

@@ -42,5 +42,6 @@ def only(recording: Recording, rows: Sequence[int]) -> Recording:
         times=None if recording.times is None else recording.times[list(rows)],
         rows=recording.numbers[list(rows)],
         mountings=None if recording.mountings is None else tuple(recording.mountings[row] for row in rows),
+        read_ups=None,
         world_from_lidar=None if recording.world_from_lidar is None else recording.world_from_lidar[list(rows)],
     )

@@ -28,6 +28,8 @@ class ReadOptions:
     """Unit of the times in `times` and `poses`."""
     pose_topic: str | None = None
     """Topic of the poses in a bag that has several."""
+    imu_topic: str | None = None
+    """Topic of the IMU in a bag that has several."""
 
     def __post_init__(self):
         for name in ("pose_source", "format", "pose_format", "time_unit"):
@@ -52,5 +54,5 @@ class Reader:
     order."""
     takes_poses: bool = False
     """Whether `ReadOptions.poses` and `times` apply. Otherwise the layout has its own pose files."""
-    takes_pose_topic: bool = False
-    """Whether `ReadOptions.pose_topic` applies."""
+    takes_topics: bool = False
+    """Whether `ReadOptions.pose_topic` and `imu_topic` apply."""

@@ -1,16 +1,19 @@
-"""Data of one scan or one ready-made image: points or pixels, labels and lasers."""
+"""Data of one scan or one ready-made image: points or pixels, labels, lasers and times of points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
+from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.label_images import read_label_image
-from sglpr_jax.data.formats.scan_files import read_labels, read_points_and_lasers
+from sglpr_jax.data.formats.scan_files import read_labels, read_scan_records
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.files import naming
 from sglpr_jax.labels import to_classes
 
@@ -31,6 +34,8 @@ class Record:
     """Laser number of each point, if the file contains it."""
     name: str = ""
     """Name for error messages: "scan 000052 of sequence 08"."""
+    time_field: TimeField | None = None
+    """Times of the points as the file states them, if it does."""
     position: Float[np.ndarray, " 3"] | None = None
     """Position in metres, z up."""
     time: float | None = None
@@ -43,6 +48,18 @@ class Record:
         """Points as seen by a gravity-aligned sensor 1.73 m above the ground. Models use these points."""
         assert self.points is not None
         return self.points if self.mounting is None else self.mounting.level(self.points)
+
+    @property
+    def point_times(self) -> Float32[np.ndarray, " n"] | None:
+        """Time of each point relative to `time`, in seconds, or None if the file has no times of points.
+
+        Raises ValueError if the times of the points cannot be those of a scan (`TimeField.seconds`).
+        """
+        if self.time_field is None or self.points is None:
+            return None
+        valid = np.isfinite(self.points).all(axis=1) & (self.points != 0).any(axis=1)
+        with naming(self.name):
+            return self.time_field.seconds(valid=valid, scan_time=self.time)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -93,9 +110,14 @@ def scan_record(
       ValueError: If a file is malformed, or the number of labels differs from the number of points. Other errors are
         those of `read_scan` and `read_labels`.
     """
-    points, laser_of_point = read_points_and_lasers(path, format=format, records=records)
-    raw = None if labels is None else read_labels(labels, points=len(points))
-    return Record(points=points, labels=raw, labels_file=labels, lasers=laser_of_point if lasers else None)
+    found = read_scan_records(path, format=format, records=records)
+    raw = None if labels is None else read_labels(labels, points=len(found.points))
+    return found_record(found, lasers=lasers, labels=raw, labels_file=labels)
+
+
+def found_record(found: Records, *, lasers: bool, **fields: Any) -> Record:
+    """Return the record of the points of a scan, with more fields. The lasers are dropped if they are not wanted."""
+    return Record(points=found.points, lasers=found.lasers if lasers else None, time_field=found.times, **fields)
 
 
 def image_record(

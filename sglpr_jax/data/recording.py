@@ -1,6 +1,7 @@
 """The `Recording` type that every reader returns: scans or ready-made BEV images of one sequence, read on access."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,9 @@ from jaxtyping import Float, Float32, Int, Int32
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import ReadRecord, Record
+
+ReadUps = Callable[[], tuple[Float[np.ndarray, "n 3"], str] | None]
+"""Reads up in the LiDAR frame at each scan, NaN where unknown, and its source in words; None if there is no gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,8 @@ class Recording:
     """Mounting at each scan of a sensor that tilts. None means that `mounting` holds for all scans."""
     world_from_lidar: Float[np.ndarray, "n 4 4"] | None = None
     """Poses of the LiDAR in the frame of a bag's messages, if these contain rotations. None for other layouts."""
+    read_ups: ReadUps | None = None
+    """Function that reads up at each scan from an IMU. None without an IMU, and when the gravity is known."""
     found: tuple[str, ...] = ()
     """What the reader found, in words: the format of the scans and the ignored files."""
     rows: Int[np.ndarray, " n"] | None = None

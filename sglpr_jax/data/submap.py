@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt64
 
 from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.given_poses import poses_of_scans, turned_poses
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
-from sglpr_jax.poses import are_rotations
 
 LENGTH_M, KEYFRAME_M = 10.0, 1.0
 """Default travelled distance that a submap covers, and default distance between its scans, in metres."""
@@ -84,7 +84,7 @@ class SubmapBuilder:
           ValueError: If the scan shows no place (`check_cloud`), or if the pose has no rotation.
         """
         check_cloud(points)
-        pose = _checked(np.asarray(world_from_lidar, np.float64)[None])[0]
+        pose = turned_poses(np.asarray(world_from_lidar, np.float64)[None], use=SUBMAPS)[0]
         rows = self._window.add(pose)
         self._clouds = {row: self._clouds[row] for row in rows[1:]} | {rows[0]: _thinned((points, None))[0]}
         self._poses = {row: self._poses[row] for row in rows[1:]} | {rows[0]: pose}
@@ -119,17 +119,8 @@ def submaps(
     if length_m == 0:
         return recording
     window = _Window(length_m, keyframe_m)
-    if recording.has_images:
-        raise ValueError(f"sequence {recording.name}: expected scans to build submaps of, found ready-made images")
-    poses = np.asarray(world_from_lidar, np.float64)
-    if poses.shape != (len(recording), 4, 4):
-        raise ValueError(
-            f"sequence {recording.name}: expected a pose (4, 4) for each of {len(recording)} scans, found an array of "
-            f"shape {poses.shape}"
-        )
-    read = _SubmapReader(
-        recording, _checked(poses), [window.add(pose) for pose in poses], f"{length_m:g} {keyframe_m:g}"
-    )
+    poses = poses_of_scans(recording, world_from_lidar, use=SUBMAPS)
+    read = _SubmapReader(recording, poses, [window.add(pose) for pose in poses], f"{length_m:g} {keyframe_m:g}")
     said = f"submaps: the scans of the last {length_m:g} m, {keyframe_m:g} m apart, in the frame of the newest scan"
     return dataclasses.replace(recording, read=read, on_disk=False, found=(*recording.found, said))
 
@@ -195,14 +186,6 @@ class _SubmapReader:
         check_cloud(record.points, name=f"scan {self._recording.ids[row]} of sequence {self._recording.name}")
         unknown = np.zeros(len(record.points), np.int32) if labelled else None
         return _thinned((record.points, unknown if record.labels is None else record.labels))
-
-
-def _checked(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-    wrong = ~(np.isfinite(poses).all((-2, -1)) & are_rotations(poses[:, :3, :3]))
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise ValueError(f"submaps: expected poses with rotations, found {poses[row].tolist()} at scan {row}")
-    return poses
 
 
 def _motion(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:

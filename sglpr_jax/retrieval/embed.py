@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int32, Num
 
+from sglpr_jax.data.deskew import DESKEWED
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
@@ -205,9 +206,9 @@ def _file(
     check_readable(recording, len(rows))
     sensor = {} if recording.mounting is None else {"sensor": str(recording.mounting)}
     skipped = sorted(set(range(len(recording))) - set(rows))  # needed to add poses of all scans later
-    submaps = {name: value for name, value in recording.read_options.items() if name == SUBMAPS}
+    made = {name: value for name, value in recording.read_options.items() if name in (DESKEWED, SUBMAPS)}
     scale = {SCALE: scale_of(recording)} if scale_of(recording) != 1 else {}
-    config = {"data": recording.name, **sensor, **submaps, **scale, **method.about, "rotation_seed": rotation_seed}
+    config = {"data": recording.name, **sensor, **made, **scale, **method.about, "rotation_seed": rotation_seed}
     return DescriptorFile(
         sequence=recording.name,
         ids=tuple(recording.ids[row] for row in rows),

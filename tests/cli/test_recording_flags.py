@@ -53,3 +53,5 @@ def test_the_recording_is_opened_as_they_say_and_described(town, capsys):
         PosedRecordingOptions("08", poses=Path("p.csv")).open(town)
     with pytest.raises(ValueError, match="expected a bag with the pose topic /odom, found sequences/NN"):
         RecordingOptions("08", pose_topic="/odom").open(town)
+    with pytest.raises(ValueError, match="expected a bag with the IMU topic /imu, found sequences/NN"):
+        RecordingOptions("08", imu_topic="/imu").open(town)

@@ -66,10 +66,12 @@ def test_submaps_without_poses_are_one_clear_error(command, drive, tmp_path):
     folder, poses = drive
     run = ("embed", "--method", "scan-context", "--data", folder, "--out", tmp_path / "out.npz")
     assert_one_line_error(command(*run, "--submap-m", "10"), "expected poses with rotations for --submap-m, found none")
-    assert_one_line_error(command(*run, "--odometry", poses), "poses.tum: expected --submap-m with --odometry, found 0")
+    assert_one_line_error(
+        command(*run, "--odometry", poses), "poses.tum: expected --submap-m or --deskew with --odometry, found neither"
+    )
     assert_one_line_error(
         command(*run, "--odometry", poses, "--submap-m", "-1"), "expected length_m in metres, more than 0"
     )
     lone = ("relocalize", folder / "000000.bin", "--map", tmp_path / "no.safetensors", "--submap-m", "10")
-    assert_one_line_error(command(*lone), "000000.bin: expected --frame of a recording with --submap-m, found a single")
+    assert_one_line_error(command(*lone), "000000.bin: expected --frame with --submap-m, found a single")
     assert not (tmp_path / "out.npz").exists()

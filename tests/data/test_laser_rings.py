@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sglpr_jax.data import open_recording, read_scan
 from sglpr_jax.data.corruption.laser_rings import keep_rings, ring_numbers
-from sglpr_jax.data.formats.scan_files import read_points_and_lasers
+from sglpr_jax.data.formats.scan_files import read_scan_records
 from sglpr_jax.sim.sensor import HDL64E_DEG
 
 
@@ -80,7 +80,7 @@ def test_real_scans_of_other_sensors(shared):
     samples = shared / "data/samples"
     (nclt,) = (samples / "nclt/velodyne_sync").glob("*.bin")
     for path, expected in ((nclt, 32), (samples / "nuscenes_32_beams.pcd.bin", 32), (samples / "16_beams.pcd", 16)):
-        points, lasers = read_points_and_lasers(path)
+        points, lasers, _ = read_scan_records(path)
         finite = np.isfinite(points).all(axis=1)
         found = ring_numbers(points[finite], lasers=None if lasers is None else lasers[finite])
         assert set(found) == set(range(expected)), path

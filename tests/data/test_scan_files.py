@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.scan_files import guess_format, read_labels, read_points_and_lasers, read_scan, scan_id
+from sglpr_jax.data.formats.scan_files import guess_format, read_labels, read_scan, read_scan_records, scan_id
 
 
 def test_kitti_keeps_its_axes(tmp_path):
@@ -20,7 +20,7 @@ def test_nuscenes_turns_right_and_forward_into_forward_and_left(tmp_path):
     path = tmp_path / "sweep.pcd.bin"
     np.array([[1, 2, 3, 0.5, 31]], dtype="<f4").tofile(path)
     np.testing.assert_array_equal(read_scan(path), [[2, -1, 3]])
-    np.testing.assert_array_equal(read_points_and_lasers(path)[1], [31])
+    np.testing.assert_array_equal(read_scan_records(path)[1], [31])
 
 
 def test_nclt_is_decoded_in_double_precision_and_turned_not_mirrored(tmp_path):
@@ -33,7 +33,7 @@ def test_nclt_is_decoded_in_double_precision_and_turned_not_mirrored(tmp_path):
     metres = raw.astype(np.float64) * 0.005 - 100
     expected = np.stack([metres[:, 0], -metres[:, 1], -metres[:, 2]], axis=1).astype(np.float32)
     np.testing.assert_array_equal(read_scan(path), expected)
-    np.testing.assert_array_equal(read_points_and_lasers(path)[1], [5, 31])
+    np.testing.assert_array_equal(read_scan_records(path)[1], [5, 31])
 
 
 @pytest.mark.parametrize(
@@ -58,10 +58,10 @@ def test_the_format_can_be_named(tmp_path):
     assert read_scan(path).shape == (5, 3)
     assert read_scan(path, format="nuscenes").shape == (4, 3)
     assert read_scan(path, format="nclt").shape == (10, 3)
-    assert read_points_and_lasers(path)[1] is None
+    assert read_scan_records(path)[1] is None
     (tmp_path / "a.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 1\nDATA ascii\n1 2 3\n")
-    assert read_points_and_lasers(tmp_path / "a.pcd")[1] is None
-    np.testing.assert_array_equal(read_points_and_lasers(path, format="nuscenes")[1], [4, 9, 14, 19])
+    assert read_scan_records(tmp_path / "a.pcd")[1] is None
+    np.testing.assert_array_equal(read_scan_records(path, format="nuscenes")[1], [4, 9, 14, 19])
 
 
 @pytest.mark.parametrize(

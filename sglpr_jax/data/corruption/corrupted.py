@@ -39,7 +39,7 @@ def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Rec
 
 
 def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Generator) -> Record:
-    """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points."""
+    """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points, but no times."""
     assert record.points is not None
     rows = np.flatnonzero(np.isfinite(record.points).all(axis=1))
     lasers = None if record.lasers is None else record.lasers[rows]
@@ -50,4 +50,5 @@ def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Gen
         points=points,
         labels=None if record.labels is None else record.labels[left],
         lasers=None if record.lasers is None else record.lasers[left],
+        time_field=None,
     )

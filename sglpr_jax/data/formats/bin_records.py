@@ -11,6 +11,7 @@ from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.scan_size import check_points
+from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.files import naming
 
 NCLT_RECORD = np.dtype([("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
@@ -23,12 +24,14 @@ scans."""
 
 
 class Records(NamedTuple):
-    """Points of one scan, with their lasers."""
+    """Points of one scan, with their lasers and times."""
 
     points: Float32[np.ndarray, "n 3"]
     """Points in metres: x forward, y left, z up if the format defines its axes, or else the axes of the file."""
     lasers: Int32[np.ndarray, " n"] | None
     """Laser number of each point, or None if the format has none."""
+    times: TimeField | None = None
+    """Field with the times of the points, or None if the format has none."""
 
 
 def is_record(format: str) -> TypeGuard[RecordFormat]:

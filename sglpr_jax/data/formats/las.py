@@ -8,7 +8,9 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points
+from sglpr_jax.data.point_times import TimeField, time_field_of
 from sglpr_jax.files import in_short, naming
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60
@@ -18,7 +20,12 @@ _COMPRESSED = 0x80
 
 
 def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of a .las file in metres, scaled by the header. The axes are not changed.
+    """Return the points (n, 3) of a .las file. Raises what `las_records` raises."""
+    return las_records(path).points
+
+
+def las_records(path: Path) -> Records:
+    """Return the points of a .las file in metres, scaled by the header, and their times. The axes are not changed.
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -32,7 +39,9 @@ def read_las(path: Path) -> Float32[np.ndarray, "n 3"]:
         with laspy.open(path) as stream:
             found = stream.read()
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.stack([np.asarray(axis) for axis in (found.x, found.y, found.z)], axis=1).astype(np.float32)
+            points = np.stack([np.asarray(axis) for axis in (found.x, found.y, found.z)], axis=1).astype(np.float32)
+        time = time_field_of(list(found.point_format.dimension_names))
+        return Records(points, None, None if time is None else TimeField(time, np.array(found[time])))
     except Exception as error:  # laspy raises struct.error, MemoryError and others
         raise ValueError(f"{path}: expected a .las file, found an unreadable one ({in_short(error)})") from error
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.ros_message import RosMessage
+from sglpr_jax.data.point_times import TimeField
 
 CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 POINT = {
@@ -22,7 +23,7 @@ POINT = {
 
 
 def read_custom_msg(message: RosMessage) -> Records:
-    """Return the points (n, 3) in the axes of the message, and their line numbers.
+    """Return the points (n, 3) in the axes of the message, their line numbers and their times.
 
     Raises:
       ValueError: If the message is truncated or has no points.
@@ -35,4 +36,4 @@ def read_custom_msg(message: RosMessage) -> Records:
     if not len(points):
         raise ValueError("expected at least one point, found none")
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    return Records(xyz, points["line"].astype(np.int32))
+    return Records(xyz, points["line"].astype(np.int32), TimeField("offset_time", points["offset_time"].copy()))

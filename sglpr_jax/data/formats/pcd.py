@@ -1,4 +1,4 @@
-"""Reads points from .pcd files, the format of the Point Cloud Library."""
+"""Reads points and their times from .pcd files, the format of the Point Cloud Library."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.lzf import decompress_lzf
 from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
 from sglpr_jax.data.formats.scan_size import blocks_of, check_points, mapped_content, read_content
+from sglpr_jax.data.point_times import TimeField, time_field_of
 
 _NUMBERS = {
     **{("F", 4): "<f4", ("F", 8): "<f8"},
@@ -60,7 +62,12 @@ class _Header:
 
 
 def read_pcd(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the points (n, 3) of a .pcd file with `DATA binary`, `binary_compressed` or `ascii`, NaN points included.
+    """Return the points (n, 3) of a .pcd file. Raises what `pcd_records` raises."""
+    return pcd_records(path).points
+
+
+def pcd_records(path: Path) -> Records:
+    """Return the points and times of a .pcd file with `DATA binary`, `binary_compressed` or `ascii`, NaN included.
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -87,9 +94,9 @@ def pcd_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
         content = mapped_content(path)
         header, body = _split(content)
         if header.encoding != "binary":
-            yield _decode(content).astype(np.float64)
+            yield _decode(content).points.astype(np.float64)
             return
-        points = _binary_records(header, body)
+        points = _binary_records(header, body, AXES)
         yield from blocks_of(points, AXES)
     except ValueError as error:
         raise ValueError(f"{path}: expected a .pcd file of a map, preferably DATA binary, found {error}") from error
@@ -104,16 +111,18 @@ def _split(content: bytes | memoryview) -> tuple[_Header, bytes | memoryview]:
     return _parse_header(text, data[1].decode(errors="replace")), content[data.end() :]
 
 
-def _decode(content: bytes | memoryview) -> Float32[np.ndarray, "n 3"]:
+def _decode(content: bytes | memoryview) -> Records:
     header, body = _split(content)
     check_points(header.points, bytes_each=sum(field.width for field in header.fields))
+    time = time_field_of([field.name for field in header.fields if field.count == 1])
+    names = (*AXES, *([] if time is None else [time]))
     if header.encoding == "binary":
-        points = _binary_records(header, body)
-        return _rows([points[axis] for axis in AXES])
+        found = _binary_records(header, body, names)
+        return _records([found[name] for name in names], time)
     if header.encoding == "binary_compressed":
-        return _decode_compressed(header, bytes(body))
+        return _records(_decode_compressed(header, bytes(body), names), time)
     if header.encoding == "ascii":
-        return _decode_ascii(header, bytes(body))
+        return _records(_decode_ascii(header, bytes(body), names), time)
     raise ValueError(f"expected DATA binary, binary_compressed or ascii, found {header.encoding}")
 
 
@@ -166,15 +175,15 @@ def _parse_fields(words: dict[str, list[str]]) -> tuple[_Field, ...]:
     return fields
 
 
-def _binary_records(header: _Header, body: bytes | memoryview) -> np.ndarray:
-    """Records with the fields x, y and z."""
+def _binary_records(header: _Header, body: bytes | memoryview, names: Sequence[str]) -> np.ndarray:
+    """Records with the named fields."""
     offsets = list(accumulate((field.width for field in header.fields), initial=0))
-    axes = {field.name: column for column, field in enumerate(header.fields) if field.name in AXES}
+    wanted = {field.name: column for column, field in enumerate(header.fields) if field.name in names}
     record = np.dtype(
         {
-            "names": list(axes),
-            "formats": [_number(header.fields[column]) for column in axes.values()],
-            "offsets": [offsets[column] for column in axes.values()],
+            "names": list(wanted),
+            "formats": [_number(header.fields[column]) for column in wanted.values()],
+            "offsets": [offsets[column] for column in wanted.values()],
             "itemsize": offsets[-1],
         }
     )
@@ -184,8 +193,11 @@ def _binary_records(header: _Header, body: bytes | memoryview) -> np.ndarray:
     return np.frombuffer(body, record, header.points)
 
 
-def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
-    """Decode two sizes and LZF data. The data contains one field after another: all x, all y and so on."""
+def _decode_compressed(header: _Header, body: bytes, names: Sequence[str]) -> list[np.ndarray]:
+    """Decode two sizes and LZF data, and return the named columns.
+
+    The data contains one field after another: all x, all y and so on.
+    """
     if len(body) < 8:
         raise ValueError(f"expected two sizes before the points, found {len(body)} bytes")
     packed, size = (int(number) for number in np.frombuffer(body, "<u4", count=2))
@@ -202,27 +214,28 @@ def _decode_compressed(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3
     found = {
         field.name: np.frombuffer(columns, _number(field), count=header.points, offset=start)
         for field, start in zip(fitting[0], starts, strict=False)
-        if field.name in AXES
+        if field.name in names
     }
-    return _rows([found[axis] for axis in AXES])
+    return [found[name] for name in names]
 
 
-def _decode_ascii(header: _Header, body: bytes) -> Float32[np.ndarray, "n 3"]:
+def _decode_ascii(header: _Header, body: bytes, names: Sequence[str]) -> list[np.ndarray]:
     lines = text_lines(body)
     words = len(lines[0].split()) if lines else 0
     padded = words == sum(field.count for field in header.fields)
     fields = header.fields if padded or words != sum(field.count for field in header.unpadded) else header.unpadded
     offsets = list(accumulate((field.count for field in fields), initial=0))
     rows = number_rows(lines, rows=header.points, columns=offsets[-1])
-    names = [field.name for field in fields]
-    return _rows([rows[:, offsets[names.index(axis)]] for axis in AXES])
+    order = [field.name for field in fields]
+    return [rows[:, offsets[order.index(name)]] for name in names]
 
 
 def _number(field: _Field) -> str:
     return _NUMBERS[field.kind, field.size]
 
 
-def _rows(axes: Sequence[np.ndarray]) -> Float32[np.ndarray, "n 3"]:
-    """Points of the columns x, y and z."""
+def _records(columns: Sequence[np.ndarray], time: str | None) -> Records:
+    """Points of the columns x, y, z, and the times in the column after them if it has a name."""
     with np.errstate(over="ignore", invalid="ignore"):  # invalid points are dropped by the callers
-        return np.stack([axis.astype(np.float32) for axis in axes], axis=1)
+        points = np.stack([axis.astype(np.float32) for axis in columns[:3]], axis=1)
+    return Records(points, None, None if time is None else TimeField(time, columns[3].copy()))

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
 from sglpr_jax.data.formats.scan_size import blocks_of, check_points, mapped_content, read_content
+from sglpr_jax.data.point_times import TimeField, time_field_of
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -51,7 +53,12 @@ class _Element:
 
 
 def read_ply(path: Path) -> Float32[np.ndarray, "n 3"]:
-    """Return the vertices (n, 3) of a .ply file, NaN included. The axes are not changed.
+    """Return the vertices (n, 3) of a .ply file. Raises what `ply_records` raises."""
+    return ply_records(path).points
+
+
+def ply_records(path: Path) -> Records:
+    """Return the vertices of a .ply file and their times, NaN included. The axes are not changed.
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -78,9 +85,9 @@ def ply_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
         content = mapped_content(path)
         order, elements, body = _split(content)
         if order == "ascii":
-            yield _decode(content).astype(np.float64)
+            yield _decode(content).points.astype(np.float64)
             return
-        points = _binary_records(body, elements, _ORDERS[order])
+        points = _binary_records(body, elements, _ORDERS[order], "xyz")
         yield from blocks_of(points, "xyz")
     except ValueError as error:
         raise ValueError(f"{path}: expected a .ply file of a map, preferably binary, found {error}") from error
@@ -95,16 +102,22 @@ def _split(content: bytes | memoryview) -> tuple[str, list[_Element], bytes | me
     return *_parse_header(lines[1:]), content[end.end() :]
 
 
-def _decode(content: bytes | memoryview) -> Float32[np.ndarray, "n 3"]:
+def _decode(content: bytes | memoryview) -> Records:
     order, elements, body = _split(content)
     at = _index_of_vertices(elements)
-    columns = _columns(elements[at])
+    properties = [name for name, _ in elements[at].properties]
+    time = time_field_of([name for name in properties if properties.count(name) == 1])
+    names = (*"xyz", *([] if time is None else [time]))
+    columns = _columns(elements[at], names)
     check_points(elements[at].count, bytes_each=sum(elements[at].sizes))
     if order == "ascii":
-        return _read_text(bytes(body), elements[:at], elements[at], elements[at + 1 :])[:, columns]
-    records = _binary_records(body, elements, _ORDERS[order])
+        found = list(_read_text(bytes(body), elements[:at], elements[at], elements[at + 1 :])[:, columns].T)
+    else:
+        records = _binary_records(body, elements, _ORDERS[order], names)
+        found = [records[name] for name in names]
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        points = np.stack(found[:3], axis=1).astype(np.float32)
+    return Records(points, None, None if time is None else TimeField(time, found[3].copy()))
 
 
 def _parse_header(lines: Sequence[str]) -> tuple[str, list[_Element]]:
@@ -136,24 +149,26 @@ def _index_of_vertices(elements: Sequence[_Element]) -> int:
     return names.index("vertex")
 
 
-def _columns(vertices: _Element) -> list[int]:
-    """Columns of x, y and z. Other properties may appear twice."""
+def _columns(vertices: _Element, wanted: Sequence[str]) -> list[int]:
+    """Columns of the wanted properties, x, y and z among them. Other properties may appear twice."""
     names = [name for name, _ in vertices.properties]
     if any(names.count(axis) != 1 for axis in "xyz"):
         raise ValueError(f"expected vertices with x, y and z, found {' '.join(names) or 'none'}")
-    return [names.index(axis) for axis in "xyz"]
+    return [names.index(name) for name in wanted]
 
 
-def _binary_records(body: bytes | memoryview, elements: Sequence[_Element], order: str) -> np.ndarray:
-    """Records of the vertices with the fields x, y and z."""
+def _binary_records(
+    body: bytes | memoryview, elements: Sequence[_Element], order: str, names: Sequence[str]
+) -> np.ndarray:
+    """Records of the vertices with the named properties."""
     at = _index_of_vertices(elements)
-    vertices, columns = elements[at], _columns(elements[at])
+    vertices, columns = elements[at], _columns(elements[at], names)
     body = body[sum(element.bytes for element in elements[:at]) :]
     offsets = list(accumulate(vertices.sizes, initial=0))
     kinds = [order + _TYPES[kind] for _, kind in vertices.properties]
     record = np.dtype(
         {
-            "names": list("xyz"),
+            "names": list(names),
             "formats": [kinds[column] for column in columns],
             "offsets": [offsets[column] for column in columns],
             "itemsize": offsets[-1],
@@ -202,14 +217,12 @@ def _size(kind: str) -> int:
 
 def _read_text(
     body: bytes, before: Sequence[_Element], vertices: _Element, behind: Sequence[_Element]
-) -> Float32[np.ndarray, "n columns"]:
+) -> Float64[np.ndarray, "n columns"]:
     """All properties of the vertices. Each instance of an element is a line."""
     skipped = sum(element.count for element in before)
     lines = text_lines(body)
     _check_end(len(lines), skipped + vertices.count + sum(element.count for element in behind), unit="lines")
-    rows = number_rows(lines[skipped : skipped + vertices.count], rows=vertices.count, columns=len(vertices.properties))
-    with np.errstate(over="ignore", invalid="ignore"):
-        return rows.astype(np.float32)
+    return number_rows(lines[skipped : skipped + vertices.count], rows=vertices.count, columns=len(vertices.properties))
 
 
 def _check_end(found: int, most: int, *, unit: str) -> None:

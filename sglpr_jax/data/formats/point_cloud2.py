@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 
 from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.scan_size import check_points
+from sglpr_jax.data.point_times import FIELDS, TimeField, time_field_of
 from sglpr_jax.data.warning import warn
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -20,7 +21,7 @@ _LASERS = ("ring", "channel", "line", "laser_id", "laser")
 
 
 def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
-    """Return the points (n, 3) in the axes of the message, and their lasers if the message has a laser field.
+    """Return the points (n, 3) in the axes of the message, and their lasers and times if the message has such fields.
 
     Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
     returned, with a warning.
@@ -40,10 +41,12 @@ def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
         if _in_metres(others):
             warn(f"{name}: expected big-endian points, as is_bigendian states, found little-endian points")
             records = others
-    laser = next((field for field in _LASERS if field in (records.dtype.names or ())), None)
+    names = records.dtype.names or ()
+    laser, time = next((field for field in _LASERS if field in names), None), time_field_of(names)
+    times = None if time is None else TimeField(time, records[time].copy())
     with np.errstate(over="ignore", invalid="ignore"):
         points = np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
-        return Records(points, None if laser is None else records[laser].astype(np.int32))
+        return Records(points, None if laser is None else records[laser].astype(np.int32), times)
 
 
 def described_fields(message: Any) -> str:
@@ -74,6 +77,7 @@ def _record(message: Any, order: str) -> np.dtype:
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
     wanted = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
+    wanted += [name for name in FIELDS if name in fields and fields[name].datatype in _TYPES]
     types = [_TYPES.get(fields[name].datatype) for name in wanted]
     if None in types:
         raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")

@@ -14,6 +14,7 @@ from sglpr_jax.data.formats.bounded_file import BoundedPath
 from sglpr_jax.data.formats.inflation import bound_bags
 from sglpr_jax.data.formats.livox import CUSTOM_MSG, POINT, read_custom_msg
 from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
+from sglpr_jax.data.formats.ros_imu import IMU, ImuMessages
 from sglpr_jax.data.formats.ros_message import RosMessage
 from sglpr_jax.data.formats.ros_poses import POSES, TRANSFORMS, read_transforms
 from sglpr_jax.data.formats.ros_tracks import Stamps, Track, tracks_of
@@ -75,6 +76,16 @@ class RosBag:
     def pose_topics(self) -> tuple[str, ...]:
         """Pose topics."""
         return tuple(sorted(topic for topic, kind in self.topics.items() if kind in POSES))
+
+    @property
+    def imu_topics(self) -> tuple[str, ...]:
+        """IMU topics."""
+        return tuple(sorted(topic for topic, kind in self.topics.items() if kind == IMU))
+
+    def imu(self, topic: str) -> ImuMessages:
+        """Read the messages of an IMU topic, in one pass over the bag. Raises ValueError if the bag is broken."""
+        with self._lock, _broken(self.paths[0]):
+            return ImuMessages.of(self._messages(topic))
 
     def stamps(self, topic: str) -> Stamps:
         """Read the timestamps of a topic, in one pass over the bag. Raises ValueError if the bag is broken."""

@@ -6,13 +6,15 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int, Int64
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.ros_poses import StampedPose
-from sglpr_jax.data.formats.timed_poses import poses_of
+from sglpr_jax.data.formats.timed_poses import interpolate, poses_of
 from sglpr_jax.data.times import doubt
 
+LEAST_SHARE = 0.5
+"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
 UNIT = 0.01
 """Maximum deviation of the length of a quaternion from 1."""
 
@@ -24,6 +26,10 @@ class Stamps(NamedTuple):
     """Times of the recorder, in nanoseconds."""
     own: Float[np.ndarray, " n"]
     """Times in the headers of the messages, in seconds."""
+
+    def of(self, rows: Int[np.ndarray, " m"]) -> "Stamps":
+        """Stamps of some messages."""
+        return Stamps(self.recorded[rows], self.own[rows])
 
     @property
     def orderly(self) -> bool:
@@ -61,7 +67,7 @@ class Track:
         """
         given = list(found)
         placed = [(time, pose) for time, pose in given if np.isfinite(pose.numbers[:3]).all()]
-        valid = _are_unit([pose.numbers[3:] for _, pose in placed])
+        valid = are_unit([pose.numbers[3:] for _, pose in placed])
         turned = [one for one, fits in zip(placed, valid, strict=True) if fits]
         kept = turned if 2 * len(turned) > len(placed) else placed
         numbers = np.array([pose.numbers for _, pose in kept], np.float64).reshape(-1, 7)
@@ -75,7 +81,7 @@ class Track:
     @property
     def turned(self) -> bool:
         """Whether the quaternions are valid rotations that change. A GPS receiver writes zeros or a constant."""
-        return bool(len(self) and _are_unit(self.quaternions).all() and np.ptp(self.quaternions, axis=0).any())
+        return bool(len(self) and are_unit(self.quaternions).all() and np.ptp(self.quaternions, axis=0).any())
 
     @property
     def moves(self) -> bool:
@@ -87,7 +93,7 @@ class Track:
         return f"{len(self)} poses of {self.child or 'a body'} in {self.frame or 'a frame'}"
 
 
-def _are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
+def are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
     """Whether each quaternion has length 1."""
     with np.errstate(invalid="ignore", over="ignore"):
         lengths = np.linalg.norm(np.reshape(np.asarray(quaternions, np.float64), (-1, 4)), axis=1)
@@ -101,6 +107,15 @@ def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
         named = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
         found[named.child, named.frame].append((time, named))
     return [Track.of(poses) for _, poses in sorted(found.items())]
+
+
+def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
+    """Times of messages and of scans in seconds: header times, or recorder times if the headers do not overlap."""
+    if scans.orderly and stamps.orderly:
+        own = interpolate(stamps.own, np.zeros((len(stamps.own), 3)), scans.own)
+        if own.kept.mean() >= LEAST_SHARE:
+            return stamps.own, scans.own
+    return stamps.recorded / 1e9, scans.recorded / 1e9
 
 
 def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:

@@ -8,19 +8,19 @@ from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.arrays import read_npy, read_npz
-from sglpr_jax.data.formats.bin_records import is_record, read_records
-from sglpr_jax.data.formats.las import read_las
-from sglpr_jax.data.formats.pcd import read_pcd
-from sglpr_jax.data.formats.ply import read_ply
+from sglpr_jax.data.formats.bin_records import Records, is_record, read_records
+from sglpr_jax.data.formats.las import las_records
+from sglpr_jax.data.formats.pcd import pcd_records
+from sglpr_jax.data.formats.ply import ply_records
 from sglpr_jax.data.formats.record_size import record_of_scan
 from sglpr_jax.fields import check_value
 
-READERS: dict[ScanFormat, Callable[[Path], Float32[np.ndarray, "n 3"]]] = {
-    "pcd": read_pcd,
-    "ply": read_ply,
-    "npy": read_npy,
-    "npz": read_npz,
-    "las": read_las,
+READERS: dict[ScanFormat, Callable[[Path], Records]] = {
+    "pcd": pcd_records,
+    "ply": ply_records,
+    "npy": lambda path: Records(read_npy(path), None),
+    "npz": lambda path: Records(read_npz(path), None),
+    "las": las_records,
 }
 """Readers of formats with a header. The name of each format is also its file ending."""
 ENDINGS = (".bin", ".pcd", ".ply")
@@ -85,13 +85,11 @@ def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.nd
       ImportError: If the file is a .las file and the extra `las` is not installed.
     """
     path = Path(path)
-    return read_points_and_lasers(path, format=found_format(path) if format == "auto" else format)[0]
+    return read_scan_records(path, format=found_format(path) if format == "auto" else format).points
 
 
-def read_points_and_lasers(
-    path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti"
-) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None]:
-    """Return the points of a scan of a recording in metres, and the laser number of each point.
+def read_scan_records(path: Path, *, format: ScanFormat = "auto", records: RecordFormat = "kitti") -> Records:
+    """Return the points of a scan of a recording in metres, with their laser numbers and times.
 
     Raises what `read_scan` raises, except that `format` "auto" does not use the content.
 
@@ -101,7 +99,7 @@ def read_points_and_lasers(
       records: Format of .bin files whose name does not define it, for "auto".
 
     Returns:
-      Points, and laser numbers from the file (nuscenes, nclt) or None.
+      Points, laser numbers from the file (nuscenes, nclt) or None, and times from the file (pcd, ply, las) or None.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a scan, found none")
@@ -109,7 +107,7 @@ def read_points_and_lasers(
     known = guess_format(path, records=records) if format == "auto" else format
     if is_record(known):
         return read_records(path, known)
-    return READERS[known](path), None
+    return READERS[known](path)
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:

@@ -50,6 +50,7 @@ def open_recording(
     times: Path | str | None = None,
     time_unit: TimeUnit = "auto",
     pose_topic: str | None = None,
+    imu_topic: str | None = None,
 ) -> Recording:
     """Open one sequence of `root`, in any supported layout.
 
@@ -67,11 +68,12 @@ def open_recording(
       times: File of timestamps of a plain folder, if it is not beside the scans.
       time_unit: Unit of the times in text files of a plain folder or of KITTI's layout. "auto" expects seconds.
       pose_topic: Pose topic of a bag. By default, the topic that covers the largest number of scans is used.
+      imu_topic: IMU topic of a bag, for the gravity of each scan. By default, the one beside the LiDAR's topic is used.
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, if times decrease, or if `poses`, `times` or `pose_topic` does not apply to
-        the layout.
+      ValueError: If a file is malformed, if times decrease, or if `poses`, `times` or a topic does not apply to the
+        layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 
     Example:
@@ -87,10 +89,11 @@ def open_recording(
     given = next((path for path in (poses, times) if path is not None), None)
     if given is not None and not reader.takes_poses:
         raise ValueError(f"{given}: expected poses or times for a plain folder of scans, found {root}: {reader.layout}")
-    if pose_topic is not None and not reader.takes_pose_topic:
-        raise ValueError(f"{root}: expected a bag with the pose topic {pose_topic}, found {reader.layout}")
+    for kind, topic in (("pose", pose_topic), ("IMU", imu_topic)):
+        if topic is not None and not reader.takes_topics:
+            raise ValueError(f"{root}: expected a bag with the {kind} topic {topic}, found {reader.layout}")
     pose_file, times_file = (None if path is None else Path(path) for path in (poses, times))
-    options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, time_unit, pose_topic)
+    options = ReadOptions(pose_source, format, pose_file, pose_format, times_file, time_unit, pose_topic, imu_topic)
     recording = reader.open(root, name, options)
     if recording.times is not None:
         check_order(recording.times, source=f"{root}, sequence {name}")

@@ -12,20 +12,25 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.point_times import TimeField, time_field_of
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.readers.stamped import read_table, stamped_recording
 from sglpr_jax.data.recording import Recording
 
 RECORDS = {
-    "Avia": np.dtype([("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"), ("offset", "<u4")]),
-    "Aeva": np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset", "<i4"), ("line", "u1"), ("intensity", "<f4")]),
+    "Avia": np.dtype(
+        [("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"), ("offset_time", "<u4")]
+    ),
+    "Aeva": np.dtype(
+        [("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1"), ("intensity", "<f4")]
+    ),
     "Ouster": np.dtype(
         [("xyz", "<f4", 3), ("intensity", "<f4"), ("t", "<u4"), ("reflectivity", "<u2"), ("line", "<u2"), ("a", "<u2")]
     ),
     "Velodyne": np.dtype([("xyz", "<f4", 3), ("intensity", "<f4"), ("line", "<u2"), ("time", "<f4")]),
 }
 """Record of one point, for each sensor."""
-AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset", "<i4"), ("line", "u1")])
+AEVA_BEFORE = np.dtype([("xyz", "<f4", 3), ("more", "<f4", 2), ("offset_time", "<i4"), ("line", "u1")])
 AEVA_CHANGED = 1691936557946849179
 """Time in nanoseconds. Aeva scans up to this time have no intensities (`AEVA_BEFORE`)."""
 
@@ -61,7 +66,7 @@ def open_recording(root: Path, name: str) -> Recording:
 
 
 def read_points(path: Path, *, sensor: str) -> Records:
-    """Read the points of a scan and their line numbers.
+    """Read the points of a scan, their line numbers and their times.
 
     Raises:
       ValueError: If the file is empty or its size is not a multiple of the record size.
@@ -72,7 +77,9 @@ def read_points(path: Path, *, sensor: str) -> Records:
     if size == 0 or size % record.itemsize:
         raise ValueError(f"{path}: expected {record.itemsize} bytes a point ({sensor}), found {size} bytes in total")
     found = np.fromfile(path, record)
-    return Records(np.ascontiguousarray(found["xyz"], np.float32), found["line"].astype(np.int32))
+    time = time_field_of(record.names or ())
+    times = None if time is None else TimeField(time, found[time].copy())
+    return Records(np.ascontiguousarray(found["xyz"], np.float32), found["line"].astype(np.int32), times)
 
 
 READER = Reader(

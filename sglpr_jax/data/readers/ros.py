@@ -18,13 +18,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.formats.ros_bag import COMPRESSED, METADATA, RosBag
-from sglpr_jax.data.formats.ros_tracks import Stamps, Track, fixed_transform
+from sglpr_jax.data.formats.ros_tracks import LEAST_SHARE, Stamps, Track, fixed_transform, times_on_one_clock
 from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.formats.trajectory import check_height, check_order
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.readable import only
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.readers.ros_gravity import imu_topic_of, ups_of_scans
+from sglpr_jax.data.record import Record, found_record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
@@ -33,8 +34,6 @@ from sglpr_jax.files import naming
 ENDINGS = (".bag", ".mcap", ".db3")
 PAUSE_NS = 60 * 10**9
 """Minimum pause between two drives in a folder of bags, in nanoseconds. Parts of a drive follow each other at once."""
-LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -47,7 +46,7 @@ def recording_names(root: Path) -> tuple[str, ...]:
     return tuple(_recordings(root)) if bag_files(root) else ()
 
 
-def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> Recording:
+def open_recording(root: Path, name: str, *, pose_topic: str | None = None, imu_topic: str | None = None) -> Recording:
     """Open the point clouds of one topic, with poses if the bag has them.
 
     The bag is read once for the times and once for each topic of poses and of tf. If a pose topic is used, scans
@@ -57,9 +56,11 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
       root: File or folder of the bag.
       name: Name of the recording, from `recording_names`.
       pose_topic: Pose topic. By default, the topic that covers the largest number of scans is used.
+      imu_topic: Topic of the IMU. By default, the one whose name has most in common with that of the LiDAR is used.
 
     Raises:
-      ValueError: If the bag is broken, the topic has no messages, or `pose_topic` covers less than half of the scans.
+      ValueError: If the bag is broken, the topic has no messages, `pose_topic` covers less than half of the scans, or
+        `imu_topic` does not exist.
       ImportError: If the extra `ros` is not installed.
     """
     bag, topic = _recordings(root)[name]
@@ -84,7 +85,12 @@ def open_recording(root: Path, name: str, *, pose_topic: str | None = None) -> R
         found=(f"format: {topic} of {bag.name}, {bag.fields(topic, int(recorded[0]))}",),
     )
     lidar = bag.frame(topic, int(recorded[0])).strip("/")
-    return _with_poses(recording, bag, stamps, pose_topic, lidar)
+    posed = _with_poses(recording, bag, stamps, pose_topic, lidar)
+    imu = imu_topic_of(bag, topic, imu_topic)
+    if imu is None:
+        return posed
+    options = {"scans": stamps.of(posed.numbers), "lidar": lidar, "required": imu_topic is not None}
+    return dataclasses.replace(posed, read_ups=partial(ups_of_scans, bag, imu, **options))
 
 
 def _times(stamps: Stamps, source: str) -> Float[np.ndarray, " n"] | None:
@@ -145,7 +151,7 @@ class _Placed(NamedTuple):
     @classmethod
     def at(cls, scans: Stamps, track: Track) -> "_Placed":
         """Interpolate the track at the times of the scans."""
-        clocks = _clocks(track, scans)
+        clocks = times_on_one_clock(track.stamps, scans)
         return cls(track, clocks, *interpolate(clocks[0], track.positions, clocks[1]))
 
     @property
@@ -214,15 +220,6 @@ def _tracks_of_lidar(transforms: list[Track], lidar: str) -> dict[str, Track]:
     }
 
 
-def _clocks(track: Track, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
-    """Times of the poses and of the scans in seconds: header times, or recorder times if the headers do not overlap."""
-    if scans.orderly and track.stamps.orderly:
-        own = interpolate(track.stamps.own, track.positions, scans.own)
-        if own.kept.mean() >= LEAST_SHARE:
-            return track.stamps.own, scans.own
-    return track.stamps.recorded / 1e9, scans.recorded / 1e9
-
-
 def _of_lidar(placed: _Placed, transforms: list[Track], lidar: str) -> tuple[Float[np.ndarray, "q 4 4"] | None, str]:
     """Poses of the LiDAR, or None if the track has no rotations; and a description of how they were computed."""
     track, (poses_s, scans_s) = placed.track, placed.clocks
@@ -250,14 +247,16 @@ def _read(
     time, nth = where[path.name]
     with naming(f"scan {path.name}"):
         found = bag.cloud(topic, time, nth)
-    return Record(points=found.points, lasers=found.lasers if lasers else None)
+    return found_record(found, lasers=lasers)
 
 
 READER = Reader(
     layout="*.bag, *.mcap or a folder of ROS 2 (ROS)",
     recording_names=recording_names,
-    open=lambda root, name, options: open_recording(root, name, pose_topic=options.pose_topic),
+    open=lambda root, name, options: open_recording(
+        root, name, pose_topic=options.pose_topic, imu_topic=options.imu_topic
+    ),
     knows_mounting=False,
     rank=8,
-    takes_pose_topic=True,
+    takes_topics=True,
 )

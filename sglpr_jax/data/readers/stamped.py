@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64
 from sglpr_jax.data.formats.bin_records import Records
 from sglpr_jax.data.formats.timed_poses import match_times
 from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.record import Record, found_record
 from sglpr_jax.data.recording import Recording
 
 MAX_GAP_S = 0.1
@@ -69,8 +69,7 @@ def stamped_recording(
 
 
 def _read(path: Path, labels: Path | None, lasers: bool, *, read_points: Callable[[Path], Records]) -> Record:
-    found = read_points(path)
-    return Record(points=found.points, lasers=found.lasers if lasers else None)
+    return found_record(read_points(path), lasers=lasers)
 
 
 def read_table(path: Path, *, columns: int, header_lines: int = 0) -> tuple[Int64[np.ndarray, " n"], np.ndarray]:

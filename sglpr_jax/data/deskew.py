@@ -1,0 +1,173 @@
+"""Removes the motion of the sensor within a scan, by the times of the points and a trajectory.
+
+A scan takes about .1 s, and each point is relative to the pose of the sensor when the point was measured. `deskew`
+moves the points of a scan into the frame of one pose. `deskewed` does so for a recording, with the poses of its scans.
+"""
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from sglpr_jax.data.given_poses import poses_of_scans
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+
+TICK_S = 2e-5
+"""Resolution of the times of points, in seconds. A point at 50 m moves by 3 mm in this time if the sensor turns by 180
+degrees a second."""
+WIDEST_S = 1.0
+"""Maximum time between two scans with constant velocity between them, in seconds."""
+DESKEWED = "deskewed"
+"""Name of the read option that describes the trajectory of a deskewed recording."""
+TRIED = 5
+"""Number of scans in which times of points are searched, if the scans before are unreadable."""
+
+
+def deskew(
+    points: Float32[np.ndarray, "n 3"],
+    point_times: Float[np.ndarray, " n"],
+    *,
+    time: float,
+    pose_times: Float[np.ndarray, " m"],
+    world_from_lidar: Float[np.ndarray, "m 4 4"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Move the points of a scan to where the sensor sees them from its pose at the time of the scan.
+
+    Arguments:
+      points: Points in metres, each in the frame of the LiDAR when the point was measured. NaN stays NaN.
+      point_times: Time of each point relative to `time`, in seconds.
+      time: Time of the scan, in seconds.
+      pose_times: Times of the poses in seconds, in increasing order.
+      world_from_lidar: Poses of the LiDAR in a fixed frame. Between two poses, and beyond the first and the last one,
+        the velocity is constant.
+
+    Returns:
+      Points in the frame of the LiDAR at `time`.
+
+    Raises:
+      ValueError: If there are less than two poses or their times do not increase.
+
+    Example:
+      still = sglpr_jax.deskew(points, seconds, time=8.3, pose_times=np.array([8.3, 8.4]), world_from_lidar=poses)
+    """
+    if len(pose_times) < 2 or len(pose_times) != len(world_from_lidar) or not (np.diff(pose_times) > 0).all():
+        raise ValueError(
+            f"deskew: expected two poses or more at increasing times, found {len(world_from_lidar)} poses and "
+            f"{len(pose_times)} times"
+        )
+    ticks = np.rint(np.asarray(point_times, np.float64) / TICK_S).astype(np.int64)
+    first = int(ticks.min(initial=0))
+    times = time + TICK_S * np.arange(first, int(ticks.max(initial=0)) + 1)
+    poses = poses_at(np.append(times, time), pose_times, world_from_lidar)
+    scan_from_lidar = np.linalg.solve(poses[-1], poses[:-1])[:, :3].astype(np.float32)[ticks - first]
+    with np.errstate(invalid="ignore"):
+        return np.einsum("nij,nj->ni", scan_from_lidar[:, :, :3], points) + scan_from_lidar[:, :, 3]
+
+
+def poses_at(
+    times: Float[np.ndarray, " q"], pose_times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"]
+) -> Float[np.ndarray, "q 4 4"]:
+    """Interpolate poses at `times`. The linear and angular velocity in the moving frame is constant between two poses.
+
+    Before the first and after the last pose, the velocity is that of the nearest two. `pose_times` must increase.
+    """
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+
+    segments, which = np.unique((np.searchsorted(pose_times, times) - 1).clip(0, len(poses) - 2), return_inverse=True)
+    start_from_end = np.linalg.solve(poses[segments], poses[segments + 1])
+    turns = Rotation.from_matrix(start_from_end[:, :3, :3]).as_rotvec()
+    shifts = np.linalg.solve(_mean_rotations(turns), start_from_end[:, :3, 3:])
+    widths = pose_times[segments + 1] - pose_times[segments]
+    shares = (times - pose_times[segments[which]]) / widths[which]
+    turned = shares[:, None] * turns[which]
+    moved = np.tile(np.eye(4), (len(times), 1, 1))
+    moved[:, :3, :3] = Rotation.from_rotvec(turned).as_matrix()
+    moved[:, :3, 3:] = _mean_rotations(turned) @ (shares[:, None, None] * shifts[which])
+    return poses[segments[which]] @ moved
+
+
+def _mean_rotations(turns: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Mean of the rotations from none to each rotation vector. It maps a constant velocity to a translation."""
+    angles = np.linalg.norm(turns, axis=1).clip(min=1e-6)[:, None, None]  # smaller angles have the same mean
+    x, y, z = turns.T
+    nothing = np.zeros_like(x)
+    cross = np.array([[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]).transpose(2, 0, 1)
+    first, second = (1 - np.cos(angles)) / angles**2, (angles - np.sin(angles)) / angles**3
+    return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+def deskewed(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4 4"]) -> Recording:
+    """Return a recording whose scans have no motion within them: scan i is seen from pose i.
+
+    Scans are corrected when they are read. A scan without a neighbour within a second is not changed.
+
+    Arguments:
+      recording: Recording of scans with times, whose points have times (`Record.point_times`).
+      world_from_lidar: Pose of the LiDAR at the time of each scan, from odometry or a map.
+
+    Raises:
+      ValueError: If scans or points have no times, if the recording has ready-made images, or if the poses have another
+        length or no rotations.
+
+    Example:
+      recording = sglpr_jax.deskewed(recording, sglpr_jax.read_odometry("odometry.tum"))
+    """
+    poses = poses_of_scans(recording, world_from_lidar, use=DESKEWED)
+    if recording.times is None:
+        raise ValueError(f"sequence {recording.name}: expected times of the scans to remove their motion, found none")
+    _check_point_times(recording)
+    read = _DeskewedReader(recording, recording.times, poses)
+    alone = sum(len(_neighbours(recording.times, row)) < 2 for row in range(len(recording)))
+    left = f", but {alone} of {len(recording)} scans have no neighbour within {WIDEST_S:g} s" if alone else ""
+    said = f"deskewed: the motion within each scan is removed by its poses{left}"
+    return dataclasses.replace(recording, read=read, on_disk=False, found=(*recording.found, said))
+
+
+class _DeskewedReader:
+    """Reads scans without the motion within them."""
+
+    def __init__(self, recording: Recording, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"]):
+        self._recording, self._times, self._poses = recording, times, poses
+        self._row_of = {path: row for row, path in enumerate(recording.paths)}
+        digest = hashlib.sha256(times.tobytes() + poses.tobytes()).hexdigest()[:16]
+        self.keywords = {**recording.read_options, DESKEWED: digest}
+        """Read options, which identify a recording (`Recording.read_options`)."""
+
+    def __call__(self, path: Path, label_path: Path | None, lasers: bool) -> Record:
+        """Read the scan at `path`. Its points have no times any more."""
+        row = self._row_of[path]
+        record = self._recording.read(path, label_path, lasers)
+        name, time = f"scan {self._recording.ids[row]} of sequence {self._recording.name}", float(self._times[row])
+        point_times = dataclasses.replace(record, name=name, time=time).point_times
+        if point_times is None or record.points is None:
+            raise ValueError(f"{name}: expected times of the points, found none")
+        rows = _neighbours(self._times, row)
+        if len(rows) < 2:
+            return dataclasses.replace(record, time_field=None)
+        trajectory = {"pose_times": self._times[rows], "world_from_lidar": self._poses[rows]}
+        points = deskew(record.points, point_times, time=time, **trajectory)
+        return dataclasses.replace(record, points=points, time_field=None)
+
+
+def _neighbours(times: Float[np.ndarray, " n"], row: int) -> list[int]:
+    """The scan at `row` and the scans before and after it within `WIDEST_S`."""
+    before, after = np.searchsorted(times, times[row], "left") - 1, np.searchsorted(times, times[row], "right")
+    rows = [int(one) for one in (before, row, after) if 0 <= one < len(times)]
+    return [one for one in rows if abs(times[one] - times[row]) <= WIDEST_S]
+
+
+def _check_point_times(recording: Recording) -> None:
+    """Raise ValueError if the points of the first readable scan have no times."""
+    for row in range(min(len(recording), TRIED)):
+        try:
+            record = recording.record(row, labels=False)
+        except (ValueError, OSError):  # whoever reads the scans decides about bad ones
+            continue
+        if record.point_times is None:
+            raise ValueError(
+                f"sequence {recording.name}: expected times of the points to remove the motion within scans, found none"
+            )
+        return
