@@ -144,14 +144,14 @@ class Speed:
         rules = finder.config.rivals
         sizes = finder.config.candidates + 1, rules.of_query + rules.of_match
         spectra = query_spectra(image)
-        peak = finder.search(spectra, [image], 1).one(0)
+        peak = finder.comparer.search(spectra, [image], 1).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
             ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None))),
             ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
-            ("comparison", lambda i: finder.search(spectra, [image] * sizes[0], sizes[0])),
+            ("comparison", lambda i: finder.comparer.search(spectra, [image] * sizes[0], sizes[0])),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),
-            ("rivals", lambda i: finder.search(spectra, [image] * sizes[1], sizes[1])),
+            ("rivals", lambda i: finder.comparer.search(spectra, [image] * sizes[1], sizes[1])),
             ("all of it", lambda i: detector.add(records[i % 20], time=float(next(clock)))),
         ):
             work(0)

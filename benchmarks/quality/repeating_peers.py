@@ -28,6 +28,7 @@ from benchmarks.quality.map_closures import peer_python, run_peer
 from benchmarks.quality.repeating import REVISIT_M, revisits
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.comparison import Comparer
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.probability import DEFAULTS, models
 from sglpr_jax.loops.seen import Seen
@@ -48,24 +49,30 @@ DRIVES = tuple(
 )
 
 
-class ScanContextFinder(CandidateFinder):
-    """Candidates by Scan Context: its distance over all rotations."""
-
-    def __init__(self, params: Params):
-        super().__init__(params)
-        self.stored = StoredScans(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
-
-    def seen(self, record: Record) -> Seen:
-        """The matrix of Scan Context in place of the descriptor."""
-        return super().seen(record)._replace(descriptor=scan_context(np.asarray(record.points)[:, :3]))
+class ByScanContext(Comparer):
+    """Comparison with the nearest scans by Scan Context."""
 
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
         """Up to k frames that are nearest over all rotations, in order."""
         allowed = np.flatnonzero(~excluded)
-        apart = scan_context_distance(descriptor[None], self.index.descriptors[allowed])[0]
+        apart = scan_context_distance(descriptor[None], self.stored.index.descriptors[allowed])[0]
         return allowed[np.argsort(apart, kind="stable")[:k]]
+
+
+class ScanContextFinder(CandidateFinder):
+    """Candidates by Scan Context: its distance over all rotations."""
+
+    def __init__(self, params: Params):
+        super().__init__(params)
+        self.stored = StoredScans(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
+        known = self.comparer
+        self.comparer = ByScanContext(self.stored, self.motion, known.config, known.verification, known.drift)
+
+    def seen(self, record: Record) -> Seen:
+        """The matrix of Scan Context in place of the descriptor."""
+        return super().seen(record)._replace(descriptor=scan_context(np.asarray(record.points)[:, :3]))
 
 
 @dataclasses.dataclass(frozen=True)

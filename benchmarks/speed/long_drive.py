@@ -116,7 +116,7 @@ class WithoutImages(CandidateFinder):
 
     def _compared(self, seen, time, position, pose, clock) -> Compared:
         query = len(self)
-        rows = self.similar(seen.descriptor, self._excluded(time, position))
+        rows = self.comparer.similar(seen.descriptor, self._excluded(time, position))
         link = None if pose is not None or not query else self._peak(query, self.motion.keyframe)
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows) or not self._drive.closes:
