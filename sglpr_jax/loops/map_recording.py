@@ -1,31 +1,19 @@
 """Creation of the map of a recording with known poses. It can skip unreadable scans, stop and resume."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
-from sglpr_jax.data.gravity import with_odometry
-from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.scaled import scaled
 from sglpr_jax.data.scan_stream import OnBadScan
-from sglpr_jax.loops.add_scans import add_scans
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.choices import SPACING_M
-from sglpr_jax.loops.given import check_is, given_poses
-from sglpr_jax.loops.mountings import mountings_of
-from sglpr_jax.loops.place_names import place_names
-from sglpr_jax.loops.place_scans import PlaceScans
+from sglpr_jax.loops.given import check_is
+from sglpr_jax.loops.mapped_scans import map_scans
 from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
-from sglpr_jax.retrieval.index import Index
 
 
 class Mapped(NamedTuple):
@@ -73,62 +61,15 @@ def map_recording(
       TypeError: If an argument is not a recording, parameters or an array.
     """
     check_is(recording, Recording, by="open_recording")
-    poses = given_poses(poses, of="poses")
-    if len(poses) != len(recording) or not len(recording):
-        raise ValueError(f"{recording.name}: expected a pose for each of {len(recording)} scans, found {len(poses)}")
-    check_level(poses, mountings_of(recording), name=recording.name)
-    recording = with_odometry(recording, poses)
-    finder = CandidateFinder(params)
-    chosen = PlaceScans(finder, poses[:, :3, 3], spacing_m)
-    seen_scans: list[Seen | None] = []
-
-    def add(seen: Seen | None, compared: Compared | None) -> None:
-        seen_scans.append(seen)
-        finder.add_seen(seen, compared=Compared([], None))
-
-    add_scans(
-        scaled(recording, scale),
-        finder,
-        add,
-        rows=chosen.unseen(),
-        kept_in=kept_in,
+    mapped = map_scans(
+        recording,
+        params,
+        poses,
+        spacing_m=spacing_m,
+        scale=scale,
         on_bad_scan=on_bad_scan,
+        kept_in=kept_in,
         should_stop=should_stop,
         on_progress=on_progress,
-        poses=poses,
-        spacing_m=spacing_m,
     )
-    on_progress(chosen.done)
-    if not chosen.rows and chosen.done == len(recording):
-        raise ValueError(
-            f"{recording.name}: expected at least one scan that is not empty, found {len(recording)} empty ones"
-        )
-    skipped = tuple(recording.ids[chosen.looked_at[frame]] for frame in finder.missing)
-    index = Index.empty(finder.index.width, weights_hash=finder.index.weights_hash, scale=scale)
-    return Mapped(_map_of(index, recording, poses, chosen, seen_scans), chosen.done, skipped)
-
-
-def _map_of(
-    index: Index,
-    recording: Recording,
-    poses: Float[np.ndarray, "n 4 4"],
-    chosen: PlaceScans,
-    seen: Sequence[Seen | None],
-) -> PlaceMap:
-    """Map of the chosen scans of a recording, with an index without places."""
-    places = [one for one in (seen[frame] for frame in chosen.frames) if one is not None]
-    names, rows = place_names(recording), chosen.rows
-    ids = [names[row] for row in rows]
-    descriptors = np.array([one.descriptor for one in places], np.float32).reshape(-1, index.width)
-    index.add(descriptors, ids=ids, positions=poses[rows, :3, 3])
-    images = [one.image for one in places]
-    sensors = [recording.mounting_of(row) or Mounting(MODEL_HEIGHT_M) for row in rows]
-    mountings = np.array([[sensor.height_m, *sensor.up] for sensor in sensors], np.float64).reshape(-1, 4)
-    deviations = [[sensor.height_deviation_m, sensor.tilt_deviation_deg] for sensor in sensors]
-    return PlaceMap(
-        index,
-        np.stack(images) if images else np.zeros((0, 0, 0), np.uint8),
-        poses[rows],
-        mountings,
-        np.array(deviations, np.float64).reshape(-1, 2),  # None becomes NaN
-    )
+    return Mapped(PlaceMap(*mapped.places), mapped.scans, mapped.skipped)

@@ -19,8 +19,9 @@ from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig
-from sglpr_jax.loops.given import given_record
+from sglpr_jax.loops.given import check_is, given_record
 from sglpr_jax.loops.loop import planar_loop
+from sglpr_jax.loops.mapped_scans import map_scans
 from sglpr_jax.loops.mountings import upright_from_lidar
 from sglpr_jax.loops.place_file import REQUIRED, read_places, write_places
 from sglpr_jax.loops.place_names import Content, free_names
@@ -85,10 +86,9 @@ class PlaceMap:
           scale: Factor for all lengths before scans are described, 1, 2 or 4.
           on_progress: Called with the number of scans done.
         """
-        from sglpr_jax.loops.map_recording import map_recording  # imports this module
-
-        options = {"spacing_m": spacing_m, "scale": scale, "on_progress": on_progress}
-        return map_recording(recording, params, poses, **options).places
+        check_is(recording, Recording, by="open_recording")
+        scans = map_scans(recording, params, poses, spacing_m=spacing_m, scale=scale, on_progress=on_progress)
+        return cls(*scans.places)
 
     def mounting(self, row: int = -1) -> Mounting:
         """Mounting of the sensor at a place, by default the last one."""
