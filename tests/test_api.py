@@ -53,6 +53,7 @@ def test_key_comes_first_and_options_are_named(name, signature):
             assert parameter.kind is parameter.KEYWORD_ONLY, parameter.name
 
 
+@pytest.mark.slow
 def test_the_readmes_lines(tmp_path):
     head = sglpr_jax.HeadConfig(channels=(8,), kernels=(4,), strides=(4,), cbam_reduction=4, clusters=4)
     grid = sglpr_jax.Grid(resolution_m=3.2, height=16, width=16)

@@ -71,6 +71,7 @@ clouds = hnp.arrays(np.float32, (CLOUD_SIZE, 3), elements=coordinates, fill=st.n
 labellings = hnp.arrays(np.int32, CLOUD_SIZE, elements=st.integers(0, 19))
 
 
+@pytest.mark.slow
 @hypothesis.settings(deadline=None, max_examples=100)
 @hypothesis.given(clouds, labellings, st.integers(0, CLOUD_SIZE))
 def test_any_cloud_equals_the_reference(points, labels, count):
@@ -117,6 +118,7 @@ def test_the_last_point_gives_the_label():
     np.testing.assert_array_equal(image, [[0, 3], [0, 0]])
 
 
+@pytest.mark.slow
 def test_batches_vmap_jit_and_eager_agree():
     rng = np.random.default_rng(0)
     points = rng.uniform(-3, 3, (2, 3, CLOUD_SIZE, 3)).astype(np.float32)
@@ -160,6 +162,7 @@ def test_a_grid_without_a_centre_is_refused(changed):
         Grid(**changed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", GRIDS)
 def test_real_scans_equal_the_reference(shared, grid):
     samples = shared / "data/samples"
@@ -184,6 +187,7 @@ def test_a_real_scan_with_points_that_are_not_numbers(shared):
     np.testing.assert_array_equal(rasterize(points, grid=Grid()), fast_reference(finite, Grid()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", [Grid(), Grid(0.4, 128, 128)])
 def test_real_labels_equal_the_reference(shared, grid):
     sequence = open_recording(shared / "data/kitti_odometry", "08")

@@ -74,11 +74,13 @@ def test_every_room_has_a_floor():
     assert {room(module) for module in FILES if module != "sglpr_jax"} == set(FLOOR)
 
 
+@pytest.mark.slow
 def test_no_two_files_import_each_other():
     graph = {module: {other for other in imported(path) if other in FILES} for module, path in FILES.items()}
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
+@pytest.mark.slow
 def test_folders_of_the_models_are_in_no_circle():
     """A folder counts as one file: what it imports must not import it."""
     graph: dict[str, set[str]] = {}

@@ -89,6 +89,7 @@ def test_height_counts_only_in_3d():
     assert revisits(climb[:, :2], excluded_frames=20)[20:].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sequence, count", [("00", 777), ("02", 296), ("05", 425), ("06", 268), ("07", 28), ("08", 321)]
 )
@@ -107,6 +108,7 @@ def test_the_pose_file_matters(shared, sequence, count):
     assert revisits(positions, times=times).sum() == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence, count", [("00", 774), ("02", 217), ("06", 268)])
 def test_revisits_of_the_bev_images(shared, sequence, count):
     positions = read_poses(shared / f"data/kitti_bev/{sequence}/pose.txt")[:, :, 3]

@@ -26,6 +26,7 @@ def test_an_import_brings_nothing_slow(module):
     assert imported_by(f"import {module}") == set()
 
 
+@pytest.mark.slow
 def test_a_name_of_the_library_brings_what_it_needs():
     assert imported_by("import sglpr_jax; sglpr_jax.CATEGORIES") == {"numpy", "jaxtyping"}
     assert "jax" in imported_by("import sglpr_jax; sglpr_jax.describe")

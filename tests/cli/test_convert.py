@@ -84,6 +84,7 @@ def test_swin_t_fills_what_it_fits_and_says_what_it_does_not(command, preset, st
         assert (values[f"backbone/{place}/block_0/mlp_in/kernel"] == expected).all()
 
 
+@pytest.mark.slow
 def test_a_training_can_begin_with_them(command, preset, state, tmp_path):
     """What bin/train does with --weights: the place head stays as it was written."""
     file = written(tmp_path / "unet.safetensors", state)

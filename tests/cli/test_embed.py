@@ -223,6 +223,7 @@ def test_every_baseline_can_be_chosen():
     assert get_args(MethodName) == ("sglpr", *HANDCRAFTED)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HANDCRAFTED)
 def test_a_baseline_describes_a_sequence_and_names_its_distance(embed, town, name):
     ended, out = embed("--method", name, "--data", town, "--seq", "08")

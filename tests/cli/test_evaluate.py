@@ -35,6 +35,7 @@ def recording() -> DescriptorFile:
     )
 
 
+@pytest.mark.slow
 def test_every_protocol_is_printed_written_and_drawn(command, recording, tmp_path):
     recording.save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz")
@@ -55,6 +56,7 @@ def test_every_protocol_is_printed_written_and_drawn(command, recording, tmp_pat
             assert min(picture.size) > 200
 
 
+@pytest.mark.slow
 def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, recording, tmp_path):
     dataclasses.replace(recording, times=None).save(tmp_path / "08.npz")
     ended = command("evaluate", tmp_path / "08.npz", "--out", tmp_path / "a" / "b")
@@ -62,6 +64,7 @@ def test_the_folder_can_be_chosen_and_without_times_290_frames_count(command, re
     assert "290 frames" in ended.out
 
 
+@pytest.mark.slow
 def test_the_record_beside_the_results_repeats_them(command, recording, tmp_path):
     recording.save(tmp_path / "08.npz")
     out = tmp_path / "out"
@@ -100,6 +103,7 @@ def test_descriptors_without_positions_cannot_be_scored(command, recording, tmp_
     assert not (tmp_path / "mine").exists()
 
 
+@pytest.mark.slow
 def test_a_file_of_another_kind_is_refused_without_a_traceback(command, tmp_path):
     assert_one_line_error(command("evaluate", tmp_path / "no.npz"), tmp_path / "no.npz", "found none")
     (tmp_path / "cut.npz").write_bytes(b"PK\3\4")

@@ -51,6 +51,7 @@ def results(folder):
     return {entry["protocol"]: entry for entry in json.loads((folder / "results.json").read_text())["results"]}
 
 
+@pytest.mark.slow
 def test_poses_of_every_format_give_the_same_scores(score, laps):
     found = {}
     for name, options in {
@@ -69,6 +70,7 @@ def test_poses_of_every_format_give_the_same_scores(score, laps):
     assert all(scores == found["lidar.txt"] for scores in found.values())
 
 
+@pytest.mark.slow
 def test_the_mistake_is_on_the_page_with_its_distances(score, laps):
     ended, folder = score("mine.npy", "--poses", laps / "poses.csv", "--distance", "cosine")
     assert ended.status == 0, ended.error
@@ -80,6 +82,7 @@ def test_the_mistake_is_on_the_page_with_its_distances(score, laps):
     assert "add --data" in text and "add --weights and --data" in text
 
 
+@pytest.mark.slow
 def test_a_top_k_list_and_scored_pairs(score, laps):
     ended, folder = score("topk.txt", "--poses", laps / "poses.csv")
     assert ended.status == 0, ended.error
@@ -106,6 +109,7 @@ def test_methods_are_compared_on_one_page(score, laps):
     assert_one_line_error(ended, "topk", "for a top-k list", "found pairs-f1max")
 
 
+@pytest.mark.slow
 def test_all_protocols(score, laps):
     ended, folder = score("mine.npy", "--poses", laps / "tum.txt", "--protocol", "all")
     assert ended.status == 0, ended.error
@@ -172,6 +176,7 @@ def test_data_and_weights_add_pictures(command, trained, town, tmp_path):
     assert "add --weights" not in page
 
 
+@pytest.mark.slow
 def test_ready_made_images_give_heat_maps_and_semantic_maps(command, trained, images, tmp_path):
     np.save(tmp_path / "a.npy", np.eye(30))
     ended = command("evaluate", tmp_path / "a.npy", "--data", images, "--seq", "06", "--weights", trained.folder)

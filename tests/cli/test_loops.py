@@ -108,6 +108,7 @@ def test_every_setting_of_the_detector_is_a_flag():
     assert (limited.keyframe_m, limited.max_places) == (1.5, 100)
 
 
+@pytest.mark.slow
 def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path, monkeypatch):
     """And a degenerate loop is kept, or rejected with `--degenerate drop`."""
     unsure = Loop(35, 1, np.eye(4), np.diag([4.0, 0.01, 1, 1, 1, 1]), 0.995)

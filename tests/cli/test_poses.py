@@ -38,6 +38,7 @@ def between(positions, times, *, step=0.03):
     return np.stack([np.interp(stamps, times, axis) for axis in positions.T], axis=1), stamps
 
 
+@pytest.mark.slow
 def test_poses_of_other_times_serve_embedding_and_scoring_alike(command, scans, tmp_path):
     folder, positions, times = scans
     poses = write(tmp_path / "odometry.tum", *between(positions, times))
@@ -63,6 +64,7 @@ def test_poses_of_other_times_serve_embedding_and_scoring_alike(command, scans, 
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timed", [True, False])
 def test_poses_of_all_scans_can_be_named_after_bad_ones_were_skipped(command, scans, tmp_path, timed):
     folder, positions, times = scans
@@ -81,6 +83,7 @@ def test_poses_of_all_scans_can_be_named_after_bad_ones_were_skipped(command, sc
     assert file.config["skipped"] == [0, 7, 39] and file.positions is None and len(file) == SCANS - 3
 
 
+@pytest.mark.slow
 def test_a_matrix_is_compared_on_the_positions_and_times_of_the_file(command, town, tmp_path):
     assert command("embed", "--data", town, "--seq", "08", *METHOD, "--out", tmp_path / "08.npz").status == 0
     np.save(tmp_path / "own.npy", load(tmp_path / "08.npz").descriptors)

@@ -133,6 +133,7 @@ def test_a_user_without_a_home_has_a_cache_until_the_process_ends(monkeypatch, t
     runtime._temporary_folder.cache_clear()
 
 
+@pytest.mark.slow
 def test_a_device_that_is_absent_is_one_line():
     program = """
 import sys

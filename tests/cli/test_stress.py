@@ -57,6 +57,7 @@ def test_everything_on_the_network_and_a_baseline(stress, rings, trained):
     assert config["methods"]["sglpr"]["weights"] == load(out / "descriptors" / "clean-sglpr.npz").weights_hash
 
 
+@pytest.mark.slow
 def test_descriptors_are_those_of_embed_and_change_when_disturbed(stress, rings, command, tmp_path):
     ended, out = stress("--data", rings, "--method", "solid", "--corruption", "rotation", "dropout-0.9", "--seed", 3)
     assert ended.status == 0, ended.error
@@ -71,6 +72,7 @@ def test_descriptors_are_those_of_embed_and_change_when_disturbed(stress, rings,
     np.testing.assert_array_equal(clean.positions, dropped.positions)
 
 
+@pytest.mark.slow
 def test_a_second_run_takes_the_descriptors_that_are_there(stress, rings):
     options = ("--data", rings, "--method", "solid", "--corruption", "beams")
     first, out = stress(*options)

@@ -129,6 +129,7 @@ def test_the_parts_of_two_hosts_are_the_whole_batch(recordings, pool, share_nega
     jax.tree.map(np.testing.assert_array_equal, joined, whole)
 
 
+@pytest.mark.slow
 def test_views_are_the_rasterised_turned_points(recordings, pool):
     batch = read(recordings, pool)
     angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 8).astype(np.float32)
@@ -210,6 +211,7 @@ def test_maps_are_turned_and_cropped_with_their_images(pool, tmp_path):
     assert same_angle > 5.5 > 4.5 > np.asarray(images)[np.asarray(maps) == 0].mean()
 
 
+@pytest.mark.slow
 def test_scans_become_density_images_of_all_their_points(recordings, pool):
     bare, frames = recordings[1], np.array([[0, 1, 12, 13]])
     alone = TuplePool([bare.positions], TupleConfig(negatives=2))

@@ -78,6 +78,7 @@ def test_a_scan_has_the_visible_points_around_its_pose(opened):
     assert np.ptp(house[:, 0]) > 60
 
 
+@pytest.mark.slow
 def test_points_are_in_the_frame_of_the_lidar(opened):
     ahead = opened(along()).points(1)
     left = opened(along(), quaternion=(0, 0, np.sqrt(0.5), np.sqrt(0.5))).points(1)  # 90 degrees

@@ -36,6 +36,7 @@ def apart(a, b):
     return math.acos(max(-1.0, min(1.0, math.cos(a - b))))
 
 
+@pytest.mark.slow
 @any_cloud
 @given(clouds, st.floats(-10, 10), st.floats(0, 2 * math.pi))
 def test_a_sector_without_points_is_exactly_the_wedge(points, heading, width):

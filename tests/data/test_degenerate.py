@@ -112,6 +112,7 @@ def test_the_flag_beside_the_descriptor(random_params):
     np.testing.assert_array_equal(one_by_one, [False, True, False, True])  # integers know no NaN
 
 
+@pytest.mark.slow
 def test_integers_are_no_density_image_but_its_bytes_are(random_params):
     config = dataclasses.replace(CONFIG, grid=Grid(0.4, CONFIG.grid.height, CONFIG.grid.width), image="density")
     params = random_params(config)

@@ -33,6 +33,7 @@ def reference_image(points: np.ndarray) -> tuple[np.ndarray, float]:
     return np.round(counts / max(counts.max(), 1) * 255).astype(np.uint8), 0.05 * steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "spread_m", "edge_m"), [(500, 12.0, 0.10), (9000, 12.0, 0.70), (30000, 2.5, 0.45)])
 def test_images_follow_the_recipe_at_every_edge(n, spread_m, edge_m):
     points = np.random.default_rng(n).normal(scale=[spread_m, spread_m, 1.0], size=(n, 3)).astype(np.float32)

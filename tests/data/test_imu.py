@@ -136,6 +136,7 @@ def test_gravity_of_a_bag(tmp_path, kind):
     assert recording.read_ups is None
 
 
+@pytest.mark.slow
 def test_topics_transforms_and_gravity_that_are_missing(tmp_path):
     path = bag_of(tmp_path / "a.bag", "ros1", tf=False)
     with pytest.raises(ValueError, match="expected the IMU topic /imu, found /livox/imu"):

@@ -23,6 +23,7 @@ def turn(elevations_deg, *, azimuths=90, wobble_deg=0.0, seed=0):
     return points, np.repeat(np.arange(len(elevation))[::-1], azimuths)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 64))
 def test_elevations_that_stand_apart_tell_the_ring_in_any_order(seed, rings):

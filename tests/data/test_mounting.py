@@ -151,6 +151,7 @@ def low_robot(tmp_path):
     return tmp_path, [street(i) for i in range(4)]
 
 
+@pytest.mark.slow
 def test_a_plain_folder_is_levelled_before_a_model_sees_it(low_robot):
     folder, expected = low_robot
     recording = open_recording(folder)
@@ -211,6 +212,7 @@ def test_another_sensor_in_kittis_layout_is_told(height, kitti_root):
     assert open_recording(kitti_root, "08", sensor_height=height).mounting == Mounting(height)
 
 
+@pytest.mark.slow
 def test_real_scans(shared):
     """KITTI's sensor is 1.73 m above the road, nuScenes' 1.84 m above the one of its first scene."""
     data = shared / "data"

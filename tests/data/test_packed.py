@@ -55,6 +55,7 @@ def test_points_and_labels_are_those_of_the_files(recording, tmp_path):
     np.testing.assert_array_equal(found.points(1), 100 + np.arange(20, dtype=np.float32).reshape(5, 4)[:, :3])
 
 
+@pytest.mark.slow
 def test_real_scans_are_those_of_the_files(shared, tmp_path):
     recording = open_recording(shared / "data/kitti_odometry", "08")
     require_same_scans(packed(recording, tmp_path), recording)

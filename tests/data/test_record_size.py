@@ -228,6 +228,7 @@ def test_more_points_than_a_scan_has_are_refused_before_they_are_read(tmp_path, 
         read_records(path, "kitti")
 
 
+@pytest.mark.slow
 def test_real_scans(shared, tmp_path):
     """Real scans of four sensors in every layout."""
     samples = shared / "data/samples"

@@ -1,6 +1,7 @@
 """Which points of a cloud a LiDAR sees: those in front of walls, one for each ray."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -25,6 +26,7 @@ def rows_of(points):
     return {tuple(row) for row in points.tolist()}
 
 
+@pytest.mark.slow
 def test_a_wall_hides_almost_all_points_behind_it_and_none_beside_it():
     for near_m in (2.0, 5.0, 10.0):
         behind = wall(near_m + 8, half_m=0.8 * 4 * (near_m + 8) / near_m)

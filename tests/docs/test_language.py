@@ -13,6 +13,7 @@ def test_sentences_of_pages_are_short_and_plain(page):
     assert not faults(sentences_of_page(page))
 
 
+@pytest.mark.slow
 def test_sentences_of_docstrings_are_short_and_plain():
     assert not faults(sentence for path in CODE for sentence in sentences_of_code(path))
 

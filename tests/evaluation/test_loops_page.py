@@ -35,6 +35,7 @@ def test_the_page_has_the_drawing_the_pairs_and_the_least_sure_loops(found, tmp_
     assert "0.9950" in table and "000005" in table and "17.2" in table
 
 
+@pytest.mark.slow
 def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert len(Parsed(loops_page(dataclasses.replace(found, odometry=None))).images) == 2
     none = dataclasses.replace(found, loops=())
@@ -44,6 +45,7 @@ def test_without_odometry_or_loops_or_frames_it_says_so(found):
     assert "No scan was processed." in loops_page(dataclasses.replace(none, frames=0))
 
 
+@pytest.mark.slow
 def test_rejected_pairs_are_counted_by_reason(found):
     assert "No pair was rejected." in Parsed(loops_page(found)).texts["Rejected"]
     pair = found.loops[0]
@@ -54,6 +56,7 @@ def test_rejected_pairs_are_counted_by_reason(found):
     assert "Rejected pairs are grey." in page.texts["Trajectory"]
 
 
+@pytest.mark.slow
 def test_wrong_loops_are_counted_and_come_first_where_positions_are_known(found, known):
     page = Parsed(loops_page(known))
     assert "1 of 3 loops are wrong (red): more than 20 m apart by poses.txt." in page.texts["Trajectory"]
@@ -82,6 +85,7 @@ def known(found) -> FoundLoops:
     return dataclasses.replace(found, recording=recording, candidates=candidates, model=model)
 
 
+@pytest.mark.slow
 def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known, monkeypatch):
     page = Parsed(loops_page(known))
     assert [headline for headline, _ in page.images] == ["Trajectory", "Trajectory", "Pairs", "Reliability"]
@@ -93,6 +97,7 @@ def test_how_many_of_the_pairs_are_loops_is_drawn_where_it_is_known(found, known
     assert "0.99 to 1" in Parsed(loops_page(known)).texts["Reliability"]
 
 
+@pytest.mark.slow
 def test_the_trajectory_before_and_after_is_drawn_with_its_error(found, known, monkeypatch):
     optimized = OptimizedTrajectory(known.odometry + 0.0, np.array([True, True, False]))
     optimized.poses[:, :3, 3] = known.recording.positions

@@ -90,6 +90,7 @@ def test_what_is_missing_is_said_with_its_option(found):
     assert seen.images == []
 
 
+@pytest.mark.slow
 def test_pictures_stand_where_they_belong(found):
     (mistake,) = found.worst
     assert (mistake.query, mistake.answer) == (500, 10)

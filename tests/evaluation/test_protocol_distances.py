@@ -26,6 +26,7 @@ def of_unit_length(by_cosine):
     return replace(by_cosine, descriptors=by_cosine.descriptors / lengths, distance="l2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", protocols_taking("descriptors"))
 def test_cosine_is_l2_of_unit_length(by_cosine, of_unit_length, name):
     protocol = PROTOCOLS[name]
@@ -43,11 +44,13 @@ def test_so_it_is_across_sessions(by_cosine, of_unit_length, name):
     assert scored(by_cosine) == pytest.approx(scored(of_unit_length), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_without_its_distance_the_same_file_scores_otherwise(by_cosine):
     by_l2 = replace(by_cosine, distance="l2")
     assert PROTOCOLS["pairs-f1max"](by_l2).score != pytest.approx(PROTOCOLS["pairs-f1max"](by_cosine).score, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_distance_between_sets_serves_for_pairs_and_for_neighbours(make_file):
     rng = np.random.default_rng(0)
     rows = rng.uniform(size=(90, 1200)).astype(np.float32)

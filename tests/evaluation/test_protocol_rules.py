@@ -193,6 +193,7 @@ def test_nclt_recall_is_asked_across_two_sessions(sessions):
     assert result.interval[0] < expected < result.interval[1]
 
 
+@pytest.mark.slow
 def test_pointnetvlad_recall_is_the_mean_over_ordered_pairs_of_runs(sessions):
     result = pointnetvlad_recall(*sessions)
     ordered = [(a, b) for a in sessions for b in sessions if a is not b]

@@ -90,6 +90,7 @@ def test_descriptors_that_know_the_place_score_one(make_file, two_laps, name):
     assert sum(result.counts.values()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DESCRIPTORS)
 def test_the_interval_holds_the_score_and_every_result_has_another_name(make_file, two_laps, name):
     noise = np.random.default_rng(0).normal(scale=0.05, size=(800, 3))

@@ -25,6 +25,7 @@ def found(one_found) -> FoundRecordings:  # noqa: F811
     return FoundRecordings((one_found, one_found), (pair,))
 
 
+@pytest.mark.slow
 def test_transforms_pairs_and_recordings_are_shown(found):
     page = Parsed(recordings_page(found))
     assert "28.65" in page.texts["Transforms"] and "10.00" in page.texts["Transforms"]
@@ -36,6 +37,7 @@ def test_transforms_pairs_and_recordings_are_shown(found):
     assert "corrected by 1 of 1 loops" in corrected.texts["Together"]
 
 
+@pytest.mark.slow
 def test_no_common_place_is_said(found):
     none = dataclasses.replace(found.between[0], loops=(), aligned=())
     page = Parsed(recordings_page(dataclasses.replace(found, between=(none,))))

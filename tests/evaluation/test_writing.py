@@ -39,6 +39,7 @@ def names_in(folder) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_plots_of_an_earlier_evaluation_go_and_other_files_stay(one, two, sessions, tmp_path):
     mine = tmp_path / "precision-recall-raw.png"
     mine.write_bytes(b"not of this command")
@@ -71,6 +72,7 @@ def test_a_full_disk_leaves_the_earlier_evaluation_as_it_was(one, sessions, tmp_
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["[/red]<b>", "$x_{$", "n\udcff\nb\x1b[2J", "x" * 2**20])
 def test_a_name_with_markup_is_printed_drawn_and_written_as_it_is(file, tmp_path, name):
     file = dataclasses.replace(file, sequence=name)

@@ -36,6 +36,7 @@ def try_case(road: Road | FolderRoad, case: Case) -> Outcome:
 EVERY_ROAD = [pytest.param(road, marks=[pytest.mark.slow] * road.slow, id=name) for name, road in ROADS.items()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("road", EVERY_ROAD)
 def test_the_whole_file_is_right(road):
     assert try_case(road, road.intact()) == Outcome("right", "")

@@ -45,6 +45,7 @@ def loop_of(poses: np.ndarray, query: int, match: int, error: tuple[float, float
     return planar_loop(query, match, Alignment(*relative[:2, 3], yaw, covariance, 0.8, 0.3), probability=0.99)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 10**6))
 def test_right_loops_agree_and_wrong_ones_do_not(seed):

@@ -26,6 +26,7 @@ def exact(poses: np.ndarray, query: int, match: int) -> Loop:
     return Loop(query, match, inverse(poses[match]) @ poses[query], np.zeros((6, 6)), 1.0)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(percent=st.floats(-1.5, 1.5), degrees=st.floats(-1, 1), start=st.integers(0, 600), length=st.integers(30, 320))
 def test_drift_of_constant_rate_is_at_most_its_multiple_of_the_model(percent, degrees, start, length):

@@ -74,6 +74,7 @@ def found(params, there_and_back, monkeypatch):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.0, 1.01])
 def test_odometry_in_the_lidars_axes_agrees_with_the_loops_drifting_as_it_may(found, there_and_back, share):
     odometry = there_and_back.copy()
@@ -81,6 +82,7 @@ def test_odometry_in_the_lidars_axes_agrees_with_the_loops_drifting_as_it_may(fo
     assert len(found(odometry).loops) >= N - 1
 
 
+@pytest.mark.slow
 def test_odometry_in_other_axes_is_told(found, there_and_back):
     forward_is_y = there_and_back @ transform(0.0, 0.0, np.pi / 2)
     words = r"08: the odometry contradicts the loops of \d\d of \d\d frames; .* use these axes: x forward"
@@ -105,6 +107,7 @@ def test_a_few_loops_tell_nothing():
         check_odometry("08", frames, [], [], np.tile(np.eye(4), (5, 1, 1)), CONFIG)
 
 
+@pytest.mark.slow
 def test_loops_that_contradict_the_odometry_are_rejected_and_do_not_keep_the_true_ones_out(
     params, there_and_back, monkeypatch
 ):

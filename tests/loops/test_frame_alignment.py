@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -38,6 +39,7 @@ def test_loops_with_noise_give_the_transform_to_centimetres_even_if_a_fifth_is_w
     assert np.linalg.norm(found[:3, 3]) < 0.25 and abs(np.degrees(yaw_of(found))) < 0.2
 
 
+@pytest.mark.slow
 def test_the_covariance_covers_the_errors_and_grows_with_the_stated_drift():
     first, second, true = two_drives()
     squares = []
@@ -52,6 +54,7 @@ def test_the_covariance_covers_the_errors_and_grows_with_the_stated_drift():
     assert (np.diag(drifting)[[0, 1, 5]] > 2 * np.diag(exact)[[0, 1, 5]]).all()
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-3.1, 3.1))
 def test_other_frames_change_only_the_transform(x, y, yaw):

@@ -79,6 +79,7 @@ def test_a_loop_within_the_drift_that_contradicts_the_others_is_rejected():
     assert kept == loops and [(one.loop, one.reason) for one in rejected] == [(wrong, "contradicts other loops")]
 
 
+@pytest.mark.slow
 def test_odometry_that_drifts_more_than_stated_is_told_with_both_readings_and_can_be_stated():
     true = town()
     odometry, loops = drifted(true, percent=10, deg_per_100m=5), true_loops(true, every=3)

@@ -83,6 +83,7 @@ def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
     assert finder.stored.frames.tolist() == [int(np.flatnonzero(finder.motion.segments == k)[0]) for k in range(3)]
 
 
+@pytest.mark.slow
 def test_memory_stays_bounded(params):
     sizes = [driven(params, 1.0, frames=frames, max_places=32) for frames in (300, 2000)]
     assert all(len(one.stored) <= 32 for one in sizes)

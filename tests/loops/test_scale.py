@@ -35,6 +35,7 @@ def there_and_back() -> np.ndarray:
     return np.concatenate([there, (there @ aside)[::-1]])
 
 
+@pytest.mark.slow
 def test_loops_of_scaled_scans_are_in_metres(params, there_and_back, monkeypatch):
     large = scaled_poses(there_and_back, float(SCALE))
     detector = searched(params, large, large)

@@ -45,6 +45,7 @@ def test_places_with_distant_descriptors_are_found_by_further_comparisons(images
     assert (candidate.match == TRUE) == found
 
 
+@pytest.mark.slow
 def test_a_good_fit_on_another_floor_does_not_end_the_search(images, query):
     config = CandidateConfig(candidates=1, elsewhere=0, further=PLACES, exclude_frames=1, min_travelled_m=0.0)
     finder = CandidateFinder(sglpr_jax.load("circular"), config=config)

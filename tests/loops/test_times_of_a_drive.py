@@ -118,6 +118,7 @@ def by_times_file(folder: Path, stamps, unit="auto") -> Recording:
 ROADS = (by_odometry, by_poses_beside_scans, by_times_file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("road", ROADS)
 def test_seconds_in_a_file_give_the_loops(params, tmp_path, road):
     assert loops_of(params, road(tmp_path, STAMPS["s"])) == SAME
@@ -132,6 +133,7 @@ def test_other_units_in_a_file_are_one_line_and_the_same_loops_if_stated(params,
     assert loops_of(params, road(tmp_path / "again", STAMPS[unit], unit)) == SAME
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("road", ROADS)
 def test_row_numbers_in_a_file_are_no_times(params, tmp_path, road, recwarn):
     recording = road(tmp_path, STAMPS["rows"]) if road is not by_times_file else None
@@ -192,11 +194,13 @@ FROM_PYTHON = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", FROM_PYTHON.values(), ids=FROM_PYTHON)
 def test_seconds_and_dates_from_python_give_the_loops(params, times):
     assert found_in(detector_of(params), times) == SAME
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 def test_other_units_from_python_are_one_line_as_soon_as_steps_show_them(params, unit):
     detector = detector_of(params)

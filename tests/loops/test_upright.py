@@ -222,6 +222,7 @@ def test_frames_with_one_mounting_are_stored_once():
     np.testing.assert_array_equal(mountings.uprights(np.array([8, 9]))[:, 2, 3], [2.5 - MODEL_HEIGHT_M, 0])
 
 
+@pytest.mark.slow
 def test_the_covariance_of_estimated_mountings_is_that_of_drawn_ones():
     rng = np.random.default_rng(0)
     tilts = [tilted_from_level(degrees) for degrees in ((9.0, -6.0, 0.0), (-4.0, 12.0, 0.0))]

@@ -56,6 +56,7 @@ def images(places, turn_points):
     return np.stack([*map(lidar_iris, scans), np.zeros(28800, np.float32)]).reshape(-1, 80, 360)
 
 
+@pytest.mark.slow
 def test_the_alignment_is_the_published_one(images):
     images = images[:-1].astype(np.float64)
     found = column_shifts(*[spectra(jnp.asarray(images, jnp.float32) / 255)] * 2)
@@ -105,6 +106,7 @@ def test_a_scale_beyond_1_8_is_taken_for_its_inverse(down, right):
     assert float(scale) == pytest.approx(math.hypot(40, 180) ** (side * right / 360), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_the_distance_is_the_hamming_distance_of_the_signs(images):
     rows = images.reshape(len(images), -1)
     expected = [[published.distance(a.astype(float), b.astype(float)) for b in images] for a in images[:3]]

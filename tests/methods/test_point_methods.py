@@ -94,6 +94,7 @@ def test_real_loops_rank_above_a_pair_that_is_none(real, name):
     assert apart("08", 720, 1500) < none  # driven in the opposite direction
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [scan_context, m2dp])
 def test_a_turn_of_a_real_scan_is_less_than_the_step_to_another_place(real, turn_points, method):
     name = "scan-context" if method is scan_context else "m2dp"

@@ -153,6 +153,7 @@ def test_the_gradient_reaches_every_weight(random_params, views, what):
         assert np.isfinite(leaf).all() and np.abs(leaf).max() > 0, path
 
 
+@pytest.mark.slow
 def test_describe_costs_less_without_a_backbone(random_params, views):
     def operations(config):
         compiled = fast_describe.lower(random_params(config), views[0]).compile()

@@ -20,6 +20,7 @@ def fresh(seed: int) -> Params:
     return init(jax.random.key(seed), preset="tiny")
 
 
+@pytest.mark.slow
 def test_every_parameter_is_the_weighted_mean():
     models = [fresh(seed) for seed in range(3)]
     found = by_name(average(models, shares=[4.0, 3.0, 1.0]).weights)

@@ -51,6 +51,7 @@ def test_output_and_gradients_agree(tag, reduction, golden, assert_parity):
         assert_parity(jnp.linalg.norm(by_name[name]), expected[f"eval_gradnorm/{name}"], name)
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_agree_and_an_empty_map_has_finite_gradients(random_variables):
     module, image = CBAM(reduction=16), jnp.asarray(np.random.default_rng(0).normal(size=(3, 8, 8, 6)), jnp.float32)
     variables = random_variables(module, image)
@@ -63,6 +64,7 @@ def test_jit_and_vmap_agree_and_an_empty_map_has_finite_gradients(random_variabl
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_maximum_survives_rounding():
     """An entry that rounding keeps from being equal to the maximum still has its gradient; ties share it."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 5)), jnp.float32)
@@ -74,6 +76,7 @@ def test_the_gradient_of_the_maximum_survives_rounding():
     assert largest(tied, (-1,)) == 2
 
 
+@pytest.mark.slow
 def test_a_circular_map_may_be_rolled_along_its_columns_and_no_other(random_variables):
     image = jnp.asarray(np.random.default_rng(0).normal(size=(2, 8, 12, 6)), jnp.float32)
     variables = random_variables(CBAM(reduction=3), image)

@@ -27,6 +27,7 @@ def params(request, random_params):
     return random_params(request.param)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fine", [(), (3, 5)])
 def test_maps_shrink_as_configured_and_turn_with_the_image(fine, random_variables):
     image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
@@ -55,6 +56,7 @@ def test_means_of_blocks_are_numpys(radii, sectors):
     np.testing.assert_allclose(each, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_variables):
     image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
     net, decoder = CircularNet(RINGS), CircularDecoder(RINGS.widths)
@@ -67,6 +69,7 @@ def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_vari
     np.testing.assert_allclose(turned, jnp.roll(pixels, 4, axis=2), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_fine_blocks_see_what_the_means_do_not(random_variables):
     image = jax.random.normal(jax.random.key(0), (1, 16, 32, 2))
     other = image.at[0, 4, 8].add(1.0).at[0, 5, 9].add(-1.0)  # in one square

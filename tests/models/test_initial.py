@@ -55,6 +55,7 @@ def test_weights_differ_by_key_and_by_name_and_not_by_shape_of_others():
     assert len(first) == len(random)
 
 
+@pytest.mark.slow
 def test_init_is_the_same_in_a_compiled_function_and_maps_over_keys():
     keys = jax.random.split(jax.random.key(3), 2)
     one = sglpr_jax.init(keys[0], config=MODEL).weights

@@ -87,6 +87,7 @@ def test_descriptors_and_logits_under_jit_vmap_and_grad(params):
     assert jnp.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 def test_no_array_has_a_rank_above_five(params):
     def loss(weights):
         outputs = forward(dataclasses.replace(params, weights=weights), BEV)

@@ -127,6 +127,7 @@ def test_an_empty_image_has_finite_gradients(variables, images):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.slow
 def test_initial_weights_are_the_references(images):
     block = SwinBlock(heads=2, window=4, shifted=True).init(jax.random.key(0), jnp.zeros((1, 8, 8, 16)))["params"]
     kernel = PatchEmbed(channels=8).init(jax.random.key(0), images)["params"]["projection"]["kernel"]

@@ -66,6 +66,7 @@ def test_swin_unet_checkpoint_with_prefix_buffers_and_three_channels(state, para
     np.testing.assert_allclose(kernel, embedding.transpose(2, 3, 1, 0), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_swin_t_fills_the_encoder_and_the_mirrored_decoder_where_shapes_match(state, params):
     """The small model plays Swin-T: encoder names only, plus what ImageNet's has more, and one other window size."""
     swin_t = {name: value for name, value in state.items() if name.startswith(("patch_embed.", "layers.", "norm."))}
@@ -135,6 +136,7 @@ def test_a_checkpoint_of_another_model_is_refused(change, message, state, params
         from_torch_names(changed, params.config)
 
 
+@pytest.mark.slow
 def test_a_swin_t_of_another_width_or_with_unknown_names_is_refused(params):
     with pytest.raises(ValueError, match="expected weights that fit the model, found none"):
         from_swin_t({"norm.weight": np.ones(768)}, params)

@@ -253,6 +253,7 @@ def test_the_hash_is_that_of_what_describes(params):
     assert weights_hash(other) == weights_hash(for_places(params)) == weights_hash(params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tap", ["tokens", "pixels"])
 @pytest.mark.parametrize("name", ["paper", "circular", "sglpr"])
 def test_what_describes_is_what_a_model_without_a_segmentation_head_has(name, tap):

@@ -46,6 +46,7 @@ def test_equal_descriptors_are_refused(n):
         fit_whitening(np.ones((n, 6)))
 
 
+@pytest.mark.slow
 def test_a_fresh_layer_is_the_identity():
     config = model_preset("tiny")
     layered = dataclasses.replace(config, head=dataclasses.replace(config.head, whiten=True))
@@ -56,6 +57,7 @@ def test_a_fresh_layer_is_the_identity():
     assert unwhitened(plain) is plain
 
 
+@pytest.mark.slow
 def test_fitted_weights_describe_are_stored_and_lose_the_layer_again(random_params, tmp_path):
     params = random_params(model_preset("tiny"))
     before = np.asarray(describe(params, BEV))

@@ -40,6 +40,7 @@ def test_maps_lie_on_the_grid_of_the_image_and_follow_it(random_params, polar):
         assert np.nanmax(np.abs(values - other[name])) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", MODELS)
 def test_the_maps_that_a_preset_names_are_there_and_have_the_form_of_its_image(preset):
     """Traced only, so that the paper's sizes cost nothing."""

@@ -45,6 +45,7 @@ def test_the_map_of_a_mirrored_image_is_the_mirrored_map(params):
     np.testing.assert_array_equal(other.predicted, np.fliplr(one.predicted))
 
 
+@pytest.mark.slow
 def test_a_map_holds_the_likeliest_known_class_where_points_are(params):
     rng = np.random.default_rng(0)
     points = rng.normal(0, 9, (700, 3)).astype(np.float32)
@@ -94,6 +95,7 @@ def test_cells_the_network_is_not_sure_of_are_left_unlabelled(params):
     assert 0 < found.seen.sum() < every.seen.sum()
 
 
+@pytest.mark.slow
 def test_the_map_of_a_model_for_density_images_lies_on_such_an_image(random_params):
     config = dataclasses.replace(model_preset("tiny"), grid=Grid(0.4, 32, 32), image="density")
     params = random_params(config)

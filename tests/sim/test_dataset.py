@@ -95,6 +95,7 @@ def test_a_drive_on_the_fly_is_the_one_on_disk(dataset, drive):
         np.testing.assert_array_equal(drive.labels(i), on_disk.labels(i))
 
 
+@pytest.mark.slow
 def test_images_are_as_of_a_sensor_at_the_height_that_models_know(tmp_path):
     low = dataclasses.replace(TINY, height_m=0.8)
     image = open_recording(write(tmp_path, names=("08",), sensor=low, layout="images"), "08").image(0)
@@ -118,6 +119,7 @@ def test_training_batches_are_read_from_a_drive_on_the_fly(drive):
     np.testing.assert_array_equal(batch.classes[1, : batch.count[1]], to_classes(drive.labels(1)))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(dataset, tmp_path):
     again = content(write(tmp_path / "again"))
     assert again == content(dataset)
@@ -126,6 +128,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(dataset, tmp_pa
     assert other.keys() == again.keys() and other[first] != again[first]
 
 
+@pytest.mark.slow
 def test_drives_can_be_added_and_do_not_depend_on_each_other(dataset, tmp_path):
     root = write(tmp_path / "grown", names=("08",))
     kept = (root / "sequences" / "08" / "velodyne" / "000000.bin").stat().st_mtime_ns
@@ -133,6 +136,7 @@ def test_drives_can_be_added_and_do_not_depend_on_each_other(dataset, tmp_path):
     assert (root / "sequences" / "08" / "velodyne" / "000000.bin").stat().st_mtime_ns == kept
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_recognised_and_resumed(dataset, tmp_path):
     calls = []
 
@@ -148,6 +152,7 @@ def test_an_interrupted_run_is_recognised_and_resumed(dataset, tmp_path):
     assert content(write(tmp_path / "cut")) == content(dataset)
 
 
+@pytest.mark.slow
 def test_deleted_scans_come_back_and_finished_ones_are_left_alone(dataset, tmp_path):
     root = write(tmp_path / "kept")
     scans = root / "sequences" / "00" / "velodyne"
@@ -209,6 +214,7 @@ def test_images_are_those_of_the_scans(tmp_path, drive):
     assert 0.8 < (labels[expected > 0] > 0).mean() <= 1
 
 
+@pytest.mark.slow
 def test_images_written_before_there_were_label_maps_get_them(tmp_path):
     root = write(tmp_path / "images", names=("08",), layout="images")
     whole = content(root)
@@ -244,6 +250,7 @@ def test_a_dataset_of_before_there_were_sceneries_is_a_town(dataset, tmp_path):
         write(old, scenery=OUTSKIRTS)
 
 
+@pytest.mark.slow
 def test_a_dataset_that_notes_older_names_of_a_scenery_is_completed(tmp_path):
     new = write(tmp_path / "new", names=("00",), scenery=OUTSKIRTS)
     old = shutil.copytree(new, tmp_path / "old")
@@ -307,6 +314,7 @@ def test_two_drives_of_one_name_are_refused(tmp_path, pose_file):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_clear_error_and_leaves_only_whole_files(dataset, tmp_path):
     """The limit on the size of a file stands in for the disk: writing fails half-way."""
     root = tmp_path / "full"

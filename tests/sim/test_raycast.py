@@ -63,6 +63,7 @@ def numbered(scene: Scene) -> Scene:
     return Scene(*(kind._replace(label=np.arange(i * COUNT, (i + 1) * COUNT)) for i, kind in enumerate(scene)))
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), poses)
 def test_the_nearest_of_all_shapes_wins_from_any_pose(seed, world_from_lidar):
@@ -171,6 +172,7 @@ def test_rough_shapes_return_from_within_and_let_long_shots_through():
     assert np.all(through_slot[ahead] == -1) and np.all(through[ahead] == REACH_M)
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_change_nothing():
     where = [pose(), pose(1, -2, 0.3, yaw=0.5, pitch=0.1)]
     rays = [as_vectors(directions(w)) for w in where]

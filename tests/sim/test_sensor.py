@@ -92,6 +92,7 @@ def test_turning_world_and_sensor_together_changes_nothing():
     np.testing.assert_array_equal(labels, turned_labels)
 
 
+@pytest.mark.slow
 def test_noise_dropout_and_range_limits():
     whole = dataclasses.replace(EXACT, azimuth_steps=1000, min_range_m=4.5, max_range_m=30.0, range_noise_m=0.05)
     points, labels = scan(KEY, walled_world(), pose(z=1.73), sensor=whole)
@@ -223,6 +224,7 @@ def test_a_pattern_that_does_not_repeat_fills_its_field_of_view():
     assert hidden.mean() == pytest.approx(1 - np.pi / 4, abs=0.03) and not hidden[32, 240]
 
 
+@pytest.mark.slow
 def test_a_sector_sees_what_a_revolution_sees_there():
     world, where = walled_world(POLE_AHEAD), pose(z=1.73)
     whole, _ = scan(KEY, world, where, sensor=EXACT)

@@ -134,6 +134,7 @@ def test_the_sensor_of_nclt_is_an_hdl32e_turned_over():
     np.testing.assert_allclose(sorted(SENSORS["hdl32e-nclt"].elevations_deg)[-1], 30.67)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_an_interrupted_run_goes_on(dataset, tmp_path):
     def interrupt(date: str, done: int, scans: int) -> None:
         if date == DAYS[1] and done == 5:

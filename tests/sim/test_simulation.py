@@ -43,6 +43,7 @@ def test_submaps_of_a_scenery_where_places_repeat(tmp_path):
         simulate(tmp_path, routes=["08"], **{**options, "submap_m": 10.0})
 
 
+@pytest.mark.slow
 def test_days_of_one_town(tmp_path):
     found = simulate(tmp_path, sessions=["2012-01-15", "2012-02-04"], **THIN)
     assert recording_names(tmp_path) == found.names == ("2012-01-15", "2012-02-04")

@@ -124,6 +124,7 @@ def test_some_streets_look_alike_for_long():
     assert len(lengths) > 5 and max(lengths) > 300
 
 
+@pytest.mark.slow
 def test_the_outskirts_have_neighbourhoods_of_their_own_and_fewer_crossings():
     sides, stretches = {}, {}
     for name, scenery in SCENERIES.items():
@@ -138,6 +139,7 @@ def test_the_outskirts_have_neighbourhoods_of_their_own_and_fewer_crossings():
     assert alike["outskirts"] > alike["town"] and sides["outskirts"] < sides["town"]
 
 
+@pytest.mark.slow
 def test_lanes_run_between_hedgerows_and_some_have_posts():
     path = resample(*drive(((0, 0), (1500, 0))))
     sides = {}
@@ -168,6 +170,7 @@ def test_going_around_a_roundabout_makes_an_island():
     assert roundabouts(resample(*drive(LOOP))) == ()  # crossings are none
 
 
+@pytest.mark.slow
 def test_gardens_have_low_fences_and_hedges_cut_straight_and_other_land_has_none():
     path = resample(*drive(((0, 0), (1500, 0))))
     borders = {}

@@ -53,6 +53,7 @@ def select(shapes: Shapes, keep: np.ndarray) -> Shapes:
     return Shapes(*(leaf[keep] for leaf in shapes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corners", [LOOP, THERE_AND_BACK])
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("scenery", SCENERIES)
@@ -150,6 +151,7 @@ def test_the_outskirts_have_walls_to_their_length_and_hills_beside_the_road():
     assert hills["outskirts"] > 50 > hills["town"]
 
 
+@pytest.mark.slow
 def test_behind_the_face_of_a_hedgerow_leaves_thin_out_away_from_the_road():
     layers = []
     for seed in range(6):
@@ -171,6 +173,7 @@ def test_behind_the_face_of_a_hedgerow_leaves_thin_out_away_from_the_road():
     assert len(layers) > 100 and set(layers) == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_gardens_show_limbs_and_low_fences_that_one_sees_through():
     """Trunks branch out below their crowns, and many a fence lets half of the rays through; in town none does."""
     limbs, trunks, sparse = {}, {}, {}
@@ -205,6 +208,7 @@ def _longest_run(along: np.ndarray, side: np.ndarray) -> float:
     return max((float(np.ptp(piece)) for piece in pieces if len(piece)), default=0.0)
 
 
+@pytest.mark.slow
 def test_parked_cars_come_and_go_between_two_visits():
     corners = ((0, 0), (160, 0), (160, 300), (0, 300), (0, 0), (160, 0))
     _, times = drive(corners)
@@ -218,6 +222,7 @@ def test_parked_cars_come_and_go_between_two_visits():
     assert min(kept, gone, came) > 2
 
 
+@pytest.mark.slow
 def test_a_seed_gives_one_town_and_another_seed_another():
     one, again, other = (build_world(seed, *drive(LOOP[:3])) for seed in ((5, 1), (5, 1), (6, 1)))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):

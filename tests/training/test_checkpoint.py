@@ -48,6 +48,7 @@ def test_what_is_saved_is_the_state_of_that_moment(checkpoints, state, config):
     chex.assert_trees_all_equal(checkpoints.restore(config), state)
 
 
+@pytest.mark.slow
 def test_the_two_newest_and_the_best_are_kept(checkpoints, state, config, tmp_path):
     for step, score in enumerate([0.1, 0.9, 0.2, 0.3, 0.4, None]):
         checkpoints.save(state.replace(step=jnp.int32(step)), score=score)
@@ -57,6 +58,7 @@ def test_the_two_newest_and_the_best_are_kept(checkpoints, state, config, tmp_pa
     assert sorted(folder.name for folder in (tmp_path / "checkpoints").iterdir()) == ["1", "4", "5"]
 
 
+@pytest.mark.slow
 def test_the_best_is_still_known_after_a_resume(checkpoints, state, tmp_path):
     for step, score in enumerate([0.1, 0.9, 0.2, 0.3]):
         checkpoints.save(state.replace(step=jnp.int32(step)), score=score)
@@ -129,6 +131,7 @@ def test_nothing_to_resume_from_is_an_error(checkpoints, config, tmp_path):
         checkpoints.restore(config)
 
 
+@pytest.mark.slow
 def test_the_best_weights_are_those_of_the_highest_score_after_a_resume_too(checkpoints, state, config, tmp_path):
     def plus(step: int):
         return jax.tree.map(lambda leaf: leaf + step, state.params.weights)

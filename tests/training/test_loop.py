@@ -88,6 +88,7 @@ def test_stopped_and_resumed_is_uninterrupted(config, make_batch, fast_step, tmp
     assert logged(folders[1]) == logged(folders[0])
 
 
+@pytest.mark.slow
 def test_a_run_resumed_past_a_damaged_checkpoint_is_uninterrupted(config, make_batch, fast_step, tmp_path, capfd):
     folders = tmp_path / "whole", tmp_path / "resumed"
     whole = run_steps(config, Made(make_batch), folders[0], score=size_of_weights)
@@ -120,6 +121,7 @@ def test_a_stop_between_two_lines_of_the_log_leaves_no_trace_in_it(config, make_
     assert losses == [(5, 3), (8, 7), (10, 9.5), (12, 11.5)]
 
 
+@pytest.mark.slow
 def test_the_first_line_after_each_start_says_nothing_of_time(config, make_batch, fake_step, tmp_path):
     fake_step()
     run_steps(config, Made(make_batch), tmp_path, score=size_of_weights, stopped=after(3))
@@ -177,6 +179,7 @@ def test_a_callback_gets_all_that_is_measured(config, make_batch, fake_step, tmp
     assert [line for line in told if not isinstance(line, dict)] == [("from", 0, 6), 2, 4, 6]
 
 
+@pytest.mark.slow
 def test_a_batch_that_cannot_be_read_ends_the_run_with_its_own_error(config, make_batch, fake_step, tmp_path):
     fake_step()
 
@@ -193,6 +196,7 @@ def test_a_batch_that_cannot_be_read_ends_the_run_with_its_own_error(config, mak
     assert [line["step"] for line in logged(tmp_path)] == [1, 2, 2, 3, 4, 4, 5, 6, 6]
 
 
+@pytest.mark.slow
 def test_the_score_decides_which_checkpoint_is_the_best(config, make_batch, fake_step, tmp_path):
     fake_step()
     scores = iter([0.1, 0.9, 0.3, 0.2, 0.5])
