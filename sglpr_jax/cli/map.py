@@ -137,6 +137,8 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
     """The existing map with the places of the new one, in the frame that the flag states."""
     from sglpr_jax.loops.map_alignment import align_maps, check_one_frame, without_known_places
 
+    if command.frame != "same":
+        print("comparing up to 300 of the new places with the existing map", file=sys.stderr)
     if command.frame == "check":
         check_one_frame(before, new)
     if command.frame != "align":
