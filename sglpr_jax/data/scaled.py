@@ -22,8 +22,8 @@ SCALE = "scale"
 SCANS = 11
 """Number of scans from which the scale is chosen, spread over the recording."""
 FAR_M = 8.0
-"""Minimum range of scans that are not scaled, in metres (`typical_range_m`). Outdoors and in garages the range is 12 m
-or more, and in corridors and rooms 3 to 7 m."""
+"""Minimum range of scans that are not scaled, in metres (`typical_range_m`). Simulated corridors and rooms
+have 5 to 6 m, warehouses 9 to 13 m, and garages and streets 12 m or more (`benchmarks/quality/ranges.py`)."""
 NEAR_SCALE: Scale = 4
 """Scale of recordings with shorter ranges."""
 

@@ -56,8 +56,13 @@ def described(format: RecordFormat) -> str:
     return f"{format} ({record_type(format).itemsize} bytes a point)"
 
 
-def read_records(path: Path, format: RecordFormat) -> Records:
+def read_records(path: Path, format: RecordFormat, *, last_is_time: bool = False) -> Records:
     """Read a file of records.
+
+    Arguments:
+      path: The file.
+      format: Format of one point.
+      last_is_time: Whether the last of the columns after x, y, z is the time of the point.
 
     Raises:
       ValueError: If the file is empty or too large, or its size is not a multiple of the record size.
@@ -76,10 +81,11 @@ def read_records(path: Path, format: RecordFormat) -> Records:
     with naming(path):
         check_points(size // dtype.itemsize, bytes_each=dtype.itemsize)
     records = np.fromfile(path, dtype=dtype)
+    times = TimeField("time", records["more"][:, -1].copy()) if last_is_time else None
     lasers = records["laser"].astype(np.int32) if "laser" in (dtype.names or ()) else None
     with np.errstate(over="ignore", invalid="ignore"):  # invalid numbers are dropped by the callers
         # Column-major order: the copy takes half the time, and later steps work along the axes.
-        return Records(np.asfortranarray(_our_axes(records["xyz"], format), dtype=np.float32), lasers)
+        return Records(np.asfortranarray(_our_axes(records["xyz"], format), dtype=np.float32), lasers, times)
 
 
 def _our_axes(xyz: np.ndarray, format: RecordFormat) -> np.ndarray:

@@ -7,12 +7,12 @@ Scans are named by their time. Names and GPSTime are in microseconds. Positions 
 points are not changed.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records, described, read_records
-from sglpr_jax.data.point_times import TimeField
+from sglpr_jax.data.formats.bin_records import described, read_records
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.readers.stamped import read_table, stamped_recording
 from sglpr_jax.data.recording import Recording
@@ -39,15 +39,9 @@ def open_recording(root: Path, name: str) -> Recording:
         positions=np.ascontiguousarray(numbers[:, :3]),
         pose_file=folder / POSES,
         tick_s=1e-6,
-        read_points=read_points,
+        read_points=partial(read_records, format="float32x6", last_is_time=True),
         format=f"Boreas, {described('float32x6')}",
     )
-
-
-def read_points(path: Path) -> Records:
-    """Read the points of a scan and their times, which are the last column. Raises what `read_records` raises."""
-    found = read_records(path, "float32x6")
-    return found._replace(times=TimeField("time", np.fromfile(path, "<f4")[5::6].copy()))
 
 
 def _is_sequence(folder: Path) -> bool:
