@@ -215,7 +215,7 @@ def naming(source: Path | str) -> Iterator[None]:
         raise ValueError(f"{source}: {error}") from error
 
 
-def in_short(error: Exception, *, most: int = 100) -> str:
+def in_short(error: Exception | str, *, most: int = 100) -> str:
     """Return the message of another library's error, on one line of at most that many characters."""
     return _cut(" ".join(str(error).split()) or type(error).__name__, most=most)
 

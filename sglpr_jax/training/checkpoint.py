@@ -30,7 +30,7 @@ from sglpr_jax.training.state import TrainState, new_state
 
 _KEPT_LATEST = 2
 _MOST_OF_AN_ERROR = 500
-"""Maximum number of characters of an error of orbax, whose reason comes last."""
+"""Maximum number of characters of an error of orbax, whose reason comes last. The folder is not counted."""
 _INTACT = "the last checkpoint is intact"
 _UNLOGGED = "unlogged"
 _OUTDATED = "outdated"
@@ -180,7 +180,10 @@ class Checkpoints:
         try:
             yield
         except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or in_short(error, most=_MOST_OF_AN_ERROR)
+            named_once = str(error).replace(f"{self._folder}/", "")
+            reason = getattr(error, "strerror", None) or in_short(
+                named_once or type(error).__name__, most=_MOST_OF_AN_ERROR
+            )
             raise OSError(f"{self._folder}: expected to write a checkpoint, found: {reason}; {_INTACT}") from error
 
 
