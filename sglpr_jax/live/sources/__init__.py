@@ -1,0 +1,87 @@
+"""Sources of scans, one module each. A module is imported when its source is asked for.
+
+A module has the function `open_source(where, options, report)`. To support a new source, add a module and its name.
+"""
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+from sglpr_jax.data.choices import PoseFormat, ScanFormat, TimeUnit
+from sglpr_jax.live.frame import LiveFrame
+from sglpr_jax.live.report import Report
+
+SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
+"""Names of the sources, with the extra that each needs."""
+WAIT_S = 0.2
+"""Maximum time that `Source.frames` blocks before it yields None, in seconds."""
+
+
+class Source(Protocol):
+    """Source of scans."""
+
+    def frames(self) -> Iterator[LiveFrame | None]:
+        """Yield scans as they arrive. Yields None after at most `WAIT_S` seconds without a scan, so that the node can
+        react to signals. Ends if no more scans can come."""
+        ...
+
+    def close(self) -> None:
+        """Release threads and connections."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Number of scans that were replaced by newer ones before they were taken."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceOptions:
+    """Options of all sources. Each source uses those that apply to it."""
+
+    topic: str | None = None
+    """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh)."""
+    odometry_topic: str | None = None
+    """Topic of the odometry (Odometry or tf). None: no odometry, except that of a bag's own poses."""
+    rate: float = 1.0
+    """Speed of a replayed bag. 0 is as fast as possible."""
+    poses: Path | None = None
+    """File of poses of a folder, which may grow."""
+    pose_format: PoseFormat = "auto"
+    time_unit: TimeUnit = "auto"
+    format: ScanFormat = "auto"
+    """Format of the scan files of a folder."""
+    taken: Callable[[str], bool] = lambda name: False
+    """Whether a scan with this `Record.name` is in the map already."""
+
+
+def open_source(text: str, options: SourceOptions, report: Report) -> Source:
+    """Open the source that a text names: `NAME` or `NAME:WHERE`, such as `folder:my_scans`.
+
+    Arguments:
+      text: Name of the source and, after a colon, its folder, file, domain or endpoint.
+      options: Options of the source.
+      report: Function for trouble with single scans and messages.
+
+    Raises:
+      ValueError: If no source has this name.
+      ImportError: If the extra of the source is not installed.
+    """
+    name, _, where = text.partition(":")
+    return module_of(name, text, SOURCES, kind="sources").open_source(where, options, report)
+
+
+def module_of(name: str, text: str, known: dict[str, str | None], *, kind: str):
+    """Import the module of a source or sink. Raises ValueError or ImportError, which name the choices or the extra."""
+    if name not in known:
+        raise ValueError(f"{text}: expected one of the {kind} {', '.join(known)}, found {name or 'nothing'}")
+    try:
+        return importlib.import_module(f"sglpr_jax.live.{kind}.{name}")
+    except ModuleNotFoundError as error:
+        if error.name is not None and error.name.startswith("sglpr_jax"):
+            raise
+        raise ImportError(
+            f"{text}: expected the package {error.name}, found none; pip install 'sglpr-jax[{known[name]}]'"
+        ) from error
