@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
-from sglpr_jax.data.choices import PoseFormat, ScanFormat, TimeUnit
+from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.live.frame import LiveFrame
 from sglpr_jax.live.report import Report
 
@@ -53,6 +53,8 @@ class SourceOptions:
     time_unit: TimeUnit = "auto"
     format: ScanFormat = "auto"
     """Format of the scan files of a folder."""
+    sensor_height: SensorHeight = "auto"
+    """Height of the sensor, for a bag, whose scans are all there. For other sources the node estimates it."""
     taken: Callable[[str], bool] = lambda name: False
     """Whether a scan with this `Record.name` is in the map already."""
 
