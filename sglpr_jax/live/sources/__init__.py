@@ -7,7 +7,7 @@ import dataclasses
 import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.live.frame import LiveFrame
@@ -19,6 +19,7 @@ WAIT_S = 0.2
 """Maximum time that `Source.frames` blocks before it yields None, in seconds."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """Source of scans."""
 
