@@ -56,7 +56,7 @@ class Comparer:
 
     def fit_on_floor(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
         """The correlation, and -2 added on another floor by odometry, because floors of a building look alike."""
-        other = on_other_floor(self.motion.poses, self.motion.travelled, self.stored.frames[rows], found, self.drift)
+        other = on_other_floor(self.motion.path, self.stored.frames[rows], found, self.drift)
         return np.asarray(found.correlation - 2 * other)
 
     def with_further(
@@ -83,7 +83,7 @@ class Comparer:
     def about(self, row: int) -> Bool[np.ndarray, " n"]:
         """Whether each stored scan was recorded at about the same time as one of them."""
         frames = self.stored.frames
-        return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s)[frames]
+        return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s, frames)
 
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
