@@ -25,14 +25,12 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 
-PUBLISHERS = {"folder": "benchmarks.speed.live_folder"}
-"""Module of each source with a function `publisher(where)`."""
 WARM_S = 10.0
 """Time before memory is measured for the first time, in seconds."""
 
 
 class Publisher(Protocol):
-    """Publishes scans for a source."""
+    """Publishes scans for a source. The function `publisher(where)` of `benchmarks.speed.live_SOURCE` makes one."""
 
     flags: tuple[str, ...]
     """Flags of bin/live for this source, beside its name."""
@@ -60,6 +58,11 @@ class Options:
     """More flags of bin/live, such as `max-places=500`."""
 
 
+def publisher_of(name: str, where: str) -> Publisher:
+    """Publisher for a source."""
+    return importlib.import_module(f"benchmarks.speed.live_{name}").publisher(where)
+
+
 def measured(options: Options, rate: float) -> dict[str, float]:
     """Run both processes at one rate. Returns a row of the table."""
     with tempfile.TemporaryDirectory() as place:
@@ -67,7 +70,7 @@ def measured(options: Options, rate: float) -> dict[str, float]:
         name, _, where = options.source.partition(":")
         where = str(folder / "scans") if name == "folder" else where
         text = f"{name}:{where}" if where else name
-        publisher = importlib.import_module(PUBLISHERS[name]).publisher(where)
+        publisher = publisher_of(name, where)
         more = [part for flag in options.flags for part in f"--{flag}".split("=", 1)]
         command = ["-m", "sglpr_jax.cli.live", text, "--out", str(folder / "map"), "--weights", options.weights]
         with (folder / "errors.txt").open("w") as errors:
@@ -97,7 +100,7 @@ def publish(name: str, where: str, rate: float, options: Options) -> None:
     clouds = [drive.points(i) for i in range(len(drive))]
     poses = drive.poses.world_from_lidar
     there_and_back = [*range(len(drive)), *range(len(drive) - 2, 0, -1)]
-    publisher = importlib.import_module(PUBLISHERS[name]).publisher(where)
+    publisher = publisher_of(name, where)
     begin = time.monotonic()
     for count in range(int(rate * (options.seconds + WARM_S))):
         time.sleep(max(0.0, begin + count / rate - time.monotonic()))
