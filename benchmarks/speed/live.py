@@ -88,7 +88,7 @@ def measured(options: Options, rate: float) -> dict[str, float]:
         time.sleep(1.0)
         after = results.memory()
         node.send_signal(signal.SIGTERM)
-        node.wait()
+        results.close()
         published = int(rate * (options.seconds + options.warm_s))
         return {"Hz": rate, "start [s]": ready, **results.row(published), **growth(before, after)}
 
@@ -116,7 +116,15 @@ class Results:
         self.of_loops: list[float] = []
         """Latencies in seconds: of each scan, and of each scan with loops, to its last loop."""
         self._node = node
-        threading.Thread(target=self._read, daemon=True).start()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Wait for the end of the node."""
+        self._node.wait()
+        self._thread.join()
+        assert self._node.stdout is not None
+        self._node.stdout.close()
 
     def memory(self) -> tuple[float, float]:
         """Resident memory of the node in MB, and its count of the map's bytes in MB."""
