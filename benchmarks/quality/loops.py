@@ -147,7 +147,7 @@ class Speed:
         peak = finder.comparer.search(spectra, [image], 1).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
-            ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None))),
+            ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None, continues=True))),
             ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
             ("comparison", lambda i: finder.comparer.search(spectra, [image] * sizes[0], sizes[0])),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),

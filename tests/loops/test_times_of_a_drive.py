@@ -51,9 +51,9 @@ def detector_of(params, **options) -> LoopDetector:
     finder = detector.finder
     seen = Seen(np.zeros(finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
 
-    def compared(seen, time, position, pose, clock):
+    def compared(seen, time, pose, clock, *, continues):
         query = len(finder)
-        rows = finder.stored.frames[~finder._excluded(time, position)]
+        rows = finder.stored.frames[~finder._excluded(time, pose, continues=continues)]
         finder.motion.add(clock, pose=POSES[query])
         apart = np.linalg.norm(POSES[rows, :2, 3] - POSES[query, :2, 3], axis=1)
         if not len(rows) or apart.min() > 15:
