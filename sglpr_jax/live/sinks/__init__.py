@@ -4,7 +4,7 @@ A module has the function `open_sink(where, options, report)`. To support a new 
 """
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from sglpr_jax.live.frame import FrameStatus, LoopEdge
 from sglpr_jax.live.report import Report
@@ -14,6 +14,7 @@ SINKS = {"json": None, "dds": "live", "zenoh": "live"}
 """Names of the sinks, with the extra that each needs."""
 
 
+@runtime_checkable
 class Sink(Protocol):
     """Receiver of results. A sink that raises an error is reported once and left out."""
 

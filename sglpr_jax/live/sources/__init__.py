@@ -7,7 +7,7 @@ import dataclasses
 import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, TimeUnit
 from sglpr_jax.live.frame import LiveFrame
@@ -19,6 +19,7 @@ WAIT_S = 0.2
 """Maximum time that `Source.frames` blocks before it yields None, in seconds."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """Source of scans."""
 
@@ -53,6 +54,9 @@ class SourceOptions:
     time_unit: TimeUnit = "auto"
     format: ScanFormat = "auto"
     """Format of the scan files of a folder."""
+    reliable: bool = False
+    """Whether scans that were lost on the way are requested again (dds). Publishers that are best effort then do not
+    match."""
     taken: Callable[[str], bool] = lambda name: False
     """Whether a scan with this `Record.name` is in the map already."""
 
