@@ -127,6 +127,7 @@ class CandidateFinder:
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
         compared: Compared | None = None,
+        continues: bool = True,
     ) -> list[Candidate]:
         """Add a frame that is already described, and return its candidate. Raises the errors of `add`.
 
@@ -135,6 +136,7 @@ class CandidateFinder:
           time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in any fixed frame.
           compared: Comparisons of an earlier run. If they are given, they are not repeated.
+          continues: See `LoopDetector.add_seen`.
         """
         self._check(seen, time, odometry)
         frame = len(self)
@@ -151,14 +153,14 @@ class CandidateFinder:
         detail, keyframe = self.background.without(middle), self.motion.keyframe
         if compared is None:
             position = None if pose is None else pose[:3, 3]
-            compared = self._compared(seen._replace(image=detail), time, position, upright, clock)
+            compared = self._compared(seen._replace(image=detail), time, position, upright, clock, continues=continues)
         else:
-            self.motion.add(clock, pose=upright, link=compared.link)
+            self.motion.add(clock, pose=upright, link=compared.link, continues=continues)
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
         if self.motion.keyframe == frame:
             self._keyframe = detail
-        self._keep(frame, seen, detail, time, pose, empty)
+        self._keep(frame, seen, detail, time, pose, empty, continues=continues)
         self.compared = compared
         return compared.candidates
 
@@ -170,6 +172,8 @@ class CandidateFinder:
         time: float | None,
         pose: Float[np.ndarray, "4 4"] | None,
         empty: bool,
+        *,
+        continues: bool,
     ) -> None:
         """Store what later frames need of a frame."""
         if not empty and self.stored.is_new_place(frame, self.motion):
@@ -179,7 +183,7 @@ class CandidateFinder:
         if time is not None:
             self._times.append(time)
         if pose is not None:
-            self.odometry.add(pose)
+            self.odometry.add(pose, continues=continues)
 
     def seen(self, record: Record) -> Seen:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
@@ -196,16 +200,18 @@ class CandidateFinder:
         position: Float[np.ndarray, " 3"] | None,
         pose: Float[np.ndarray, "4 4"] | None,
         clock: float,
+        *,
+        continues: bool,
     ) -> Compared:
         """Compare the next frame with its nearest frames and the keyframe, and add it to the motion."""
         if self.is_empty(seen.image):
-            self.motion.add(clock, pose=pose)
+            self.motion.add(clock, pose=pose, continues=continues)
             return Compared([], None)
-        excluded = self._excluded(time, position)
+        excluded = self._excluded(time, position, continues=continues)
         compare = self.comparer
         rows = compare.similar(seen.descriptor, excluded)
         key = self.motion.keyframe
-        linked = pose is None and len(self) > 0 and not self.empty[key]
+        linked = pose is None and continues and len(self) > 0 and not self.empty[key]
         matches = [self.stored.image(row) for row in rows.tolist()] + 2 * linked * [self._keyframe]
         priors = np.full((len(matches), 3), np.nan)
         if linked:
@@ -213,7 +219,7 @@ class CandidateFinder:
         spectra = query_spectra(seen.image, config=self.verification)
         peaks = compare.search(spectra, matches, self.config.candidates + self.config.elsewhere + 2 * linked, priors)
         link = self.motion.link(peaks.one(len(rows)), peaks.one(len(rows) + 1)) if linked else None
-        self.motion.add(clock, pose=pose, link=link)
+        self.motion.add(clock, pose=pose, link=link, continues=continues)
         if not len(rows):
             return Compared([], link)
         fit = compare.fit if pose is None else compare.fit_on_floor
@@ -233,15 +239,20 @@ class CandidateFinder:
         if time is not None and self.times is not None and time < self.times[-1]:
             raise ValueError(f"expected times that do not decrease, found {time} after {self.times[-1]}")
 
-    def _excluded(self, time: float | None, position: Float[np.ndarray, " 3"] | None) -> Bool[np.ndarray, " n"]:
+    def _excluded(
+        self, time: float | None, position: Float[np.ndarray, " 3"] | None, *, continues: bool
+    ) -> Bool[np.ndarray, " n"]:
         """Stored scans that cannot match the next frame: too recent, or too far away by odometry."""
         config, frames = self.config, self.stored.frames
         recent = are_recent(len(self), self.times, time, seconds=config.exclude_s, frames=config.exclude_frames)
+        if not continues:
+            return recent[frames]
         excluded = (recent | self.motion.near_last(config.min_travelled_m))[frames]
         if position is not None and len(self.odometry):
             known = self.odometry.poses[:, :3, 3]
             drifted = position_deviations(np.concatenate([known, position[None]]), -1, drift=self.drift)[:-1]
             apart = np.linalg.norm(known[frames] - position, axis=1)
             place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
-            excluded = excluded | (apart > place_m + self.drift.max_deviation * drifted[frames])
+            far = apart > place_m + self.drift.max_deviation * drifted[frames]
+            excluded = excluded | (far & self.motion.same(len(self) - 1, frames))
         return excluded

@@ -56,7 +56,9 @@ class Comparer:
 
     def fit_on_floor(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
         """The correlation, and -2 added on another floor by odometry, because floors of a building look alike."""
-        other = on_other_floor(self.motion.poses, self.motion.travelled, self.stored.frames[rows], found, self.drift)
+        motion, frames = self.motion, self.stored.frames[rows]
+        other = on_other_floor(motion.poses, motion.travelled, frames, found, self.drift)
+        other = other & motion.same(len(motion) - 1, frames)
         return np.asarray(found.correlation - 2 * other)
 
     def with_further(

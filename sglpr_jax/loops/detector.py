@@ -21,6 +21,7 @@ from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.drift import deviations
 from sglpr_jax.loops.given import DATES, given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
+from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion, agree_in_order
@@ -104,6 +105,7 @@ class LoopDetector:
         *,
         time: float | np.datetime64 | np.timedelta64 | datetime.datetime | datetime.timedelta | None = None,
         odometry: ArrayLike | None = None,
+        continues: bool = True,
     ) -> list[Loop]:
         """Add the next frame. Returns the loops that it closes or confirms, of this and of the last few frames.
 
@@ -112,6 +114,8 @@ class LoopDetector:
             `density_bev`.
           time: Time of the scan in `time_unit`, or a date.
           odometry: Pose of the LiDAR in a fixed frame. It may drift.
+          continues: False if the motion since the last frame is unknown, for example after a restart. The odometry may
+            then begin in another frame.
 
         Raises:
           ValueError: If a value has another shape, if times decrease or are not in seconds, or if only some frames have
@@ -120,7 +124,7 @@ class LoopDetector:
         """
         record, pose = given_record(scan), given_pose(odometry)
         seconds = self._seconds(time)
-        return self.add_seen(self.finder.seen(record), time=seconds, odometry=pose)
+        return self.add_seen(self.finder.seen(record), time=seconds, odometry=pose, continues=continues)
 
     def _seconds(self, time: Any) -> float | None:
         """Convert a time to seconds. Raises ValueError as soon as the steps show another unit than before or, with
@@ -145,6 +149,7 @@ class LoopDetector:
         time: float | None = None,
         odometry: Float[np.ndarray, "4 4"] | None = None,
         compared: Compared | None = None,
+        continues: bool = True,
     ) -> list[Loop]:
         """Add a frame that is already described, and return loops as `add` does.
 
@@ -153,8 +158,9 @@ class LoopDetector:
           time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in a fixed frame.
           compared: Comparisons of an earlier run (`loops.unfinished`).
+          continues: See `add`.
         """
-        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared)
+        candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared, continues=continues)
         self.candidates += candidates
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
@@ -221,6 +227,9 @@ class LoopDetector:
             guessed_m = motion.guessed_m
         apart = deviations(loops, poses, drift=drift, mounting=mounting, guessed_m=guessed_m)
         fits = apart <= drift.max_deviation
+        if len(self.finder.odometry):  # loops between two parts of the trajectory cannot contradict it
+            query, match = frames_of(loops)
+            fits = fits | (motion.segments[query] != motion.segments[match])
         self._reject([loop for loop, fit in zip(loops, fits, strict=True) if not fit], reason)
         return [loop for loop, fit in zip(loops, fits, strict=True) if fit]
 

@@ -158,7 +158,12 @@ def write_loops_jsonl(
     path: Path | str, loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None
 ) -> None:
     """Write loops, one JSON object a line, with the `ids` and the `recordings` of the frames if they are given."""
-    write_text(Path(path), "".join(f"{json.dumps(_as_json(loop, ids, recordings))}\n" for loop in loops))
+    write_text(Path(path), loop_lines(loops, ids, recordings))
+
+
+def loop_lines(loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None) -> str:
+    """Return the lines of a file of `write_loops_jsonl`."""
+    return "".join(f"{json.dumps(_as_json(loop, ids, recordings))}\n" for loop in loops)
 
 
 def write_rejected_jsonl(

@@ -19,6 +19,8 @@ from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
+UNKNOWN_M = 1e6
+"""Length of measured path with the same drift as an unknown motion, in metres: the sensor may be anywhere."""
 NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8"), ("clock", "f8")]
 """Numbers of a frame beside its pose."""
 
@@ -80,8 +82,20 @@ class Motion:
         """Number of bytes that the arrays hold."""
         return self._poses.nbytes + self._numbers.nbytes
 
-    def add(self, time: float, *, pose: Float[np.ndarray, "4 4"] | None = None, link: Peak | None = None) -> None:
-        """Add a frame at `time` (seconds), by its `pose` from odometry or its peak `link` over the keyframe."""
+    def add(
+        self,
+        time: float,
+        *,
+        pose: Float[np.ndarray, "4 4"] | None = None,
+        link: Peak | None = None,
+        continues: bool = True,
+    ) -> None:
+        """Add a frame at `time` (seconds), by its `pose` from odometry or its peak `link` over the keyframe.
+
+        With `continues=False`, the motion since the last frame is unknown, as after a restart.
+        """
+        if len(self) and not continues:
+            return self._begin(time, self.poses[-1] if pose is None else pose)
         key, coasts = self.keyframe, False
         if (
             pose is None
@@ -143,6 +157,13 @@ class Motion:
             clock=self.clock[-1] + seconds,
             guessed_m=self._drifted_m(time),
         )
+
+    def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Add the first frame after an unknown motion."""
+        clock = self.clock[-1] + time - self._times[-1]
+        last = {"travelled": self.travelled[-1] + UNKNOWN_M, "guessed_m": self.guessed_m[-1] + UNKNOWN_M}
+        self._append(time, pose, segment=int(self.segments[-1]) + 1, clock=clock, **last)
+        self._coasted, self._m_per_s, self.keyframe = 0, 0.0, len(self) - 1
 
     def _drifted_m(self, time: float) -> float:
         """Next value of `guessed_m`, if the motion since the last frame is a guess."""

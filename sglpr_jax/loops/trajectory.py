@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.growing import GrowingArray
+from sglpr_jax.loops.motion import UNKNOWN_M
 from sglpr_jax.loops.transforms import travelled
 
 
@@ -32,8 +33,8 @@ class Trajectory:
         """Number of bytes that the arrays hold."""
         return self._poses.nbytes + self._travelled.nbytes
 
-    def add(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add the pose of the next frame."""
+    def add(self, pose: Float[np.ndarray, "4 4"], *, continues: bool = True) -> None:
+        """Add the pose of the next frame. If it is not in the fixed frame of those before, `continues` is False."""
         self._poses.append(pose)
         before = self._travelled.rows[-1] if len(self._travelled) else 0.0
-        self._travelled.append(before + travelled(self.poses[-2:])[-1])
+        self._travelled.append(before + (travelled(self.poses[-2:])[-1] if continues else UNKNOWN_M))

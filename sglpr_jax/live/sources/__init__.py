@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from sglpr_jax.data.choices import PoseFormat, ScanFormat, TimeUnit
+from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.live.frame import LiveFrame
 from sglpr_jax.live.report import Report
 
@@ -46,6 +46,9 @@ class SourceOptions:
     """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh)."""
     odometry_topic: str | None = None
     """Topic of the odometry (Odometry or tf). None: no odometry, except that of a bag's own poses."""
+    reliable: bool = False
+    """Whether scans that were lost on the way are requested again (dds). Publishers that are best effort then do not
+    match."""
     rate: float = 1.0
     """Speed of a replayed bag. 0 is as fast as possible."""
     poses: Path | None = None
@@ -54,9 +57,8 @@ class SourceOptions:
     time_unit: TimeUnit = "auto"
     format: ScanFormat = "auto"
     """Format of the scan files of a folder."""
-    reliable: bool = False
-    """Whether scans that were lost on the way are requested again (dds). Publishers that are best effort then do not
-    match."""
+    sensor_height: SensorHeight = "auto"
+    """Height of the sensor, for a bag, whose scans are all there. For other sources the node estimates it."""
     taken: Callable[[str], bool] = lambda name: False
     """Whether a scan with this `Record.name` is in the map already."""
 

@@ -1,0 +1,202 @@
+"""bin/live: find loop closures while the robot drives."""
+
+import contextlib
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from sglpr_jax.cli.config_file import record_command
+from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
+from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
+from sglpr_jax.fields import NotNegative
+from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, MIN_PROBABILITY
+from sglpr_jax.loops.config import (
+    CandidateConfig,
+    ConsistencyConfig,
+    DetectorConfig,
+    DriftModel,
+    SequenceConfig,
+    VerificationConfig,
+)
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+
+if TYPE_CHECKING:
+    from sglpr_jax.live.live_map import LiveMap
+    from sglpr_jax.live.report import Report
+    from sglpr_jax.live.sinks import Sink
+    from sglpr_jax.live.sources import Source
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveCommand:
+    """Find loop closures while the robot drives, and publish them at once.
+
+    Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
+    `dds:DOMAIN` (ROS 2), `zenoh` or `zenoh:ENDPOINT`. Sinks: `json` (lines on standard output), `json:FILE`, `dds`,
+    `zenoh`.
+
+    The output folder holds the map. A command with the same --out continues it, also after a crash. Ctrl-C or SIGTERM
+    ends the command and writes loops.g2o, loops.csv, rejected.jsonl and trajectory.tum.
+
+    Example:
+      bin/live dds --topic /points --odometry-topic /odom --sinks dds json:loops.txt --out map
+      bin/live folder:incoming --poses incoming/poses.tum --out map
+      bin/live bag:drive.mcap --odometry-topic /odom --rate 2 --out map
+    """
+
+    source: Annotated[str, tyro.conf.Positional]
+    """Source of the scans."""
+    out: Path
+    """Folder of the map and the results."""
+    sinks: tuple[str, ...] = ("json",)
+    """Receivers of loops and of the status after each scan."""
+    weights: str = DEFAULT_WEIGHTS
+    """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors."""
+    topic: str | None = None
+    """Topic of the point clouds."""
+    odometry_topic: str | None = None
+    """Topic of the odometry. Without odometry, loops are found by the scans alone."""
+    rate: NotNegative = 1.0
+    """Speed of a replayed bag. 0 is as fast as possible."""
+    poses: Path | None = None
+    """File of odometry for a folder, which may grow: tum, or a line for each scan."""
+    pose_format: PoseFormat = "auto"
+    """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum."""
+    time_unit: TimeUnit = "auto"
+    """Unit of the times in --poses. `auto` expects seconds."""
+    format: ScanFormat = "auto"
+    """Format of the scan files of a folder."""
+    sensor_height: SensorHeight = "auto"
+    """Height of the sensor above the ground, in metres. `auto` estimates height and tilt from the first scans."""
+    topic_prefix: str = "/sglpr"
+    """Beginning of the names of published topics."""
+    map_frame: str = "map"
+    """Name of the map's frame in published messages."""
+    odometry_frame: str = "odom"
+    """Name of the odometry's frame in published messages."""
+    drift_percent: float = DRIFT_PERCENT
+    """Position drift of the odometry: one standard deviation, in percent of the travelled distance."""
+    drift_deg_per_100m: float = DRIFT_DEG_PER_100M
+    """Heading drift of the odometry: one standard deviation, in degrees per 100 m."""
+    drift_height_percent: float = DRIFT_HEIGHT_PERCENT
+    """Height drift of the odometry: one standard deviation, in percent of the travelled distance."""
+    min_probability: float = MIN_PROBABILITY
+    """Minimum probability of a loop."""
+    near_m: float = DetectorConfig.near_m
+    """With odometry, a loop must agree with at least half of the loops within this travelled distance, in metres."""
+    keyframe_m: float = DetectorConfig.keyframe_m
+    """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
+    max_places: int | None = DetectorConfig.max_places
+    """Maximum number of stored scans, to limit memory. By default all are stored."""
+    candidates: CandidateConfig = DetectorConfig.candidates
+    verification: VerificationConfig = DetectorConfig.verification
+    consistency: ConsistencyConfig = DetectorConfig.consistency
+    sequence: SequenceConfig = DetectorConfig.sequence
+    motion_drift: DriftModel = DetectorConfig.motion_drift
+
+    @property
+    def expects_odometry(self) -> bool:
+        """Whether the user asked for odometry."""
+        return self.odometry_topic is not None or self.poses is not None
+
+    @property
+    def detector(self) -> DetectorConfig:
+        """Settings of the detector."""
+        drift = DriftModel(
+            metres_per_metre=self.drift_percent / 100,
+            degrees_per_metre=self.drift_deg_per_100m / 100,
+            height_per_metre=self.drift_height_percent / 100,
+        )
+        names = [field.name for field in dataclasses.fields(DetectorConfig) if field.name != "drift"]
+        return DetectorConfig(drift=drift, **{name: getattr(self, name) for name in names})
+
+
+def live(command: LiveCommand) -> int:
+    """Run the command. Returns the exit status."""
+    from sglpr_jax.loops.unfinished import alone  # slow import, not needed for --help
+
+    with alone(command.out):
+        return _run(command)
+
+
+def _run(command: LiveCommand) -> int:
+    from sglpr_jax.live.node import Node
+    from sglpr_jax.live.report import Reports
+    from sglpr_jax.live.results import write_results
+
+    report = Reports()
+    with stop_on_signal() as stop, contextlib.ExitStack() as opened:
+        found = _map(command, report)
+        opened.callback(found.close)
+        missed = found.recall()
+        sinks = [_sink(text, command, report) for text in command.sinks]
+        for sink in sinks:
+            opened.callback(_closed, sink, report)
+        source = _source(command, found, report)
+        opened.callback(source.close)
+        node = Node(found, sinks, report=report, say=_say)
+        node.publish(missed)
+        _say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
+        node.run(source, should_stop=stop)
+        _say(str(node))
+        paths = [*write_results(found, command.out), record_command(command, command.out)]
+        _say(f"{command.out}: {', '.join(path.name for path in paths)}")
+    return stop.exit_status
+
+
+def _map(command: LiveCommand, report: "Report") -> "LiveMap":
+    """Open the map, with all programs compiled."""
+    from sglpr_jax.live.live_map import LiveMap
+    from sglpr_jax.live.warm_up import warm_up
+    from sglpr_jax.loops.detector import LoopDetector
+    from sglpr_jax.models.weights_file import load
+
+    params, config = load(command.weights), command.detector
+    found = LiveMap(
+        LoopDetector(params, config=config, time_unit="s"),
+        command.out,
+        report=report,
+        sensor_height=command.sensor_height,
+        expects_odometry=command.expects_odometry,
+    )
+    warm_up(params, config, odometry=command.expects_odometry)
+    return found
+
+
+def _source(command: LiveCommand, found: "LiveMap", report: "Report") -> "Source":
+    from sglpr_jax.live.sources import SourceOptions, open_source
+
+    names = [field.name for field in dataclasses.fields(SourceOptions) if field.name != "taken"]
+    options = SourceOptions(**{name: getattr(command, name) for name in names}, taken=found.names.__contains__)
+    return open_source(command.source, options, report)
+
+
+def _sink(text: str, command: LiveCommand, report: "Report") -> "Sink":
+    from sglpr_jax.live.sinks import SinkOptions, open_sink
+
+    options = SinkOptions(command.topic_prefix, command.map_frame, command.odometry_frame)
+    return open_sink(text, options, report)
+
+
+def _closed(sink: "Sink", report: "Report") -> None:
+    """Close a sink, and report if it fails: the other results are still written."""
+    try:
+        sink.close()
+    except Exception as error:  # a sink may use any library
+        report("close", f"{type(sink).__name__}: {error}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: parse_command(LiveCommand, "live"), lambda command: sys.exit(live(command)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Odometry of a live map: whether the pose of a scan continues the trajectory, and what to do without one."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.live.report import Report
+from sglpr_jax.loops.transforms import inverse
+
+FASTEST_M_PER_S, SLACK_M = 60.0, 1.0
+"""Maximum speed of a vehicle, and an additional distance between two scans, in metres."""
+RESTART_S = 60.0
+"""Maximum time without a scan after which the odometry may continue, in seconds."""
+RESET_M = 0.2
+"""Distance from the origin, in metres, within which odometry begins. A pose that gets there from more than five times
+this distance was reset."""
+HOLD_S = 2.0
+"""Time without odometry for which scans are left out, in seconds. Later scans are added at an unknown place."""
+WAIT_S = 10.0
+"""Time for which the first scans wait for odometry that was asked for, in seconds."""
+
+
+class Placed(NamedTuple):
+    """Pose of a scan for the detector."""
+
+    pose: Float[np.ndarray, "4 4"] | None
+    continues: bool
+    """Whether the motion since the last scan is known."""
+
+
+class Continuity:
+    """Decides for each scan whether its odometry continues. The first scan decides whether the map has odometry."""
+
+    def __init__(self, report: Report, *, expected: bool):
+        """Begin a map. `expected` says that odometry was asked for, so that the first scans wait for it."""
+        self._report, self._expected = report, expected
+        self._used: bool | None = None
+        self._last: Float[np.ndarray, "4 4"] | None = None
+        self._time = 0.0
+        """Time of `_last`, in seconds."""
+        self._began: float | None = None
+        self._known = True
+        """Whether the scan before was placed by odometry."""
+        self._resumed = False
+
+    def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> None:
+        """Continue a map of an earlier process, whose last scan had this pose at this time."""
+        self._used, self._last, self._time, self._resumed = pose is not None, pose, time, True
+
+    def placed(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> Placed | None:
+        """Place the next scan, or return None if it is to be left out.
+
+        Arguments:
+          pose: Pose by odometry, or None if it is unknown.
+          time: Time of the scan, in seconds, which does not decrease.
+        """
+        if self._used is None and not self._decided(pose, time):
+            return None
+        resumed, self._resumed = self._resumed, False
+        if not self._used:
+            if pose is not None:
+                self._report("odometry", "expected no odometry, because the map began without it; it is not used")
+            if resumed:
+                self._report("restart", "the way since the restart's last scan is unknown")
+            return Placed(None, not resumed)
+        if pose is None:
+            return self._without(time, resumed)
+        continues = self._last is None or (self._known and self._continues(pose, time, resumed))
+        if not continues or resumed:
+            said = "continues" if continues else "is taken as unknown, and begins in a frame of its own"
+            self._report("restart" if resumed else "jump", f"the odometry {said}{' after the restart' * resumed}")
+        self._last, self._time, self._known = pose, time, True
+        return Placed(pose, continues)
+
+    def _decided(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> bool:
+        """Decide whether the map has odometry. Returns False while the first scans wait for it."""
+        self._began = time if self._began is None else self._began
+        if pose is None and self._expected and time - self._began < WAIT_S:
+            self._report("wait", "expected odometry, found none yet; scans are left out until it comes")
+            return False
+        self._used = pose is not None
+        if self._expected and not self._used:
+            self._report("wait over", f"expected odometry, found none for {WAIT_S:.0f} s; the map is made without it")
+        return True
+
+    def _without(self, time: float, resumed: bool) -> Placed | None:
+        """Place a scan without odometry in a map that has odometry."""
+        if not resumed and self._known and time - self._time < HOLD_S:
+            self._report("hold", "expected odometry at a scan, found none; the scan is left out")
+            return None
+        self._report(
+            "stopped", f"expected odometry, found none for {time - self._time:.0f} s; loops are found by scans"
+        )
+        self._known = False
+        return Placed(np.eye(4) if self._last is None else self._last, False)
+
+    def _continues(self, pose: Float[np.ndarray, "4 4"], time: float, resumed: bool) -> bool:
+        """Whether a pose can follow the last one: near enough, not reset to the origin, and not after a long stop."""
+        assert self._last is not None
+        passed = time - self._time
+        moved = float(np.linalg.norm((inverse(self._last) @ pose)[:3, 3]))
+        reset = float(np.linalg.norm(pose[:3, 3])) < RESET_M and moved > 5 * RESET_M
+        near = moved <= SLACK_M + FASTEST_M_PER_S * passed
+        return near and not reset and (not resumed or passed <= RESTART_S)

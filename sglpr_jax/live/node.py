@@ -1,0 +1,102 @@
+"""The running node: scans from a source, through the map, to sinks. It survives errors of single scans and sinks."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sglpr_jax.files import in_short
+from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
+from sglpr_jax.live.live_map import LiveMap
+from sglpr_jax.live.report import Report
+from sglpr_jax.live.sinks import Sink
+from sglpr_jax.live.sources import Source
+
+EVERY_S = 10.0
+"""Time between two lines about the progress, in seconds."""
+LATEST = 100
+"""Number of latest scans whose times are summed up in a line."""
+
+
+class Node:
+    """Takes scans from a source until it ends or `should_stop` is true, and hands the results to the sinks."""
+
+    def __init__(self, live: LiveMap, sinks: Sequence[Sink], *, report: Report, say: Callable[[str], None]):
+        """Connect a map to sinks.
+
+        Arguments:
+          live: The map, after `recall`.
+          sinks: Receivers of results.
+          report: Function for trouble.
+          say: Function for lines about the progress.
+        """
+        self._live, self._sinks, self._report, self._say = live, list(sinks), report, say
+        self._seconds: deque[float] = deque(maxlen=LATEST)
+        self._latest = 0.0
+        self.scans = self.left_out = self.dropped = self.loops = 0
+        """Numbers of scans that were added, left out and dropped, and of loops, since the start."""
+
+    def run(self, source: Source, *, should_stop: Callable[[], bool] = lambda: False) -> None:
+        """Process scans. The source and the sinks are not closed."""
+        said = time.monotonic()
+        for frame in source.frames():
+            if frame is not None:
+                self.dropped = source.dropped
+                self._process(frame)
+            if time.monotonic() - said >= EVERY_S:
+                said = time.monotonic()
+                self._say(str(self))
+            if should_stop():
+                break
+        self.dropped = source.dropped
+
+    def publish(self, edges: Iterable[LoopEdge]) -> None:
+        """Hand loops to the sinks."""
+        for edge in edges:
+            self.loops += 1
+            self._to_sinks("loop", edge)
+
+    def __str__(self) -> str:
+        rate = f", {1000 * float(np.median(self._seconds)):.0f} ms a scan" if self._seconds else ""
+        memory = f"{self._live.detector.nbytes / 1e6:.0f} MB"
+        return (
+            f"{self.scans} scans{rate}, {self.dropped} dropped, {self.left_out} left out, {self.loops} loops; "
+            f"the map has {len(self._live)} scans, {memory}"
+        )
+
+    def _process(self, frame: LiveFrame) -> None:
+        begin = time.monotonic()
+        try:
+            edges = self._live.add(frame)
+        except (ValueError, TypeError, FloatingPointError) as error:
+            self._report("scan", f"a scan is left out: {in_short(error, most=300)}")
+            edges = None
+        if edges is None:
+            self.left_out += 1
+            return
+        end = time.monotonic()
+        self.scans += 1
+        self._seconds.append(end - begin)
+        self.publish(edges)
+        finder = self._live.detector.finder
+        status = FrameStatus(
+            frame=len(self._live) - 1,
+            time=frame.time,
+            seconds=end - begin,
+            latency_s=end - frame.received,
+            dropped=self.dropped,
+            places=len(finder.stored),
+            nbytes=self._live.detector.nbytes,
+        )
+        self._to_sinks("frame", status)
+
+    def _to_sinks(self, what: str, value: Any) -> None:
+        """Call a method of every sink. A sink that fails is reported and left out."""
+        for sink in list(self._sinks):
+            try:
+                getattr(sink, what)(value)
+            except Exception as error:  # a sink may use any library
+                self._sinks.remove(sink)
+                self._report(f"sink {id(sink)}", f"{type(sink).__name__} is left out: {in_short(error, most=300)}")

@@ -1,0 +1,146 @@
+"""A folder into which another program writes scans, one file each. Every scan is taken once it is complete."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from sglpr_jax.data.choices import RecordFormat
+from sglpr_jax.data.formats.record_size import record_of_scan
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, says_its_format
+from sglpr_jax.data.listing import files_in
+from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.times import EPOCH
+from sglpr_jax.live.frame import LiveFrame
+from sglpr_jax.live.report import Report
+from sglpr_jax.live.sources import SourceOptions
+from sglpr_jax.live.sources.growing_poses import GrowingPoses
+
+LOOK_S = 0.05
+"""Time between two looks at the folder, in seconds."""
+QUIET_S = 2.0
+"""Age of a file, in seconds, from which it is complete at the first look."""
+POSE_S = 1.0
+"""Maximum time that a scan waits for its pose, in seconds."""
+
+
+class FolderSource:
+    """Scans in the order of their names. A scan is complete if its size is the same at two looks."""
+
+    dropped = 0
+    """Scans are never dropped: their files stay until they are read."""
+
+    def __init__(self, root: Path, options: SourceOptions, report: Report):
+        self._root, self._options, self._report = root, options, report
+        self._records: RecordFormat | None = None
+        self._sizes: dict[Path, int] = {}
+        """Size of each waiting file at the last look."""
+        self._done: set[Path] = set()
+        self._waiting: list[Path] = []
+        self._changed = 0
+        self._stopped = False
+        found = files_in(root, *ENDINGS) or files_in(root, *ARRAY_ENDINGS)
+        last = max((i for i, path in enumerate(found) if options.taken(_name(path))), default=-1)
+        self._done.update(found[: last + 1])
+        self._poses = (
+            None if options.poses is None else GrowingPoses(options.poses, options.pose_format, options.time_unit)
+        )
+
+    def frames(self) -> Iterator[LiveFrame | None]:
+        """Yield scans as they are completed. Never ends."""
+        while not self._stopped:
+            self._look()
+            path = self._complete()
+            if path is None:
+                time.sleep(LOOK_S)
+                yield None
+                continue
+            received = time.monotonic()
+            self._done.add(path)
+            yield from self._frame(path, received)
+
+    def close(self) -> None:
+        """End `frames`."""
+        self._stopped = True
+
+    def _look(self) -> None:
+        """List the folder again if a file was added."""
+        try:
+            changed = self._root.stat().st_mtime_ns
+            if changed == self._changed and time.time_ns() - changed > QUIET_S * 1e9:
+                return
+            found = files_in(self._root, *ENDINGS) or files_in(self._root, *ARRAY_ENDINGS)
+        except OSError as error:
+            return self._report("folder", f"{self._root}: expected a folder of scans, found none ({error.strerror})")
+        self._changed = changed
+        self._waiting = [path for path in found if path not in self._done]
+
+    def _complete(self) -> Path | None:
+        """The first waiting scan, if it is complete."""
+        if not self._waiting:
+            return None
+        path = self._waiting[0]
+        try:
+            about = path.stat()
+        except OSError:  # it was removed or renamed
+            self._waiting.pop(0)
+            return None
+        old = time.time() - about.st_mtime > QUIET_S
+        if about.st_size == 0 and not old:
+            return None
+        if old or self._sizes.get(path) == about.st_size:
+            self._sizes.pop(path, None)
+            return self._waiting.pop(0)
+        self._sizes[path] = about.st_size
+        return None
+
+    def _frame(self, path: Path, received: float) -> Iterator[LiveFrame | None]:
+        """Read a scan and wait for its pose. A scan that cannot be read is reported."""
+        try:
+            record = scan_record(path, format=self._options.format, records=self._record_of(path))
+            seconds = _time_in_name(path)
+            stamp = path.stat().st_mtime if seconds is None else seconds
+        except (ValueError, OSError, ImportError) as error:
+            return self._report("scan", f"a scan is left out: {error}")
+        pose = None
+        if self._poses is not None:
+            row, end = len(self._done) - 1, time.monotonic() + POSE_S
+            while (pose := self._pose(row, seconds)) is None and time.monotonic() < end:
+                time.sleep(LOOK_S)
+                yield None
+        yield LiveFrame(dataclasses.replace(record, name=_name(path)), stamp, pose, received)
+
+    def _pose(self, row: int, seconds: float | None):
+        assert self._poses is not None
+        try:
+            self._poses.look()
+            return self._poses.of(row, seconds)
+        except ValueError as error:
+            return self._report("poses", f"a pose is left out: {error}")
+
+    def _record_of(self, path: Path) -> RecordFormat:
+        """Format of .bin files whose name does not define it, by the content of the first one."""
+        if self._records is None and self._options.format == "auto" and not says_its_format(path):
+            self._records = record_of_scan(path)
+        return self._records or "kitti"
+
+
+def _name(path: Path) -> str:
+    return str(path.resolve())
+
+
+def _time_in_name(path: Path) -> float | None:
+    """Time in seconds that the name of a file states, such as 1690000000.25.pcd, or None."""
+    try:
+        seconds = float(path.name[: -len(path.suffix)])
+    except ValueError:
+        return None
+    return seconds if "." in path.stem and seconds > EPOCH else None
+
+
+def open_source(where: str, options: SourceOptions, report: Report) -> FolderSource:
+    """Open the folder `where`. Raises FileNotFoundError if it does not exist."""
+    root = Path(where)
+    if not where or not root.is_dir():
+        raise FileNotFoundError(f"folder:{where}: expected a folder, into which scans are written, found none")
+    return FolderSource(root, options, report)
