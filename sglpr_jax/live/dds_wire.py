@@ -6,6 +6,7 @@ the type information that newer releases of rmw_cyclonedds send. Messages stay C
 """
 
 import functools
+import os
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
-from cyclonedds.domain import DomainParticipant
+from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
@@ -29,6 +30,9 @@ PREFIX = "rt"
 """Beginning of the names of ROS 2 topics on the wire. Services have others."""
 LOOK_S = 1.0
 """Time between two looks at subscriptions and publishers with other settings, in seconds."""
+BUFFER = '<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max="16MB"/></Internal></Domain></CycloneDDS>'
+"""Setting of cyclonedds: scans of 2 MB arrive as a burst of packets, of which its usual buffer of 1 MB loses many. The
+system may set a lower limit (`net.core.rmem_max`)."""
 POLICIES = {2: "durability", 4: "deadline", 8: "liveliness", 10: "partition", 11: "reliability", 23: "representation"}
 """Names of QoS policies, by their numbers in the standard."""
 TYPE = 24
@@ -53,9 +57,19 @@ class DdsWire:
     """Participant of a DDS domain. A thread takes the messages. See `ros_wire.Wire`."""
 
     def __init__(self, domain: int, report: Report):
-        """Join a domain. CYCLONEDDS_URI in the environment selects interfaces, as for ROS 2."""
+        """Join a domain. CYCLONEDDS_URI in the environment configures cyclonedds, as for ROS 2.
+
+        Raises ValueError if cyclonedds cannot use the network or this configuration.
+        """
         self._report = report
-        self._participant = DomainParticipant(domain)
+        _configure(domain)
+        try:
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            found = os.environ.get("CYCLONEDDS_URI", "no CYCLONEDDS_URI")
+            raise ValueError(
+                f"dds:{domain}: expected a network and a valid CYCLONEDDS_URI, found {found} ({in_short(error)})"
+            ) from error
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._waiting = WaitSet(self._participant)
         self._topics: dict[tuple[str, str], Topic] = {}
@@ -143,6 +157,15 @@ class DdsWire:
             if found.total_count_change > 0 and found.last_policy_id != TYPE:
                 policy = POLICIES.get(found.last_policy_id, f"policy {found.last_policy_id}")
                 self._report(f"qos {text}", f"{text} ({policy}); they do not exchange messages")
+
+
+@functools.cache
+def _configure(domain: int) -> Domain | None:
+    """Configure a domain for this process, once. The settings of the environment come after ours and override them."""
+    try:
+        return Domain(domain, ",".join(filter(None, (BUFFER, os.environ.get("CYCLONEDDS_URI")))))
+    except DDSException:  # another part of the process uses the domain
+        return None
 
 
 def _qos(depth: int, *, reliable: bool, latched: bool) -> Qos:

@@ -1,6 +1,7 @@
 """Scans from another process, and loops to subscribers, over DDS and zenoh."""
 
 import contextlib
+import itertools
 import os
 import socket
 import subprocess
@@ -28,6 +29,7 @@ LOOPBACK = (
     "<MaxAutoParticipantIndex>40</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
     "</Domain></CycloneDDS>"
 )
+_DOMAINS = itertools.count(os.getpid(), 7)
 SOON_S = 20.0
 """Time in which everything happens that these tests wait for, even on a busy machine."""
 STILL = (0, 0, 0, 1)
@@ -40,9 +42,9 @@ def said() -> Said:
 
 @pytest.fixture
 def domain(monkeypatch) -> str:
-    """A DDS domain of this process, on this computer only."""
+    """A DDS domain of this test, on this computer only. Publishers that were killed stay in theirs for seconds."""
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    return str(10 + os.getpid() % 90)
+    return str(10 + next(_DOMAINS) % 90)
 
 
 @pytest.fixture
@@ -187,6 +189,12 @@ def test_edges_reach_a_subscriber_that_comes_later_over_zenoh(endpoint, said, mo
     other.close()
     sink.close()
     assert not said
+
+
+def test_a_wrong_configuration_is_one_clear_error(domain, monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", "<nonsense")
+    with pytest.raises(ValueError, match=f"dds:{domain}: expected a network and a valid CYCLONEDDS_URI, found <nonsense"):
+        open_source(f"dds:{domain}", SourceOptions(), Said())
 
 
 def test_an_endpoint_that_is_none_is_one_clear_error(said):
