@@ -35,11 +35,13 @@ os.environ |= KEPT | {"XLA_FLAGS": f"{COMPILE} {os.environ.get('XLA_FLAGS', '')}
 TESTS = Path(__file__).resolve().parent
 RUN_LONG = (
     "benchmark_programs/test_loops.py",
+    "cli/test_live",
     "cli/test_loops",
     "cli/test_map.py",
     "docs/test_blocks.py::test_python_runs[README.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/loops.md]",
     "docs/test_blocks.py::test_python_runs[docs/guides/maps.md]",
+    "live/test_live_map.py",
     "loops/",
     "sim/",
 )

@@ -140,10 +140,12 @@ def _run(command: LiveCommand) -> int:
         node = Node(found, sinks, report=report, say=_say)
         node.publish(missed)
         _say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
-        node.run(source, should_stop=stop)
-        _say(str(node))
-        paths = [*write_results(found, command.out), record_command(command, command.out)]
-        _say(f"{command.out}: {', '.join(path.name for path in paths)}")
+        try:
+            node.run(source, should_stop=stop)
+        finally:
+            _say(str(node))
+            paths = [*write_results(found, command.out), record_command(command, command.out)]
+            _say(f"{command.out}: {', '.join(path.name for path in paths)}")
     return stop.exit_status
 
 

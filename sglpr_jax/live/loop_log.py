@@ -21,8 +21,8 @@ class LoopLog:
         """Begin with these loops, and return those that the file of an earlier process lacks."""
         written = _pairs(self.path)
         missed = [loop for loop in loops if (loop.query, loop.match) not in written]
-        if missed or len(written) != len(loops):
-            if written:
+        if not self.path.is_file() or self.path.read_bytes() != loop_lines(loops).encode():
+            if missed and written:
                 self._report("log", f"{self.path}: {len(missed)} loops were added that the last process did not write")
             write_loops_jsonl(self.path, loops)
         with writing(self.path):

@@ -22,4 +22,4 @@ def warm_up(params: Params, config: DetectorConfig, *, odometry: bool) -> None:
     draw = np.random.default_rng(0)
     for i in range(SCANS):
         points = draw.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)
-        detector.add(points, time=float(i), odometry=np.eye(4) if odometry else None)
+        detector.add(points, time=0.7 * i, odometry=np.eye(4) if odometry else None)

@@ -6,7 +6,7 @@ Each object has a `type`: `frame` (`FrameStatus`) or `loop` (`LoopEdge`).
 import json
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import IO, Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from sglpr_jax.live.sinks import SinkOptions
 class JsonLines:
     """Writes a line for each scan and each loop, and flushes it."""
 
-    def __init__(self, file: TextIO):
+    def __init__(self, file: IO[str]):
         self._file = file
 
     def frame(self, status: FrameStatus) -> None:
@@ -35,7 +35,7 @@ class JsonLines:
         if self._file is not sys.stdout:
             self._file.close()
 
-    def _line(self, kind: str, value: NamedTuple) -> None:
+    def _line(self, kind: str, value: FrameStatus | LoopEdge) -> None:
         found = {name: _plain(one) for name, one in value._asdict().items()}
         self._file.write(json.dumps({"type": kind, **found}) + "\n")
         self._file.flush()

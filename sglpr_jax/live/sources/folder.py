@@ -21,7 +21,7 @@ LOOK_S = 0.05
 QUIET_S = 2.0
 """Age of a file, in seconds, from which it is complete at the first look."""
 POSE_S = 1.0
-"""Maximum time that a scan waits for its pose, in seconds."""
+"""Maximum age of a scan that waits for its pose, in seconds."""
 
 
 class FolderSource:
@@ -99,15 +99,16 @@ class FolderSource:
         try:
             record = scan_record(path, format=self._options.format, records=self._record_of(path))
             seconds = _time_in_name(path)
-            stamp = path.stat().st_mtime if seconds is None else seconds
+            written = path.stat().st_mtime
         except (ValueError, OSError, ImportError) as error:
             return self._report("scan", f"a scan is left out: {error}")
         pose = None
         if self._poses is not None:
-            row, end = len(self._done) - 1, time.monotonic() + POSE_S
-            while (pose := self._pose(row, seconds)) is None and time.monotonic() < end:
+            row = len(self._done) - 1
+            while (pose := self._pose(row, seconds)) is None and time.time() - written < POSE_S:
                 time.sleep(LOOK_S)
                 yield None
+        stamp = written if seconds is None else seconds
         yield LiveFrame(dataclasses.replace(record, name=_name(path)), stamp, pose, received)
 
     def _pose(self, row: int, seconds: float | None):

@@ -11,8 +11,8 @@ from sglpr_jax.data.formats.timed_poses import BEYOND_S, interpolate, interpolat
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.growing import GrowingArray
 
-LAST = 50
-"""Number of latest poses between which a pose is interpolated."""
+AROUND = 25
+"""Number of poses before and after a time between which a pose is interpolated."""
 
 
 class GrowingPoses:
@@ -69,8 +69,10 @@ class GrowingPoses:
     def _add(self, words: list[str], where: str) -> None:
         if self._rows is None:
             self._rows = GrowingArray(np.empty((0, self._columns(len(words), where))))
-        self._rows.append(np.nan)  # also if the line is invalid: the next line is that of the next scan
-        self._rows.rows[-1] = numbers_of(words, columns=self._rows.rows.shape[1], where=where)
+        unknown = np.full(self._rows.rows.shape[1], np.nan)
+        unknown[0] = self._rows.rows[-1, 0] if len(self) else 0.0  # times stay in order
+        self._rows.append(unknown)  # also if the line is invalid: the next line is that of the next scan
+        self._rows.rows[-1] = numbers_of(words, columns=len(unknown), where=where)
 
     def _columns(self, found: int, where: str) -> int:
         if self._format == "auto" and found == 12:
@@ -82,7 +84,8 @@ class GrowingPoses:
     def _at(self, time: float) -> Float[np.ndarray, "4 4"] | None:
         """Pose interpolated at a time, or None if the poses do not reach it."""
         assert self._rows is not None
-        rows = self._rows.rows[-LAST:]
+        middle = int(np.searchsorted(self._rows.rows[:, 0], time * self._unit))
+        rows = self._rows.rows[max(middle - AROUND, 0) : middle + AROUND]
         rows = rows[np.isfinite(rows).all(axis=1)]
         stamps = rows[:, 0] / self._unit
         if len(stamps) < 2 or stamps[-1] < time - BEYOND_S:

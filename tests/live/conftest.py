@@ -1,0 +1,61 @@
+"""A short simulated drive that comes back, and reports as a list."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.live.frame import LiveFrame
+from sglpr_jax.sim import Sensor, recording
+from sglpr_jax.sim.recording import SimulatedRecording
+
+SCANS = 130
+SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 16)), azimuth_steps=180)
+BEGIN = 1_700_000_000.25
+"""Time of the first scan, in seconds."""
+
+
+@pytest.fixture(scope="session")
+def drive() -> SimulatedRecording:
+    """130 scans, about 3 m apart, which end where they began. Each scan is rendered once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "KEPT_SCANS", SCANS)
+        return recording.simulate_recording("08", scans=SCANS, sensor=SENSOR, seed=3)
+
+
+@pytest.fixture(scope="session")
+def params():
+    return sglpr_jax.load("circular")
+
+
+class Said(list):
+    """A `Report` that keeps the kind and the text of each event."""
+
+    def __call__(self, kind: str, text: str) -> None:
+        self.append((kind, text))
+
+    @property
+    def kinds(self) -> list[str]:
+        return [kind for kind, _ in self]
+
+
+@pytest.fixture
+def said() -> Said:
+    return Said()
+
+
+def live_frame(drive, i: int, *, pose=None, time: float | None = None, received: float | None = None) -> LiveFrame:
+    """Scan `i` of a drive as it arrives, at its own pace."""
+    record = dataclasses.replace(drive.record(i), name=f"scan {i}", mounting=None)
+    time = BEGIN + float(drive.times[i]) if time is None else time
+    return LiveFrame(record, time, pose, float(drive.times[i]) if received is None else received)
+
+
+def write_scan(folder: Path, drive, i: int) -> Path:
+    """Write a scan as KITTI's .bin, named by its time."""
+    points = drive.points(i)
+    path = folder / f"{BEGIN + drive.times[i]:.6f}.bin"
+    np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(path)
+    return path

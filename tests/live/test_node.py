@@ -1,0 +1,117 @@
+"""The node lives on, whatever a scan, a sink or the odometry does, and hands on what the map finds."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.record import Record
+from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
+from sglpr_jax.live.live_map import LiveMap
+from sglpr_jax.live.node import Node
+from sglpr_jax.live.sinks import SinkOptions, open_sink
+from sglpr_jax.live.sinks.json import JsonLines
+
+EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0.01)
+
+
+class FakeMap(LiveMap):
+    """A map whose scan 1 is invalid, and whose scan 2 is left out."""
+
+    class detector:
+        nbytes = 5_000_000
+
+        class finder:
+            stored = (1, 2, 3)
+
+    def __init__(self):
+        self.added = []
+
+    def __len__(self) -> int:
+        return len(self.added)
+
+    def add(self, frame):
+        if frame.time == 1:
+            raise ValueError("expected points, found none")
+        if frame.time == 2:
+            return None
+        self.added.append(frame)
+        return [EDGE] if frame.time == 3 else []
+
+
+class Frames:
+    """A source of five scans with a pause."""
+
+    dropped = 4
+
+    def __init__(self, frame):
+        self.frame = frame
+
+    def close(self):
+        pass
+
+    def frames(self):
+        for i in range(5):
+            yield self.frame._replace(time=float(i))
+            yield None
+
+
+class Kept:
+    """A sink that keeps what it gets, or loses its connection at the first loop."""
+
+    def __init__(self, fails: bool = False):
+        self.fails, self.seen = fails, []
+
+    def close(self):
+        pass
+
+    def frame(self, status):
+        self.seen.append(status)
+
+    def loop(self, edge):
+        if self.fails:
+            raise RuntimeError("connection lost")
+        self.seen.append(edge)
+
+
+@pytest.fixture
+def frame() -> LiveFrame:
+    return LiveFrame(Record(points=np.ones((3, 3), np.float32)), 0.0, None, 0.0)
+
+
+def test_bad_scans_and_broken_sinks_are_reported_and_left_out(frame, said):
+    good, bad, lines = Kept(), Kept(fails=True), []
+    node = Node(FakeMap(), [bad, good], report=said, say=lines.append)
+    node.run(Frames(frame))
+    assert [type(one) for one in good.seen] == [FrameStatus, LoopEdge, FrameStatus, FrameStatus]
+    assert [one.frame for one in good.seen if isinstance(one, FrameStatus)] == [0, 1, 2]
+    assert len(bad.seen) == 1 and good.seen[0].dropped == 4 and good.seen[0].places == 3
+    assert [text for _, text in said] == [
+        "a scan is left out: expected points, found none",
+        "Kept is left out: connection lost",
+    ]
+    assert str(node).endswith("4 dropped, 2 left out, 1 loops; the map has 3 scans, 5 MB")
+
+
+def test_a_node_stops_when_it_is_asked(frame, said):
+    node = Node(FakeMap(), [], report=said, say=print)
+    node.run(Frames(frame), should_stop=lambda: True)
+    assert node.scans == 1
+
+
+def test_results_are_lines_of_json(tmp_path, said):
+    text = io.StringIO()
+    sink = JsonLines(text)
+    sink.frame(FrameStatus(3, 1e9 + 0.123456789, 0.0123456789, 0.02, 1, 4, 100))
+    sink.loop(EDGE)
+    frame, loop = map(json.loads, text.getvalue().splitlines())
+    assert frame["type"] == "frame" and frame["time"] == 1e9 + 0.123456789 and frame["seconds"] == 0.012346
+    assert (
+        loop["type"] == "loop" and loop["match_from_query"] == np.eye(4).tolist() and loop["world_from_match"] is None
+    )
+    for _ in range(2):
+        opened = open_sink(f"json:{tmp_path}/found.txt", SinkOptions(), said)
+        opened.loop(EDGE)
+        opened.close()
+    assert len((tmp_path / "found.txt").read_text().splitlines()) == 2
