@@ -120,8 +120,25 @@ def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
     from sglpr_jax.loops.unfinished import alone  # slow import, not needed for --help
 
+    _check(command)
     with alone(command.out):
         return _run(command)
+
+
+def _check(command: LiveCommand) -> None:
+    """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
+    from sglpr_jax.live.results import TRAJECTORY
+    from sglpr_jax.live.sinks import SINKS
+    from sglpr_jax.live.sources import SOURCES, check_name
+
+    check_name(command.source, SOURCES, kind="sources")
+    for text in command.sinks:
+        check_name(text, SINKS, kind="sinks")
+    if command.poses is not None and command.poses.resolve() == (command.out / TRAJECTORY).resolve():
+        raise ValueError(
+            f"{command.poses}: expected odometry that this run does not overwrite, found an output file; "
+            "choose another --out"
+        )
 
 
 def _run(command: LiveCommand) -> int:

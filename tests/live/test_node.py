@@ -1,6 +1,5 @@
 """The node lives on, whatever a scan, a sink or the odometry does, and hands on what the map finds."""
 
-import io
 import json
 
 import numpy as np
@@ -11,7 +10,6 @@ from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.node import Node
 from sglpr_jax.live.sinks import SinkOptions, open_sink
-from sglpr_jax.live.sinks.json import JsonLines
 
 EDGE = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, np.eye(4), None, 0.01)
 
@@ -101,17 +99,16 @@ def test_a_node_stops_when_it_is_asked(frame, said):
 
 
 def test_results_are_lines_of_json(tmp_path, said):
-    text = io.StringIO()
-    sink = JsonLines(text)
+    sink = open_sink(f"json:{tmp_path}/lines", SinkOptions(), said)
     sink.frame(FrameStatus(3, 1e9 + 0.123456789, 0.0123456789, 0.02, 1, 4, 100))
     sink.loop(EDGE)
-    frame, loop = map(json.loads, text.getvalue().splitlines())
+    frame, loop = map(json.loads, (tmp_path / "lines").read_text().splitlines())
     assert frame["type"] == "frame" and frame["time"] == 1e9 + 0.123456789 and frame["seconds"] == 0.012346
     assert (
         loop["type"] == "loop" and loop["match_from_query"] == np.eye(4).tolist() and loop["world_from_match"] is None
     )
-    for _ in range(2):
-        opened = open_sink(f"json:{tmp_path}/found.txt", SinkOptions(), said)
-        opened.loop(EDGE)
-        opened.close()
-    assert len((tmp_path / "found.txt").read_text().splitlines()) == 2
+    sink.close()
+    again = open_sink(f"json:{tmp_path}/lines", SinkOptions(), said)
+    again.loop(EDGE)
+    again.close()
+    assert len((tmp_path / "lines").read_text().splitlines()) == 3

@@ -119,7 +119,8 @@ def odometry(seconds: float, x: float):
     def of(name: str, **fields):
         return store[f"geometry_msgs/msg/{name}"](**fields)
 
-    pose = of("Pose", position=of("Point", x=x, y=0.0, z=0.0), orientation=of("Quaternion", x=0.0, y=0.0, z=0.0, w=1.0))
+    turn = of("Quaternion", x=0.0, y=0.0, z=float(np.sin(x / 20)), w=float(np.cos(x / 20)))
+    pose = of("Pose", position=of("Point", x=x, y=0.0, z=0.0), orientation=turn)
     return of("PoseStamped", header=header("ros2", seconds, "odom"), pose=pose)
 
 

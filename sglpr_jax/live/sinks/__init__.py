@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from sglpr_jax.live.frame import FrameStatus, LoopEdge
 from sglpr_jax.live.report import Report
-from sglpr_jax.live.sources import module_of
+from sglpr_jax.live.sources import check_name, module_of
 
 SINKS = {"json": None, "dds": "live", "zenoh": "live"}
 """Names of the sinks, with the extra that each needs."""
@@ -54,5 +54,5 @@ def open_sink(text: str, options: SinkOptions, report: Report) -> Sink:
       ValueError: If no sink has this name.
       ImportError: If the extra of the sink is not installed.
     """
-    name, _, where = text.partition(":")
-    return module_of(name, text, SINKS, kind="sinks").open_sink(where, options, report)
+    name, where = check_name(text, SINKS, kind="sinks")
+    return module_of(name, SINKS, kind="sinks").open_sink(where, options, report)

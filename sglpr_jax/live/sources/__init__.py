@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
@@ -75,19 +76,25 @@ def open_source(text: str, options: SourceOptions, report: Report) -> Source:
       ValueError: If no source has this name.
       ImportError: If the extra of the source is not installed.
     """
+    name, where = check_name(text, SOURCES, kind="sources")
+    return module_of(name, SOURCES, kind="sources").open_source(where, options, report)
+
+
+def check_name(text: str, known: dict[str, str | None], *, kind: str) -> tuple[str, str]:
+    """Split `NAME:WHERE`. Raises ValueError if the name is not known. `kind` is "sources" or "sinks"."""
     name, _, where = text.partition(":")
-    return module_of(name, text, SOURCES, kind="sources").open_source(where, options, report)
-
-
-def module_of(name: str, text: str, known: dict[str, str | None], *, kind: str):
-    """Import the module of a source or sink. Raises ValueError or ImportError, which name the choices or the extra."""
     if name not in known:
         raise ValueError(f"{text}: expected one of the {kind} {', '.join(known)}, found {name or 'nothing'}")
+    return name, where
+
+
+def module_of(name: str, known: dict[str, str | None], *, kind: str) -> ModuleType:
+    """Import the module of a source or sink. Raises ImportError, which names the extra, if a package is missing."""
     try:
         return importlib.import_module(f"sglpr_jax.live.{kind}.{name}")
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.startswith("sglpr_jax"):
             raise
         raise ImportError(
-            f"{text}: expected the package {error.name}, found none; pip install 'sglpr-jax[{known[name]}]'"
+            f"{name}: expected the package {error.name}, found none; pip install 'sglpr-jax[{known[name]}]'"
         ) from error
