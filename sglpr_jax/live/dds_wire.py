@@ -195,12 +195,17 @@ class _Raw:
     def deserialize(cls, data: bytes) -> Any:
         return cls(data)
 
+    @classmethod
+    def deserialize_key(cls, data: bytes) -> Any:
+        """A notice that a publisher has ended: it holds no message."""
+        return cls(data)
+
 
 @functools.cache
 def _raw_type(kind: str) -> Any:
     """Type of messages that stay encoded. Others see the fields of ROS 2."""
     found = make_idl_struct(*_names(kind), _fields(kind), dataclassify=False)
-    for name in ("__init__", "serialize", "deserialize"):
+    for name in ("__init__", "serialize", "deserialize", "deserialize_key"):
         setattr(found, name, vars(_Raw)[name])
     return found
 

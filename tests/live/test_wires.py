@@ -140,9 +140,10 @@ def test_edges_reach_a_subscriber_that_comes_later_over_dds(domain, said):
     until(lambda: found)
     assert received_frame(found[0]) == "match/1000.250000000"
     assert EDGE in other.published()["/sglpr/loops"]
-    other.close()
     sink.close()
-    assert not said
+    until(lambda: "/sglpr/loops" not in other.published())  # the end of a publisher is no message
+    other.close()
+    assert len(found) == 1 and not said
 
 
 def test_a_subscriber_with_another_qos_is_reported(domain, said):
