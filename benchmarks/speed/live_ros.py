@@ -56,6 +56,7 @@ class Latencies:
     def __init__(self):
         self.frames: list[float] = []
         self.loops: list[float] = []
+        self.inside: list[float] = []
 
     def frame(self, message: Received) -> None:
         """Take a transform, which is published after each scan with the stamp of the scan."""
@@ -97,10 +98,14 @@ def main(
         memory.append(_resident_mb(process.pid))
         process.terminate()
         process.wait()
-        statuses = [json.loads(line) for line in (Path(folder) / "results").read_text().splitlines()]
+        results = map(json.loads, (Path(folder) / "results").read_text().splitlines())
+        statuses = [one for one in results if one["type"] == "frame"]
     connection.close()
-    dropped = max(one["dropped"] for one in statuses if one["type"] == "frame")
-    show(wire, hz, sent, dropped, found, memory, size=len(messages[0].cloud))
+    found.inside = [one["latency_s"] for one in statuses]
+    print(
+        f"{wire}, {hz:g} Hz, {len(messages[0].cloud) / 1e6:.2f} MB a scan, load of the computer {os.getloadavg()[0]:.1f}"
+    )
+    show(sent, statuses[-1]["dropped"], found, memory)
 
 
 def encoded(data: Path) -> list[Message]:
@@ -199,18 +204,20 @@ def _free_endpoint() -> str:
         return f"tcp/127.0.0.1:{found.getsockname()[1]}"
 
 
-def show(
-    wire: str, hz: float, sent: int, dropped: int, found: Latencies, memory: list[float], *, size: int
-) -> None:
+def show(sent: int, dropped: int, found: Latencies, memory: list[float]) -> None:
     """Print the table."""
+    rows = {
+        "published scan to transform": found.frames,
+        "of these, in bin/live": found.inside,
+        "published scan to loop edge": found.loops,
+    }
     table = Table("", "number", "median ms", "99 % ms")
-    for name, values in (("scan to transform", found.frames), ("scan to loop edge", found.loops)):
+    for name, values in rows.items():
         middle, late = (f"{1e3 * np.quantile(values, share):.1f}" for share in (0.5, 0.99)) if values else ("", "")
         table.add_row(name, f"{len(values):,}", middle, late)
     console = Console(width=100)
     console.print(table)
-    lost = sent - dropped - len(found.frames)
-    console.print(f"{wire}, {hz:g} Hz, {size / 1e6:.2f} MB a scan: {sent:,} scans sent, {dropped} dropped, {lost} lost")
+    console.print(f"{sent:,} scans sent, {dropped} dropped, {sent - dropped - len(found.frames)} lost")
     console.print(f"memory of bin/live: {' MB, then '.join(f'{one:.0f}' for one in memory)} MB")
 
 

@@ -31,8 +31,8 @@ PREFIX = "rt"
 LOOK_S = 1.0
 """Time between two looks at subscriptions and publishers with other settings, in seconds."""
 BUFFER = '<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max="16MB"/></Internal></Domain></CycloneDDS>'
-"""Setting of cyclonedds: scans of 2 MB arrive as a burst of packets, of which its usual buffer of 1 MB loses many. The
-system may set a lower limit (`net.core.rmem_max`)."""
+"""Setting of cyclonedds. A scan of 2 MB arrives as a burst of packets, and the usual buffer of 1 MB loses many of them.
+The system may set a lower limit (`net.core.rmem_max`)."""
 POLICIES = {2: "durability", 4: "deadline", 8: "liveliness", 10: "partition", 11: "reliability", 23: "representation"}
 """Names of QoS policies, by their numbers in the standard."""
 TYPE = 24

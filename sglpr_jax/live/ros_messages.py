@@ -117,9 +117,7 @@ def marker_message(ends: Sequence[Float[np.ndarray, "2 3"]], *, time: float, fra
     return types[MARKERS](markers=[marker])
 
 
-def transform_message(
-    frame_from_child: Float[np.ndarray, "4 4"], *, time: float, frame: str, child: str
-) -> Any:
+def transform_message(frame_from_child: Float[np.ndarray, "4 4"], *, time: float, frame: str, child: str) -> Any:
     """Pose of a child frame in a frame, as tf2_msgs/TFMessage."""
     types = typestore().types
     pose = _pose(frame_from_child)

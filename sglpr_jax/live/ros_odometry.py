@@ -71,12 +71,13 @@ class LiveOdometry:
         with self._changed:
             self._changed.wait_for(lambda: self._is_silent() or self._reaches(time, lidar), wait_s)
             found = self._used or self._use(lidar)
-            near = [] if found is None else [one for one in self._poses[found[0]] if abs(one.time - time) <= SILENT_S]
-        pose = None if found is None else _at(near, time)
+            key, mounting = found or (None, np.eye(4))
+            near = [one for one in self._poses.get(key, ()) if abs(one.time - time) <= SILENT_S] if key else []
+            why = self._why(lidar)
+        pose = _at(near, time)
         if pose is None:
-            self._report("odometry", f"{self.topic}: expected a pose at {time:.3f}, found {self._why(lidar)}")
-            return None
-        return pose @ found[1]
+            self._report("odometry", f"{self.topic}: expected a pose at {time:.3f}, found {why}")
+        return None if pose is None else pose @ mounting
 
     def _is_silent(self) -> bool:
         return clock.monotonic() - self._received > SILENT_S
@@ -99,7 +100,8 @@ class LiveOdometry:
         waited = clock.monotonic() - self._began > STATIC_S
         if waited and len(self._poses) == 1:
             (key,) = self._poses
-            self._report("mounting", f"/tf_static: expected {key[1]} and {lidar}, found no path; the poses are used as those of {lidar}")
+            found = f"found no path; the poses are used as those of {lidar}"
+            self._report("mounting", f"/tf_static: expected {key[1]} and {lidar}, {found}")
             self._used = key, np.eye(4)
         return self._used
 

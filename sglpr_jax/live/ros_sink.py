@@ -55,10 +55,11 @@ class RosSink:
     def loop(self, edge: LoopEdge) -> None:
         """Publish an edge. With odometry of both scans, draw it and correct the transform."""
         self._edges(encode(edge_message(edge)))
-        if edge.world_from_query is None or edge.world_from_match is None:
+        query, match = edge.world_from_query, edge.world_from_match
+        if query is None or match is None:
             return
-        self._corrections.add(edge)
-        self._lines.append(np.stack([edge.world_from_match[:3, 3], edge.world_from_query[:3, 3]]))
+        self._corrections.add(edge, world_from_query=query, world_from_match=match)
+        self._lines.append(np.stack([match[:3, 3], query[:3, 3]]))
         drawn = marker_message(list(self._lines), time=edge.query_time, frame=self._options.odometry_frame)
         self._markers(encode(drawn))
 
@@ -84,8 +85,10 @@ class Corrections:
         row = bisect.bisect_right(self._frames, frame)
         return self._found[row - 1] if row else np.eye(4)
 
-    def add(self, edge: LoopEdge) -> None:
-        """Correct the poses from the query of a loop on. Loops to frames after the last query are equally valid."""
-        map_from_query = self.at(edge.match) @ edge.world_from_match @ edge.match_from_query
+    def add(
+        self, edge: LoopEdge, *, world_from_query: Float[np.ndarray, "4 4"], world_from_match: Float[np.ndarray, "4 4"]
+    ) -> None:
+        """Correct the poses from the query of a loop on. The match has the correction of its own time."""
+        map_from_query = self.at(edge.match) @ world_from_match @ edge.match_from_query
         row = bisect.bisect_left(self._frames, edge.query)
-        self._frames[row:], self._found[row:] = [edge.query], [map_from_query @ inverse(edge.world_from_query)]
+        self._frames[row:], self._found[row:] = [edge.query], [map_from_query @ inverse(world_from_query)]

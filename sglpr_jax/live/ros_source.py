@@ -16,7 +16,7 @@ from sglpr_jax.live.sources import WAIT_S, SourceOptions
 CLOUD_TOPIC = "/points"
 STATIC_TOPIC = "/tf_static"
 MISSING_S = 5.0
-"""Time without scans after which the existing topics are reported, in seconds. Later reports follow in the same steps."""
+"""Time without scans after which the existing topics are reported, in seconds. It is also the time between reports."""
 TAKEN_OVER_S = 2.0
 """Time after which another publisher may take the place of one that is silent, in seconds."""
 POSES_KEPT = 100

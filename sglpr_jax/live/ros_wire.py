@@ -24,7 +24,7 @@ Receive = Callable[[Received], None]
 
 @runtime_checkable
 class Wire(Protocol):
-    """A connection to ROS 2. Names of topics begin with a slash, names of types are like those of `ros2 topic list -t`."""
+    """A connection to ROS 2. Topics and types have the names that `ros2 topic list -t` prints."""
 
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool

@@ -50,8 +50,8 @@ class ZenohWire:
         """Open a session.
 
         Arguments:
-          endpoint: Endpoint of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, ZENOH_SESSION_CONFIG_URI
-            in the environment names a configuration file, or else the router of rmw_zenoh on this computer is used.
+          endpoint: Endpoint of a router or peer, such as `tcp/192.168.0.2:7447`. If it is empty, the file that
+            ZENOH_SESSION_CONFIG_URI names configures the session, or else it uses rmw_zenoh's router on this computer.
           domain: Number of the ROS 2 domain.
           report: Function for trouble with single messages.
 
@@ -63,7 +63,9 @@ class ZenohWire:
             self._session = zenoh.open(_config(endpoint))
         except (zenoh.ZError, OSError) as error:
             where = endpoint or os.environ.get("ZENOH_SESSION_CONFIG_URI") or ROUTER
-            raise ValueError(f"zenoh: expected a valid endpoint or configuration, found {where} ({in_short(error)})") from error
+            raise ValueError(
+                f"zenoh: expected a valid endpoint or configuration, found {where} ({in_short(error)})"
+            ) from error
         self._declared: list[Any] = [self._token("NN", 0)]
 
     def subscribe(
@@ -136,13 +138,17 @@ def _config(endpoint: str) -> zenoh.Config:
     """Configuration of a peer that finds others by a router, as rmw_zenoh's."""
     given = "" if endpoint else os.environ.get("ZENOH_SESSION_CONFIG_URI")
     config = zenoh.Config.from_file(given) if given else zenoh.Config()
-    settings: dict[str, Any] = {} if given else {
-        "mode": "peer",
-        "connect/endpoints": [endpoint or ROUTER],
-        "listen/endpoints": ["tcp/localhost:0"],
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-    }
+    settings: dict[str, Any] = (
+        {}
+        if given
+        else {
+            "mode": "peer",
+            "connect/endpoints": [endpoint or ROUTER],
+            "listen/endpoints": ["tcp/localhost:0"],
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": True,
+        }
+    )
     settings["timestamping/enabled"] = True  # needed by publishers with a cache
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

@@ -81,12 +81,15 @@ def test_an_invalid_cloud_is_reported_and_the_next_one_taken(wire, source, said)
 
 def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(wire, source, said):
     frames = source.frames()
-    for publisher, at, taken in (("a", 1.0, True), ("b", 1.1, False), ("a", 1.2, True), ("b", 1.3 + TAKEN_OVER_S, True)):
+    for publisher, at, taken in (
+        ("a", 1.0, True),
+        ("b", 1.1, False),
+        ("a", 1.2, True),
+        ("b", 1.3 + TAKEN_OVER_S, True),
+    ):
         wire.receive["/points"](received(CLOUD, cloud(at), publisher=publisher, at=at))
         assert (next(frames) is not None) == taken
-    assert said["publishers"] == [
-        "/points: expected one publisher, found several; the scans of the first are used"
-    ]
+    assert said["publishers"] == ["/points: expected one publisher, found several; the scans of the first are used"]
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,8 @@ def first(source, fits=lambda frame: True):
 def test_scans_and_poses_come_over_dds(domain, said, reliable):
     """From types that cyclonedds encodes itself."""
     options = {"odometry_topic": "/tf", "reliable": reliable}
-    with opened(f"dds:{domain}", said, **options) as source, talking("dds_talker.py", domain, "reliable", "PointCloud2"):
+    talker = talking("dds_talker.py", domain, "reliable", "PointCloud2")
+    with opened(f"dds:{domain}", said, **options) as source, talker:
         frame = first(source, lambda frame: frame.odometry is not None)
     np.testing.assert_array_equal(frame.record.points, np.arange(60, dtype=np.float32).reshape(20, 3))
     np.testing.assert_allclose(frame.odometry[:3, 3], [2 * (frame.time - 100), 0, 2], atol=1e-5)
@@ -105,7 +106,8 @@ def test_scans_and_poses_come_over_dds(domain, said, reliable):
 
 @pytest.mark.slow
 def test_a_publisher_with_another_qos_is_reported(domain, said):
-    with opened(f"dds:{domain}", said, reliable=True) as source, talking("dds_talker.py", domain, "best", "PointCloud2"):
+    talker = talking("dds_talker.py", domain, "best", "PointCloud2")
+    with opened(f"dds:{domain}", said, reliable=True) as source, talker:
         frames = source.frames()
         until(lambda: next(frames) or said)
     assert said.lines == [
@@ -125,7 +127,8 @@ def test_a_topic_with_another_type_is_reported(domain, said):
 
 @pytest.mark.slow
 def test_a_topic_that_is_missing_is_reported_with_those_that_exist(domain, said):
-    with opened(f"dds:{domain}", said, topic="/rslidar") as source, talking("dds_talker.py", domain, "best", "PointCloud2"):
+    talker = talking("dds_talker.py", domain, "best", "PointCloud2")
+    with opened(f"dds:{domain}", said, topic="/rslidar") as source, talker:
         source._missing_s = 0.5
         frames = source.frames()
         until(lambda: next(frames) or any("/tf_static" in text for text in said.lines))
@@ -194,7 +197,7 @@ def test_edges_reach_a_subscriber_that_comes_later_over_zenoh(endpoint, said, mo
 
 def test_a_wrong_configuration_is_one_clear_error(domain, monkeypatch):
     monkeypatch.setenv("CYCLONEDDS_URI", "<nonsense")
-    with pytest.raises(ValueError, match=f"dds:{domain}: expected a network and a valid CYCLONEDDS_URI, found <nonsense"):
+    with pytest.raises(ValueError, match=f"dds:{domain}: expected a network .* CYCLONEDDS_URI, found <nonsense"):
         open_source(f"dds:{domain}", SourceOptions(), Said())
 
 

@@ -1,6 +1,6 @@
 """A process that publishes point clouds and poses by zenoh, with the keys, attachments and tokens of rmw_zenoh.
 
-Usage: zenoh_talker.py ENDPOINT CLOUD_FILE TF_FILE. It listens there. Each line of the files is a message in hexadecimal.
+Usage: zenoh_talker.py ENDPOINT CLOUD_FILE TF_FILE. It listens there. Lines of the files are messages in hexadecimal.
 """
 
 import json
@@ -22,7 +22,9 @@ def main() -> None:
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config) as session:
         tokens = [
-            session.liveliness().declare_token(f"@ros2_lv/0/{session.zid()}/0/{number}/MP/%/%/talker/%{name}/{kind}/::,5:,:,:,,")
+            session.liveliness().declare_token(
+                f"@ros2_lv/0/{session.zid()}/0/{number}/MP/%/%/talker/%{name}/{kind}/::,5:,:,:,,"
+            )
             for number, (name, kind) in enumerate((("points", CLOUD), ("tf", TF)))
         ]
         lines = zip(*(Path(file).read_text().split() for file in (clouds, transforms)), strict=True)
