@@ -114,7 +114,8 @@ class DdsWire:
         """Topics with a publisher, and their types."""
         found: dict[str, set[str]] = {}
         for one in self._publications.read(N=10_000):
-            if one.topic_name is not None and one.topic_name.startswith(f"{PREFIX}/"):
+            alive = one.sample_info.instance_state == InstanceState.Alive and one.topic_name is not None
+            if alive and one.topic_name.startswith(f"{PREFIX}/"):
                 found.setdefault(one.topic_name.removeprefix(PREFIX), set()).add(ros_type(one.type_name))
         return found
 

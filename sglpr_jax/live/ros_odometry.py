@@ -45,12 +45,14 @@ class LiveOdometry:
         poses = read_transforms(found) if message.kind == TRANSFORMS else [POSES[message.kind](found)]
         with self._changed:
             for pose in map(_plain, poses):
+                if self._used is not None and (pose.frame, pose.child) != self._used[0]:
+                    continue
                 kept = self._poses[pose.frame, pose.child]
                 if kept and pose.time < kept[-1].time - BACK_S:
                     kept.clear()
                 kept.append(pose)
-            self._began = message.at if np.isinf(self._began) else self._began
-            self._received = message.at
+                self._began = message.at if np.isinf(self._began) else self._began
+                self._received = message.at
             self._changed.notify_all()
 
     def receive_static(self, message: Received) -> None:

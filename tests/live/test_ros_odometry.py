@@ -101,6 +101,14 @@ def test_of_tf_that_transform_is_used_that_moves_the_lidar(live, said):
     np.testing.assert_allclose(live.pose(5.05, "lidar", wait_s=0.0)[:3, 3], [5.05, 0, 2])
 
 
+def test_other_transforms_do_not_hide_that_odometry_stopped(live, said):
+    drive(live, 10.0, 10.1, at=clock.monotonic() - 3)
+    assert live.pose(10.1, "lidar", wait_s=0.0) is not None
+    live.receive(received(TRANSFORMS, transforms(20, [("map", "odom", (0, 0, 0), (0, 0, 0, 1))]), at=clock.monotonic()))
+    assert live.pose(20.0, "lidar", wait_s=5.0) is None
+    assert "found none for 3 s" in said["odometry"][0]
+
+
 def test_times_that_jump_back_begin_another_odometry(live):
     drive(live, 10.0, 10.1, 3.0, 3.1)
     np.testing.assert_allclose(live.pose(3.05, "lidar", wait_s=0.0)[:3, 3], [6.1, 0, 0])
