@@ -60,14 +60,15 @@ def are_recent(
     *,
     seconds: float = EXCLUDED_S,
     frames: int = EXCLUDED_FRAMES,
-) -> Bool[np.ndarray, " n"]:
+    rows: Int[np.ndarray, " k"] | None = None,
+) -> Bool[np.ndarray, " k"]:
     """Return which of `n` places are too recent to be a revisit: those less than `seconds` old at the time `now`.
 
-    Without times or without `now`, these are the last `frames` places.
+    Without times or without `now`, these are the last `frames` places. If `rows` are given, the answer is for these.
     """
     if now is not None and times is not None:
-        return times > now - seconds
-    return np.arange(n) >= n - frames
+        return (times if rows is None else times[rows]) > now - seconds
+    return (np.arange(n) if rows is None else rows) >= n - frames
 
 
 def has_near(

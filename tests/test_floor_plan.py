@@ -33,7 +33,7 @@ FLOORS = (
     ("methods",),
     ("retrieval", "training"),
     ("loops",),
-    ("evaluation",),
+    ("evaluation", "live"),
     ("reproduce",),
     ("cli",),
 )

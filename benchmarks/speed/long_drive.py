@@ -114,9 +114,9 @@ class WithoutImages(CandidateFinder):
         vars(self).update(vars(finder))
         self._drive = drive
 
-    def _compared(self, seen, time, position, pose, clock) -> Compared:
+    def _compared(self, seen, time, pose, clock) -> Compared:
         query = len(self)
-        rows = self.comparer.similar(seen.descriptor, self._excluded(time, position))
+        rows = self.comparer.similar(seen.descriptor, self._excluded(time, pose))
         link = None if pose is not None or not query else self._peak(query, self.motion.keyframe)
         self.motion.add(clock, pose=pose, link=link)
         if not len(rows) or not self._drive.closes:

@@ -97,6 +97,9 @@ class LoopsCommand:
     optimize: bool = False
     """Correct the odometry by the loops (extra gtsam): trajectory-optimized.tum and .kitti. The correction of thousands
     of frames takes minutes."""
+    rerun: Path | None = None
+    """Also write trajectories, scans, loops and image pairs of one recording to this .rrd file, for the rerun viewer
+    (extra view)."""
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a loop."""
     degenerate: Degenerate = "keep"
@@ -160,6 +163,7 @@ def _drift(command: LoopsCommand) -> DriftModel:
 
 def _check(command: LoopsCommand) -> None:
     """Raises ValueError or ImportError before the search, if it would end in an error or overwrite an input."""
+    from sglpr_jax.evaluation import rerun_file
     from sglpr_jax.loops.folder import TRAJECTORIES
     from sglpr_jax.loops.optimization import check_installed
 
@@ -168,6 +172,10 @@ def _check(command: LoopsCommand) -> None:
         raise ValueError("expected a recording, found none")
     if files and len(files) != len(recordings):
         raise ValueError(f"--odometry: expected a file for each of {len(recordings)} recordings, found {len(files)}")
+    if command.rerun is not None:
+        if len(recordings) > 1:
+            raise ValueError("--rerun shows one recording, found several recordings")
+        rerun_file.check_installed()
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")
     written = {(command.out / name).resolve() for name in TRAJECTORIES}
@@ -189,6 +197,7 @@ def _is_trajectory(path: Path, out: Path) -> bool:
 
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
+    from sglpr_jax.evaluation.rerun_file import write_rerun
     from sglpr_jax.loops.explanation import why_few_queries, why_none
     from sglpr_jax.loops.find import can_register, find_loops
     from sglpr_jax.loops.folder import write_found
@@ -230,6 +239,8 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     page = {PAGE: loops_page(found, optimized=corrected)}
     paths = write_found(found, command.out, optimized=None if corrected is None else corrected.poses, texts=page)
     paths.append(record_command(dataclasses.replace(command, scale=scale), command.out))
+    if command.rerun is not None:
+        write_rerun(found, command.rerun, optimized=corrected)
     print(found, *why_none(found), *why_rejected(found.rejected), sep="\n")
     if corrected is not None:
         print(corrected)

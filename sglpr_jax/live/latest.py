@@ -33,7 +33,7 @@ class Latest(Generic[T]):
             self._changed.notify()
 
     def take(self, timeout: float) -> T | None:
-        """Remove and return the newest item, or return None if there is none within `timeout` seconds."""
+        """Remove and return the newest item, or return None after `timeout` seconds without one."""
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None, timeout)
             item, self._item = self._item, None

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from sglpr_jax.data.choices import SensorHeight
 from sglpr_jax.growing import GrowingArray
@@ -66,6 +67,7 @@ class LiveMap:
         self.names: set[str] = set()
         """Names of the scans that have one."""
         self._stamps = GrowingArray(np.empty(0))
+        self._poses = GrowingArray(np.empty((0, 4, 4)))
         self._clock = Clock(report)
         self._continuity = Continuity(report, expected=expects_odometry)
         self._mounting = FirstScans(sensor_height)
@@ -77,9 +79,14 @@ class LiveMap:
         return len(self.detector)
 
     @property
-    def stamps(self) -> np.ndarray:
+    def stamps(self) -> Float[np.ndarray, " n"]:
         """Time of the header of each scan, in seconds."""
         return self._stamps.rows
+
+    @property
+    def odometry(self) -> Float[np.ndarray, "n 4 4"]:
+        """Pose of the LiDAR at each scan by odometry. Empty without odometry."""
+        return self._poses.rows
 
     def recall(self) -> list[LoopEdge]:
         """Add the scans of the journal. Returns the loops of an earlier process that it did not write any more.
@@ -137,6 +144,8 @@ class LiveMap:
 
     def _note(self, scan: LiveScan) -> None:
         self._stamps.append(scan.stamp)
+        if scan.pose is not None:
+            self._poses.append(scan.pose)
         if scan.name:
             self.names.add(scan.name)
         self.detector.candidates.clear()  # they are in the journal
@@ -165,10 +174,9 @@ class LiveMap:
 
     def _edge(self, loop: Loop, received: float) -> LoopEdge:
         """The loop, with the times of its scans, and their poses if these are in the present frame of the odometry."""
-        finder = self.detector.finder
         ends = np.array([loop.query, loop.match])
-        known = finder.motion.same(len(self) - 1, ends) & (len(finder.odometry) > 0)
-        query, match = (finder.odometry.poses[one] if ok else None for one, ok in zip(ends, known, strict=True))
+        known = self.detector.finder.motion.same(-1, ends) & (len(self.odometry) > 0)
+        query, match = (self.odometry[one].copy() if ok else None for one, ok in zip(ends, known, strict=True))
         times = float(self._stamps.rows[loop.query]), float(self._stamps.rows[loop.match])
         found = loop.match_from_query, loop.covariance, loop.probability
         return LoopEdge(loop.query, loop.match, *times, *found, query, match, time.monotonic() - received)

@@ -17,9 +17,8 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
     The graph has no edge between scans whose motion is unknown, as before and after a restart. Returns the paths.
     Raises WriteError if a file cannot be written.
     """
-    detector = live.detector
-    finder, loops = detector.finder, detector.loops
-    odometry, segments = finder.odometry.poses, finder.motion.segments
+    detector, loops, odometry = live.detector, live.detector.loops, live.odometry
+    segments = detector.finder.motion.segments
     parts = np.split(np.arange(len(odometry)), np.flatnonzero(np.diff(segments)) + 1) if len(odometry) else []
     files = {
         GRAPH: lambda path: write_joint_g2o(

@@ -11,14 +11,12 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.background import Background
 from sglpr_jax.loops.comparison import Candidate, Comparer
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
-from sglpr_jax.loops.drift import position_deviations
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
 from sglpr_jax.loops.pose_search import Peak, query_spectra, within_reach
 from sglpr_jax.loops.seen import Seen, described
 from sglpr_jax.loops.stored_scans import StoredScans
-from sglpr_jax.loops.trajectory import Trajectory
 from sglpr_jax.loops.transforms import inverse
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
@@ -62,8 +60,8 @@ class CandidateFinder:
         """Descriptors, and centres of the images without the background, for comparison."""
         self.compared = Compared([], None)
         """Comparisons of the last frame."""
-        self.odometry = Trajectory()
-        """Poses of all frames from odometry. Empty if there is no odometry."""
+        self.has_odometry = False
+        """Whether the frames have poses from odometry. If so, `motion` holds them."""
         self.mountings = Mountings()
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
@@ -102,7 +100,7 @@ class CandidateFinder:
     @property
     def nbytes(self) -> int:
         """Number of bytes of all frames: descriptors, compressed images, poses and times."""
-        arrays = self.stored, self.motion, self.odometry, self._times, self._empty, self.mountings
+        arrays = self.stored, self.motion, self._times, self._empty, self.mountings
         return sum(one.nbytes for one in arrays)
 
     def add(
@@ -136,7 +134,7 @@ class CandidateFinder:
           time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in any fixed frame.
           compared: Comparisons of an earlier run. If they are given, they are not repeated.
-          continues: See `LoopDetector.add_seen`.
+          continues: See `LoopDetector.add`.
         """
         self._check(seen, time, odometry)
         frame = len(self)
@@ -152,15 +150,15 @@ class CandidateFinder:
             self.stored.check(frame, middle)
         detail, keyframe = self.background.without(middle), self.motion.keyframe
         if compared is None:
-            position = None if pose is None else pose[:3, 3]
-            compared = self._compared(seen._replace(image=detail), time, position, upright, clock, continues=continues)
+            compared = self._compared(seen._replace(image=detail), time, upright, clock, continues=continues)
         else:
             self.motion.add(clock, pose=upright, link=compared.link, continues=continues)
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
         if self.motion.keyframe == frame:
             self._keyframe = detail
-        self._keep(frame, seen, detail, time, pose, empty, continues=continues)
+        self._keep(frame, seen, detail, time, empty)
+        self.has_odometry = pose is not None
         self.compared = compared
         return compared.candidates
 
@@ -170,10 +168,7 @@ class CandidateFinder:
         seen: Seen,
         detail: UInt8[np.ndarray, "m m"],
         time: float | None,
-        pose: Float[np.ndarray, "4 4"] | None,
         empty: bool,
-        *,
-        continues: bool,
     ) -> None:
         """Store what later frames need of a frame."""
         if not empty and self.stored.is_new_place(frame, self.motion):
@@ -182,8 +177,6 @@ class CandidateFinder:
         self.mountings.append(seen.mounting)
         if time is not None:
             self._times.append(time)
-        if pose is not None:
-            self.odometry.add(pose, continues=continues)
 
     def seen(self, record: Record) -> Seen:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
@@ -197,7 +190,6 @@ class CandidateFinder:
         self,
         seen: Seen,
         time: float | None,
-        position: Float[np.ndarray, " 3"] | None,
         pose: Float[np.ndarray, "4 4"] | None,
         clock: float,
         *,
@@ -207,7 +199,7 @@ class CandidateFinder:
         if self.is_empty(seen.image):
             self.motion.add(clock, pose=pose, continues=continues)
             return Compared([], None)
-        excluded = self._excluded(time, position, continues=continues)
+        excluded = self._excluded(time, pose, continues=continues)
         compare = self.comparer
         rows = compare.similar(seen.descriptor, excluded)
         key = self.motion.keyframe
@@ -232,7 +224,7 @@ class CandidateFinder:
             return
         for name, given, known in (
             ("a time", time is not None, self.times is not None),
-            ("odometry", odometry is not None, len(self.odometry) > 0),
+            ("odometry", odometry is not None, self.has_odometry),
         ):
             if given != known:
                 raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self)})")
@@ -240,19 +232,20 @@ class CandidateFinder:
             raise ValueError(f"expected times that do not decrease, found {time} after {self.times[-1]}")
 
     def _excluded(
-        self, time: float | None, position: Float[np.ndarray, " 3"] | None, *, continues: bool
+        self, time: float | None, pose: Float[np.ndarray, "4 4"] | None, *, continues: bool
     ) -> Bool[np.ndarray, " n"]:
         """Stored scans that cannot match the next frame: too recent, or too far away by odometry."""
         config, frames = self.config, self.stored.frames
-        recent = are_recent(len(self), self.times, time, seconds=config.exclude_s, frames=config.exclude_frames)
+        seconds, count = config.exclude_s, config.exclude_frames
+        recent = are_recent(len(self), self.times, time, seconds=seconds, frames=count, rows=frames)
         if not continues:
-            return recent[frames]
-        excluded = (recent | self.motion.near_last(config.min_travelled_m))[frames]
-        if position is not None and len(self.odometry):
-            known = self.odometry.poses[:, :3, 3]
-            drifted = position_deviations(np.concatenate([known, position[None]]), -1, drift=self.drift)[:-1]
-            apart = np.linalg.norm(known[frames] - position, axis=1)
+            return recent
+        excluded = recent | self.motion.near_last(config.min_travelled_m, frames)
+        if pose is not None and len(frames):
+            path, position = self.motion.path, pose[:3, 3]
+            drifted = path.position_deviations(frames, len(path) - 1, position, drift=self.drift)
+            apart = np.linalg.norm(path.poses[frames, :3, 3] - position, axis=1)
             place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
-            far = apart > place_m + self.drift.max_deviation * drifted[frames]
-            excluded = excluded | (far & self.motion.same(len(self) - 1, frames))
+            far = apart > place_m + self.drift.max_deviation * drifted
+            excluded = excluded | (far & self.motion.same(-1, frames))
         return excluded

@@ -56,9 +56,8 @@ class Comparer:
 
     def fit_on_floor(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
         """The correlation, and -2 added on another floor by odometry, because floors of a building look alike."""
-        motion, frames = self.motion, self.stored.frames[rows]
-        other = on_other_floor(motion.poses, motion.travelled, frames, found, self.drift)
-        other = other & motion.same(len(motion) - 1, frames)
+        frames = self.stored.frames[rows]
+        other = on_other_floor(self.motion.path, frames, found, self.drift) & self.motion.same(-1, frames)
         return np.asarray(found.correlation - 2 * other)
 
     def with_further(
@@ -85,7 +84,7 @@ class Comparer:
     def about(self, row: int) -> Bool[np.ndarray, " n"]:
         """Whether each stored scan was recorded at about the same time as one of them."""
         frames = self.stored.frames
-        return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s)[frames]
+        return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s, frames)
 
     def nearest(
         self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]

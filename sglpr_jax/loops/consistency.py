@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.loops.config import ConsistencyConfig, DriftModel
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar_loops, planar_odometry, relative
-from sglpr_jax.loops.transforms import travelled
+from sglpr_jax.loops.path import Path
+from sglpr_jax.loops.planar import compose, frames_of, inverted, planar, planar_loops, relative
 
 BLOCK = 64
 """Number of loops compared with all others at a time, to limit memory."""
@@ -44,9 +44,24 @@ def agree(
     Returns:
       Whether loop i of `loops` is consistent with loop j of `others`.
     """
-    way = travelled(odometry) if way is None else way
-    flat = planar_odometry(odometry, mounting)
-    a, b = (_columns(each, flat, way, mounting) for each in (loops, loops if others is None else others))
+    path = Path.of(odometry, mounting=mounting)
+    others = loops if others is None else others
+    return agree_along(path, loops, others, way=way, mounting=mounting, drift=drift, config=config)
+
+
+def agree_along(
+    path: Path,
+    loops: Sequence[Loop],
+    others: Sequence[Loop],
+    *,
+    way: Float[np.ndarray, " n"] | None = None,
+    mounting: AnyMounting = None,
+    drift: DriftModel = DriftModel(),
+    config: ConsistencyConfig = ConsistencyConfig(),
+) -> Bool[np.ndarray, "a b"]:
+    """Return `agree` for two sets of loops and a path. The time is independent of the length of the path."""
+    way = path.travelled if way is None else way
+    a, b = (_columns(each, path, way, mounting) for each in (loops, others))
     pairs = np.empty((len(a["query_way"]), len(b["query_way"])), bool)
     for start in range(0, len(pairs), BLOCK):
         rows = slice(start, start + BLOCK)
@@ -88,14 +103,16 @@ def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[
 
 
 def _columns(
-    loops: Sequence[Loop], flat: Planar, way: Float[np.ndarray, " n"], mounting: AnyMounting
+    loops: Sequence[Loop], path: Path, way: Float[np.ndarray, " n"], mounting: AnyMounting
 ) -> dict[str, np.ndarray]:
     query, match = frames_of(loops)
+    level = path.level(mounting)
+    query_pose, match_pose = (planar(path.leveled(frames, level)) for frames in (query, match))
     poses, covariances = planar_loops(loops, mounting)
     return {
         "pose": poses,
-        "query_pose": flat[query],
-        "match_pose": flat[match],
+        "query_pose": query_pose,
+        "match_pose": match_pose,
         "query_way": way[query],
         "match_way": way[match],
         "place": covariances[:, 0, 0] + covariances[:, 1, 1],

@@ -17,8 +17,8 @@ from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.consistency import agree
-from sglpr_jax.loops.drift import deviations
+from sglpr_jax.loops.consistency import agree_along
+from sglpr_jax.loops.drift import deviations_along
 from sglpr_jax.loops.given import DATES, given_pose, given_record, given_time
 from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
 from sglpr_jax.loops.planar import frames_of
@@ -95,7 +95,7 @@ class LoopDetector:
     def nbytes(self) -> int:
         """Number of bytes of all frames. The results (`loops`, `supported`, `rejected`, `candidates`) are not counted.
 
-        With `max_places`, only poses and times still grow: 313 bytes a frame, and up to as much in spare capacity.
+        With `max_places`, only poses and times still grow: 305 bytes a frame, and up to as much in spare capacity.
         """
         return self.finder.nbytes
 
@@ -219,17 +219,15 @@ class LoopDetector:
         """Loops within the drift of the odometry or, without odometry, of the motion. The others are rejected."""
         if not loops:
             return []
-        motion, mounting, guessed_m = self.finder.motion, self.finder.mountings, None
-        if len(self.finder.odometry):
-            poses, drift, reason = self.finder.odometry.poses, self.config.drift, "contradicts the odometry"
-        else:
-            poses, drift, reason = motion.odometry(mounting), self.config.motion_drift, "contradicts the motion"
-            guessed_m = motion.guessed_m
-        apart = deviations(loops, poses, drift=drift, mounting=mounting, guessed_m=guessed_m)
+        drift, reason = self.config.drift, "contradicts the odometry"
+        if not self.finder.has_odometry:
+            drift, reason = self.config.motion_drift, "contradicts the motion"
+        apart = deviations_along(self.finder.motion.path, loops, drift=drift, mounting=self.finder.mountings)
         fits = apart <= drift.max_deviation
-        if len(self.finder.odometry):  # loops between two parts of the trajectory cannot contradict it
+        if self.finder.has_odometry:  # it does not say where its parts are relative to each other
             query, match = frames_of(loops)
-            fits = fits | (motion.segments[query] != motion.segments[match])
+            segments = self.finder.motion.segments
+            fits = fits | (segments[query] != segments[match])
         self._reject([loop for loop, fit in zip(loops, fits, strict=True) if not fit], reason)
         return [loop for loop, fit in zip(loops, fits, strict=True) if fit]
 
@@ -243,13 +241,13 @@ class LoopDetector:
 
         Loops that were not returned count, too. Otherwise a few early wrong loops would block all true ones.
         """
-        odometry = self.finder.odometry
-        if not len(odometry):
+        path = self.finder.motion.path
+        if not self.finder.has_odometry:
             return True
-        about = self._near(loop, odometry.travelled)
+        about = self._near(loop, path.travelled)
         if not about:
             return True
-        return bool(agree([loop], odometry.poses, about, way=odometry.travelled, **self._rules).mean() >= 0.5)
+        return bool(agree_along(path, [loop], about, **self._rules).mean() >= 0.5)
 
     def _near(self, loop: Loop, way: Float[np.ndarray, " n"]) -> list[Loop]:
         """Other loops within `near_m` of a loop, by travelled distance `way`. Much earlier loops are not looked at."""

@@ -1,7 +1,6 @@
 """Drift model of odometry: how far a loop is from the odometry between its two frames, in standard deviations."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,10 +8,11 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.planar import Planar, compose, frames_of, planar_loops, planar_odometry, wrapped
+from sglpr_jax.loops.path import Between, Path
+from sglpr_jax.loops.planar import compose, frames_of, planar, planar_loops, wrapped
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import travelled
-from sglpr_jax.loops.upright import upright_odometry, upright_poses
+from sglpr_jax.loops.upright import upright_poses
 
 GRAPH_M = 100.0
 """Travelled distance at which the drift of a pose graph equals that of the model, in metres."""
@@ -47,75 +47,61 @@ def deviations(
       mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
     """
-    flat = planar_odometry(odometry, mounting)
+    path = Path.of(odometry, mounting=mounting, guessed_m=guessed_m)
+    return deviations_along(path, loops, drift=drift, mounting=mounting)
+
+
+def deviations_along(
+    path: Path, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
+) -> Float[np.ndarray, " k"]:
+    """Return `deviations` of each loop from a path. The time is independent of the length of the path."""
     poses, covariances = planar_loops(loops, mounting)
     query, match = frames_of(loops)
-    by_loop = compose(flat[match], poses)
-    error = by_loop - flat[query]
+    level = path.level(mounting)
+    start, end = (planar(path.leveled(frames, level)) for frames in (match, query))
+    by_loop = compose(start, poses)
+    error = by_loop - end
     error[:, 2] = wrapped(error[:, 2])
-    spread = _drifted(flat, match, query, drift, guessed_m) + _turned(covariances, by_loop[:, 2])
+    spread = _drifted(path.between(match, query).turned(level[:2]), end[:, :2], drift)
+    spread += _turned(covariances, by_loop[:, 2])
     spread += np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
     in_plane = np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
-    return np.maximum(in_plane, height_deviations(loops, odometry, drift=drift, mounting=mounting))
+    return np.maximum(in_plane, height_deviations(path, loops, drift=drift, mounting=mounting))
 
 
 def height_deviations(
-    loops: Sequence[Loop],
-    odometry: Float[np.ndarray, "n 4 4"],
-    *,
-    drift: DriftModel = DriftModel(),
-    mounting: AnyMounting = None,
+    path: Path, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
 ) -> Float[np.ndarray, " k"]:
-    """Deviation of each loop from the odometry in height, in standard deviations. The arguments are those of
-    `deviations`."""
+    """Deviation of each loop from a path in height, in standard deviations. The arguments are those of
+    `deviations_along`."""
     query, match = frames_of(loops)
-    world = upright_odometry(odometry, mounting)
     poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
-    by_loop = world[match] @ upright_poses(poses, mounting, query=query, match=match)
-    variance, way = np.array([loop.covariance[2, 2] for loop in loops]), travelled(odometry)
-    spread = np.sqrt(_height_spread(way[query] - way[match], drift) ** 2 + variance)
-    return np.abs(by_loop[:, 2, 3] - world[query, 2, 3]) / spread
+    by_loop = path.poses[match] @ upright_poses(poses, mounting, query=query, match=match)
+    apart = (by_loop - path.poses[query])[:, :3, 3] @ path.level(mounting)[2]
+    variance = np.array([loop.covariance[2, 2] for loop in loops])
+    spread = np.sqrt(_height_spread(path.travelled[query] - path.travelled[match], drift) ** 2 + variance)
+    return np.abs(apart) / spread
 
 
-def on_other_floor(
-    poses: Float[np.ndarray, "n 4 4"],
-    way: Float[np.ndarray, " n"],
-    frames: Int[np.ndarray, " k"],
-    found: Peak,
-    drift: DriftModel,
-) -> Bool[np.ndarray, " k"]:
-    """Whether the odometry contradicts the pose of the last frame found at each of some other frames, by height alone.
+def on_other_floor(path: Path, frames: Int[np.ndarray, " k"], found: Peak, drift: DriftModel) -> Bool[np.ndarray, " k"]:
+    """Whether a path contradicts the pose of the last frame found at each of some other frames, by height alone.
 
     Arguments:
-      poses: Gravity-aligned poses by odometry. The world may be tilted.
-      way: Travelled distance at each pose, in metres.
+      path: Path by odometry. The world may be tilted.
       frames: The other frames.
       found: Pose of the last frame in the image of each of them.
       drift: Drift model.
     """
-    up = poses[:, :3, 2].mean(axis=0)
+    poses, way = path.poses[frames], path.travelled
     shifts = np.stack([found.x, found.y, np.zeros_like(found.x)], axis=1)
-    positions = np.einsum("kij,kj->ki", poses[frames, :3, :3], shifts) + poses[frames, :3, 3]
-    apart = (positions - poses[-1, :3, 3]) @ (up / np.linalg.norm(up))
+    positions = np.einsum("kij,kj->ki", poses[:, :3, :3], shifts) + poses[:, :3, 3]
+    apart = (positions - path.poses[-1, :3, 3]) @ path.up
     return np.abs(apart) > drift.max_deviation * _height_spread(way[-1] - way[frames], drift)
 
 
 def _height_spread(travelled_m: Float[np.ndarray, " k"], drift: DriftModel) -> Float[np.ndarray, " k"]:
     """Standard deviation of a difference in height after a travelled distance, in metres."""
     return np.hypot(drift.height_m, drift.height_per_metre * travelled_m)
-
-
-def position_deviations(
-    positions: Float[np.ndarray, "n 3"], frame: int, *, drift: DriftModel = DriftModel()
-) -> Float[np.ndarray, " n"]:
-    """Standard deviation of the position of every frame relative to `frame`, in metres, over all directions."""
-    away = positions - positions[frame]
-    steps = np.linalg.norm(np.diff(away, axis=0), axis=1)
-    levers = steps * ((away[:-1] + away[1:]) ** 2).sum(axis=1) / 4 + steps**3 / 12
-    length, lever = (np.concatenate([[0.0], np.cumsum(part)]) for part in (steps, levers))
-    length, lever = np.abs(length - length[frame]), np.abs(lever - lever[frame])
-    across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
-    return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
 
 
 def step_deviations(
@@ -134,43 +120,12 @@ def step_deviations(
     return metres, np.radians(degrees)
 
 
-class _Path(NamedTuple):
-    """Integrals along a path from its first frame to every frame: metres and products of metres."""
-
-    length: Float[np.ndarray, " n"]
-    directions: Float[np.ndarray, "n d d"]
-    """Integral of the outer product of the direction of travel with itself."""
-    first: Float[np.ndarray, "n d"]
-    """Integral of the position."""
-    squares: Float[np.ndarray, "n d d"]
-    """Integral of the outer product of the position with itself."""
-
-    @classmethod
-    def of(cls, positions: Float[np.ndarray, "n d"], guessed_m: Float[np.ndarray, " n"] | None = None) -> "_Path":
-        steps, middle = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2
-        length = np.linalg.norm(steps, axis=1)
-        square = steps[:, :, None] * steps[:, None]
-        direction = square / np.maximum(length, 1e-12)[:, None, None]
-        if guessed_m is not None:
-            more = np.diff(guessed_m)
-            length, direction = length + more, direction + more[:, None, None] * np.eye(positions.shape[1])
-        squares = length[:, None, None] * (middle[:, :, None] * middle[:, None] + square / 12)
-        parts = (length, direction, length[:, None] * middle, squares)
-        return cls(
-            *(np.concatenate([np.zeros_like(part[:1], shape=(1, *part.shape[1:])), part.cumsum(0)]) for part in parts)
-        )
-
-
-def _drifted(
-    flat: Planar, start: np.ndarray, end: np.ndarray, drift: DriftModel, guessed_m: Float[np.ndarray, " n"] | None
-) -> Float[np.ndarray, "k 3 3"]:
-    """Covariance of x, y, yaw of frame `end` by odometry from frame `start`.
+def _drifted(between: Between, last: Float[np.ndarray, "k 2"], drift: DriftModel) -> Float[np.ndarray, "k 3 3"]:
+    """Covariance of x, y, yaw of the last frame of some paths in the plane, whose position is `last`, by odometry.
 
     The rates of drift along the path are independent. Their integral has the variance of a constant rate.
     """
-    positions = flat[:, :2] - flat[:, :2].mean(axis=0)
-    between = _Path(*(part[end] - part[start] for part in _Path.of(positions, guessed_m)))
-    last, length = positions[end], between.length[:, None, None]
+    length = between.length[:, None, None]
     crossed = last[:, :, None] * between.first[:, None]
     levers = length * last[:, :, None] * last[:, None] - crossed - np.swapaxes(crossed, 1, 2) + between.squares
     left = np.array([[0.0, -1], [1, 0]])

@@ -318,5 +318,5 @@ def _poses_in(part: Part, found: FoundLoops, finder: CandidateFinder) -> Float[n
     """Pose of the LiDAR at each frame of a recording, in the frame of a part."""
     if found.odometry is not None:
         return found.odometry[: found.frames]
-    poses = finder.motion.odometry(finder.mountings)
+    poses = finder.motion.poses @ finder.mountings.uprights(np.arange(len(finder)))
     return inverse(poses[part.first]) @ poses

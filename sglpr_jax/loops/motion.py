@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import MotionConfig
-from sglpr_jax.loops.mountings import AnyMounting, uprights
+from sglpr_jax.loops.path import Path
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
@@ -31,14 +31,15 @@ class Motion:
     def __init__(self, config: MotionConfig = MotionConfig()):
         self.config = config
         self.keyframe = 0
-        self._poses = GrowingArray(np.empty((0, 4, 4)))
+        self.path = Path()
+        """Planar poses of all added frames or, with odometry, its gravity-aligned poses."""
         self._numbers = GrowingArray(np.empty(0, NUMBERS))
         self._coasted = 0
         self._m_per_s = 0.0
         """Last known forward speed, in metres per second."""
 
     def __len__(self) -> int:
-        return len(self._poses)
+        return len(self.path)
 
     @classmethod
     def joined(cls, motions: "Sequence[Motion]") -> "Motion":
@@ -49,13 +50,13 @@ class Motion:
             for name in ("segment", "travelled", "guessed_m", "clock") if len(last) else ():
                 numbers[name] += last[name] + (name == "segment")
             found._numbers.extend(numbers)
-            found._poses.extend(one.poses)
+            found.path.extend(one.poses, numbers["guessed_m"])
         return found
 
     @property
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
         """Pose of each frame in the frame of the first one. Across segments it is a guess."""
-        return self._poses.rows
+        return self.path.poses
 
     @property
     def segments(self) -> Int[np.ndarray, " n"]:
@@ -80,7 +81,7 @@ class Motion:
     @property
     def nbytes(self) -> int:
         """Number of bytes that the arrays hold."""
-        return self._poses.nbytes + self._numbers.nbytes
+        return self.path.nbytes + self._numbers.nbytes
 
     def add(
         self,
@@ -161,8 +162,8 @@ class Motion:
     def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
         """Add the first frame after an unknown motion."""
         clock = self.clock[-1] + time - self._times[-1]
-        last = {"travelled": self.travelled[-1] + UNKNOWN_M, "guessed_m": self.guessed_m[-1] + UNKNOWN_M}
-        self._append(time, pose, segment=int(self.segments[-1]) + 1, clock=clock, **last)
+        segment, guessed_m = int(self.segments[-1]) + 1, self.guessed_m[-1] + UNKNOWN_M
+        self._append(time, pose, segment=segment, travelled=self.travelled[-1], clock=clock, guessed_m=guessed_m)
         self._coasted, self._m_per_s, self.keyframe = 0, 0.0, len(self) - 1
 
     def _drifted_m(self, time: float) -> float:
@@ -179,7 +180,7 @@ class Motion:
         clock: float,
         guessed_m: float,
     ) -> None:
-        self._poses.append(pose)
+        self.path.add(pose, guessed_m=guessed_m)
         self._numbers.append((time, segment, travelled, guessed_m, clock))
 
     @property
@@ -190,24 +191,19 @@ class Motion:
         """Poses of `frame` in the frames of `rows`, and whether each is known."""
         return inverse(self.poses[rows]) @ self.poses[frame], self.same(frame, rows)
 
-    def about(self, frame: int, seconds: float) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is less than `seconds` before or after `frame`, without standing time."""
-        return np.abs(self.clock - self.clock[frame]) < seconds
+    def about(self, frame: int, seconds: float, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+        """Whether each of `rows` is less than `seconds` before or after `frame`, without standing time."""
+        return np.abs(self.clock[rows] - self.clock[frame]) < seconds
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return self.segments[rows] == self.segments[frame]
 
-    def odometry(self, mounting: AnyMounting) -> Float[np.ndarray, "n 4 4"]:
-        """Poses of the LiDAR, whose frame is tilted by its mounting."""
-        return self.poses @ uprights(mounting, np.arange(len(self)))
-
-    def near_last(self, travelled_m: float) -> Bool[np.ndarray, " n"]:
-        """Whether each frame is known to be less than `travelled_m` (metres) before the last frame."""
+    def near_last(self, travelled_m: float, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+        """Whether each of `rows` is known to be less than `travelled_m` (metres) before the last frame."""
         if not len(self):
             return np.zeros(0, bool)
-        known = self.segments == self.segments[-1]
-        return known & (self.travelled[-1] - self.travelled < travelled_m)
+        return self.same(-1, rows) & (self.travelled[-1] - self.travelled[rows] < travelled_m)
 
     def _is_trusted(self, link: Peak, *, expected: bool) -> bool:
         best, config = float(link.correlation), self.config

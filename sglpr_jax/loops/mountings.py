@@ -26,6 +26,7 @@ class Mountings:
         self._each: list[Mounting | None] = []
         self._count = 0
         self._uprights = GrowingArray(np.empty((0, 4, 4)))
+        self._tilted = False
         for mounting in mountings:
             self.append(mounting)
 
@@ -41,6 +42,11 @@ class Mountings:
         return len(self._uprights) > 0
 
     @property
+    def tilted(self) -> bool:
+        """Whether the sensor's z axis does not point up at some frame."""
+        return self._tilted
+
+    @property
     def nbytes(self) -> int:
         """Number of bytes of the transforms."""
         return self._uprights.nbytes
@@ -54,6 +60,7 @@ class Mountings:
             self._each.append(mounting)
         if self.differ:
             self._uprights.append(upright_from_lidar(mounting))
+        self._tilted |= is_tilted(mounting)
         self._count += 1
 
     def uprights(self, frames: Int[np.ndarray, " k"] | int) -> Float[np.ndarray, "*k 4 4"]:
@@ -75,3 +82,10 @@ def mountings_of(recording: Recording) -> AnyMounting:
 def uprights(mounting: AnyMounting, frames: Int[np.ndarray, " k"] | int) -> Float[np.ndarray, "*k 4 4"]:
     """Transform from the LiDAR frame to the gravity-aligned frame at some frames: one each, or one for all."""
     return mounting.uprights(frames) if isinstance(mounting, Mountings) else upright_from_lidar(mounting)
+
+
+def is_tilted(mounting: AnyMounting) -> bool:
+    """Whether the z axis of a sensor does not point up, at any frame."""
+    if isinstance(mounting, Mountings):
+        return mounting.tilted
+    return mounting is not None and tuple(mounting.up) != (0.0, 0.0, 1.0)

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from sglpr_jax.loops.loop import DEGENERATE_M, Loop
 from sglpr_jax.loops.mountings import AnyMounting, uprights
 from sglpr_jax.loops.transforms import moved_covariance, yaw_of
-from sglpr_jax.loops.upright import upright_odometry, upright_poses
+from sglpr_jax.loops.upright import upright_poses
 
 Planar = Float[np.ndarray, "... 3"]
 """Poses in the plane: x, y, yaw."""
@@ -20,11 +20,6 @@ SEEN = np.array([0, 1, 5])
 def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
     """Project poses to the x-y plane of their own frame."""
     return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
-
-
-def planar_odometry(odometry: Float[np.ndarray, "n 4 4"], mounting: AnyMounting) -> Planar:
-    """Project the odometry of a LiDAR with this `mounting` to the plane of the ground."""
-    return planar(upright_odometry(odometry, mounting))
 
 
 def planar_loops(loops: Sequence[Loop], mounting: AnyMounting) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:

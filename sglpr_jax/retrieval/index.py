@@ -44,6 +44,8 @@ TYPES = ("F32", "F64", "U8", "I64")
 """Types of arrays in every file, also of the additional arrays of `to_bytes`, in the terms of safetensors."""
 SPARE = 16
 """Number of additional rows compared in float64, because float32 may swap rows with almost equal distances."""
+FEW = 4
+"""If at most one of this many rows is allowed, only the allowed ones are compared."""
 BLOCK = 64
 """Number of queries compared with all rows at a time."""
 
@@ -257,10 +259,15 @@ class Index:
             every = distance_function(self.distance)(queries, self.descriptors[rows])
             order = smallest(every, k)
             return rows[order], np.take_along_axis(every, order, axis=1)
-        rough = self._squares()[None] - 2 * queries @ self.descriptors.T
-        rough[:, ~allowed] = np.inf
-        few = min(k + SPARE, int(allowed.sum()))
-        near = np.argpartition(rough, few - 1, axis=1)[:, :few]
+        descriptors, squares, rows = self.descriptors, self._squares(), np.flatnonzero(allowed)
+        few = min(k + SPARE, len(rows))
+        if len(rows) * FEW <= len(self):
+            rough = squares[rows] - 2 * queries @ descriptors[rows].T
+            near = rows[np.argpartition(rough, few - 1, axis=1)[:, :few]]
+        else:
+            rough = squares - 2 * queries @ descriptors.T
+            rough[:, ~allowed] = np.inf
+            near = np.argpartition(rough, few - 1, axis=1)[:, :few]
         found = [nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
         return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
 

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.drift import deviations, on_other_floor, position_deviations, step_deviations
+from sglpr_jax.loops.drift import deviations, on_other_floor, step_deviations
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.loop_files import read_g2o, write_g2o
+from sglpr_jax.loops.path import Path
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
@@ -60,15 +61,6 @@ def test_a_guessed_path_drifts_in_every_direction():
     assert after < 0.6 * before
     (same,) = deviations([exact(odometry, 100, 60)], odometry, guessed_m=guessed_m)
     assert same == 0
-
-
-def test_positions_drift_along_and_by_the_turns_before():
-    positions = along([(0, 0), (101, 0)])[:, :3, 3]
-    found = position_deviations(positions, 100)
-    assert found[100] == 0 and (np.diff(found) < 0).all()
-    lever = np.radians(0.5) * 100 / np.sqrt(3)
-    assert found[0] == pytest.approx(np.sqrt(1 + 0.25**2 + lever**2), rel=1e-3)
-    np.testing.assert_allclose(position_deviations(positions[::-1], 0), found[::-1], atol=1e-9)
 
 
 @pytest.mark.parametrize("degrees", [(0.0, 20.0, 0.0), (180.0, 0.0, 0.0)], ids=["nods", "upside down"])
@@ -158,4 +150,4 @@ def test_another_floor_is_seen_in_a_world_that_is_tilted(roll, pitch):
         poses = world @ ramp(3, rise_m)
         frames = np.array([len(poses) - 101, len(poses) - 201])
         peaks = Peak(*np.zeros((6, 2)))
-        assert (on_other_floor(poses, np.arange(len(poses)) * 1.0, frames, peaks, DriftModel()) == other).all()
+        assert (on_other_floor(Path.of(poses), frames, peaks, DriftModel()) == other).all()

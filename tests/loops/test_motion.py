@@ -69,7 +69,7 @@ def test_the_clock_stops_where_the_sensor_stands():
     for frame in range(40):
         motion.add(float(frame), link=link(0.0) if frame else None)
     assert motion.clock[-1] == motion.config.standing_s and motion.travelled[-1] == 0
-    assert motion.near_last(10.0).all()
+    assert motion.near_last(10.0, np.arange(len(motion))).all()
 
 
 def test_odometry_is_taken_as_it_is():
@@ -77,4 +77,4 @@ def test_odometry_is_taken_as_it_is():
     for frame in range(30):
         motion.add(float(frame), pose=transform(0.5 * frame, 0.0, 0.1 * frame))
     assert motion.travelled[-1] == pytest.approx(14.5) and set(motion.segments) == {0}
-    assert motion.near_last(10.0).sum() == 20
+    assert motion.near_last(10.0, np.arange(len(motion))).sum() == 20

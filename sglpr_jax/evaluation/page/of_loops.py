@@ -140,12 +140,13 @@ def _pairs(found: FoundLoops) -> str:
     if not figures.can_draw():
         return missing("The pictures need matplotlib: pip install 'sglpr-jax[viz]'.")
     rows = np.unique(np.linspace(0, len(found.loops) - 1, SHOWN_PAIRS).astype(int))
-    pictures = {_title(found, found.loops[row]): _overlay(found, found.loops[row]) for row in rows}
+    pictures = {_title(found, found.loops[row]): overlay_of(found, found.loops[row]) for row in rows}
     caption = "Match in red, query in cyan; cells with points of both are white. Pairs are spread over the recording."
     return figure_html(loop_figures.overlays(pictures), "Pairs of images", caption=caption)
 
 
-def _overlay(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
+def overlay_of(found: FoundLoops, loop: Loop) -> Float[np.ndarray, "h w 3"]:
+    """Overlay the images of the two scans of a loop, as RGB colours from 0 to 1 (`overlay.overlaid`)."""
     query, match = (square_image(found.recording.record(frame, labels=False)) for frame in (loop.query, loop.match))
     mounting = mountings_of(found.recording)
     return overlaid(query, match, upright_poses(loop.match_from_query, mounting, query=loop.query, match=loop.match))

@@ -1,0 +1,152 @@
+"""The loops of a recording as a file for the rerun viewer (extra `view`): trajectories, scans, loops, image pairs."""
+
+import importlib
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from sglpr_jax.evaluation.page.of_loops import overlay_of, wrong_loops
+from sglpr_jax.files import replacing
+from sglpr_jax.loops.find import FoundLoops
+from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.optimization import OptimizedTrajectory
+from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.transforms import transformed, travelled
+
+KEYFRAME_M = 5.0
+"""Distance between two scans in the file, in metres."""
+VOXEL_M = 0.5
+"""Edge of a voxel, in metres. One point in each is kept."""
+TIMELINE = "frame"
+BEFORE, AFTER = (150, 150, 150), (40, 120, 220)
+RIGHT, WRONG = (60, 180, 75), (230, 30, 30)
+"""Colours of the trajectories and of the loops, red, green, blue."""
+
+
+def check_installed() -> None:
+    """Raises ImportError with the command that installs rerun, if it is missing."""
+    if importlib.util.find_spec("rerun") is None:
+        raise ImportError("--rerun needs rerun-sdk: pip install 'sglpr-jax[view]'")
+
+
+def write_rerun(found: FoundLoops, path: Path | str, *, optimized: OptimizedTrajectory | None = None) -> None:
+    """Write the loops of a recording as an .rrd file for the rerun viewer.
+
+    The time line counts frames. With poses (odometry or, without it, known poses) the file has the trajectory, the
+    corrected one, the scan at every 5 m, and a line for each loop. Without poses it has the images of the loops laid
+    over each other, and the probabilities. Loops that are wrong by known poses are red.
+
+    Arguments:
+      found: Loops of a recording.
+      path: File to write. An existing file is replaced.
+      optimized: Corrected trajectory.
+
+    Raises:
+      ImportError: If rerun is not installed.
+      WriteError: If the file cannot be written.
+    """
+    check_installed()
+    rerun: Any = importlib.import_module("rerun")
+    poses = _poses(found, optimized)
+    with replacing(Path(path)) as temporary:
+        stream = rerun.RecordingStream("sglpr-jax", recording_id=f"loops {found.recording.name}")
+        stream.save(temporary, default_blueprint=_layout(rerun, with_map=poses is not None))
+        if poses is not None:
+            _log_map(rerun, stream, found, poses, optimized)
+        _log_loops(rerun, stream, found, poses)
+        _log_evidence(rerun, stream, found)
+        stream.disconnect()
+
+
+def _poses(found: FoundLoops, optimized: OptimizedTrajectory | None) -> Float[np.ndarray, "n 4 4"] | None:
+    """Pose of each searched frame in the map: corrected, by odometry, or a known position without a rotation."""
+    if optimized is not None:
+        return optimized.poses
+    if found.odometry is not None:
+        return found.odometry[: found.frames]
+    positions = found.recording.positions
+    if positions is None:
+        return None
+    poses = np.tile(np.eye(4), (found.frames, 1, 1))
+    poses[:, :3, 3] = positions[: found.frames] - positions[0]
+    return poses
+
+
+def _layout(rerun: Any, *, with_map: bool) -> Any:
+    views = importlib.import_module("rerun.blueprint")
+    images = views.Spatial2DView(origin="pair", name="Query (cyan) on match (red)")
+    lines = views.TimeSeriesView(origin="evidence", name="Evidence")
+    beside = views.Vertical(images, lines)
+    space = [views.Spatial3DView(origin="map", name="Map")] if with_map else []
+    return views.Blueprint(views.Horizontal(*space, beside))
+
+
+def _log_map(
+    rerun: Any,
+    stream: Any,
+    found: FoundLoops,
+    poses: Float[np.ndarray, "n 4 4"],
+    optimized: OptimizedTrajectory | None,
+) -> None:
+    """Both trajectories, the sensor, and the scans of keyframes."""
+    stream.log("map", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    lines = {"given": (poses, BEFORE)}
+    if optimized is not None and found.odometry is not None:
+        lines = {"given": (found.odometry[: found.frames], BEFORE), "corrected": (poses, AFTER)}
+    for name, (path, colour) in lines.items():
+        stream.log(f"map/trajectory/{name}", rerun.LineStrips3D([path[:, :3, 3]], colors=[colour]), static=True)
+    turned = found.odometry is not None  # known positions have no rotation
+    keyframes = set(_keyframes(poses).tolist()) if turned and not found.recording.has_images else set()
+    for frame, pose in enumerate(poses):
+        stream.set_time(TIMELINE, sequence=frame)
+        stream.log("map/sensor", rerun.Points3D([pose[:3, 3]], radii=[1.0], colors=[AFTER]))
+        if frame in keyframes and found.recording.ids[frame] not in found.skipped:
+            points = found.recording.record(frame, labels=False).points
+            if points is not None and len(points):
+                placed = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
+                stream.log(f"map/scans/{frame}", rerun.Points3D(placed, radii=[0.05]))
+
+
+def _keyframes(poses: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
+    """The first frame of every `KEYFRAME_M` of the path."""
+    return np.unique(np.floor(travelled(poses) / KEYFRAME_M), return_index=True)[1]
+
+
+def _thinned(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
+    """One point in each voxel."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    _, first = np.unique(np.floor(finite / VOXEL_M).astype(np.int64), axis=0, return_index=True)
+    return finite[first]
+
+
+def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarray, "n 4 4"] | None) -> None:
+    """A line in the map, the pair of images and a text for each loop, at the frame of the query."""
+    wrong = {(loop.query, loop.match) for loop in wrong_loops(found)}
+    for loop in found.loops:
+        colour = WRONG if (loop.query, loop.match) in wrong else RIGHT
+        stream.set_time(TIMELINE, sequence=loop.query)
+        if poses is not None:
+            ends = poses[[loop.match, loop.query], :3, 3]
+            stream.log(f"map/loops/{loop.query}", rerun.LineStrips3D([ends], colors=[colour], labels=[_said(loop)]))
+        image = (255 * np.clip(overlay_of(found, loop), 0, 1)).astype(np.uint8)
+        stream.log("pair", rerun.Image(image).compress(jpeg_quality=90))
+        stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {_said(loop)}"))
+
+
+def _said(loop: Loop) -> str:
+    overlap = "" if loop.overlap is None else f", overlap {loop.overlap:.2f}"
+    return f"probability {loop.probability:.4f}{overlap}"
+
+
+def _log_evidence(rerun: Any, stream: Any, found: FoundLoops) -> None:
+    """Correlation of the candidate of each frame, and its probability without the evidence of neighbours."""
+    if found.model is None or not found.candidates:
+        return
+    probabilities = found.model.probability(Evidence.stack([one.evidence for one in found.candidates]))
+    for one, probability in zip(found.candidates, probabilities.tolist(), strict=True):
+        stream.set_time(TIMELINE, sequence=one.query)
+        stream.log("evidence/probability", rerun.Scalars(probability))
+        stream.log("evidence/correlation", rerun.Scalars(float(one.alignment.correlation)))
