@@ -1,15 +1,11 @@
 """Publisher of scans and odometry on topics of ROS 2, for `live_dds` and `live_zenoh`."""
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 
 from sglpr_jax.live.ros_messages import CLOUD, TRANSFORMS, encode, transform_message, typestore
 from sglpr_jax.live.ros_wire import Wire
-
-DISCOVERY_S = 2.0
-"""Time in which subscriptions find a new publisher, in seconds."""
 
 
 class RosPublisher:
@@ -18,7 +14,7 @@ class RosPublisher:
     flags = ("--topic", "/points", "--odometry-topic", "/odometry")
 
     def __init__(self, connect: Callable[[], Wire]):
-        """`connect` opens the connection with the first scan."""
+        """`connect` opens the connection with the first scan. Scans before the subscription finds it are lost."""
         self._connect = connect
         self._wire: Wire | None = None
 
@@ -28,7 +24,6 @@ class RosPublisher:
             self._wire = self._connect()
             self._clouds = self._wire.advertise("/points", CLOUD, depth=1, latched=False)
             self._poses = self._wire.advertise("/odometry", TRANSFORMS, depth=100, latched=False)
-            time.sleep(DISCOVERY_S)
         self._poses(encode(transform_message(world_from_lidar, time=stamp, frame="odom", child="lidar")))
         self._clouds(cloud(points, stamp))
 
