@@ -25,9 +25,6 @@ from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 
-WARM_S = 10.0
-"""Time before memory is measured for the first time, in seconds."""
-
 
 class Publisher(Protocol):
     """Publishes scans for a source. The function `publisher(where)` of `benchmarks.speed.live_SOURCE` makes one."""
@@ -50,6 +47,8 @@ class Options:
     """Scans a second."""
     seconds: float = 60.0
     """Duration at each rate, without the start."""
+    warm_s: float = 10.0
+    """Time before memory is measured for the first time."""
     scans: int = 240
     """Scans of the simulated drive."""
     sensor: str = "vlp16"
@@ -83,14 +82,14 @@ def measured(options: Options, rate: float) -> dict[str, float]:
         process = context.Process(target=publish, args=(name, where, rate, options))
         process.start()
         wait_until(lambda: results.frames, node)
-        time.sleep(WARM_S)
+        time.sleep(options.warm_s)
         before = results.memory()
         process.join()
         time.sleep(1.0)
         after = results.memory()
         node.send_signal(signal.SIGTERM)
-        node.wait()
-        published = int(rate * (options.seconds + WARM_S))
+        results.close()
+        published = int(rate * (options.seconds + options.warm_s))
         return {"Hz": rate, "start [s]": ready, **results.row(published), **growth(before, after)}
 
 
@@ -102,7 +101,7 @@ def publish(name: str, where: str, rate: float, options: Options) -> None:
     there_and_back = [*range(len(drive)), *range(len(drive) - 2, 0, -1)]
     publisher = publisher_of(name, where)
     begin = time.monotonic()
-    for count in range(int(rate * (options.seconds + WARM_S))):
+    for count in range(int(rate * (options.seconds + options.warm_s))):
         time.sleep(max(0.0, begin + count / rate - time.monotonic()))
         row = there_and_back[count % len(there_and_back)]
         publisher.put(clouds[row], poses[row], time.time())
@@ -117,7 +116,15 @@ class Results:
         self.of_loops: list[float] = []
         """Latencies in seconds: of each scan, and of each scan with loops, to its last loop."""
         self._node = node
-        threading.Thread(target=self._read, daemon=True).start()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Wait for the end of the node."""
+        self._node.wait()
+        self._thread.join()
+        assert self._node.stdout is not None
+        self._node.stdout.close()
 
     def memory(self) -> tuple[float, float]:
         """Resident memory of the node in MB, and its count of the map's bytes in MB."""

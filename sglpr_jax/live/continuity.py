@@ -44,9 +44,12 @@ class Continuity:
         """Whether the scan before was placed by odometry."""
         self._resumed = False
 
-    def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> None:
-        """Continue a map of an earlier process, whose last scan had this pose at this time."""
-        self._used, self._last, self._time, self._resumed = pose is not None, pose, time, True
+    def resume(self, pose: Float[np.ndarray, "4 4"] | None, time: float, *, known: bool = True) -> None:
+        """Continue a map of an earlier process, whose last scan had this pose at this time.
+
+        With `known=False`, the motion up to that scan was unknown, so its pose may be an old one.
+        """
+        self._used, self._last, self._time, self._known, self._resumed = pose is not None, pose, time, known, True
 
     def placed(self, pose: Float[np.ndarray, "4 4"] | None, time: float) -> Placed | None:
         """Place the next scan, or return None if it is to be left out.

@@ -1,5 +1,6 @@
 """Map of a running node: the loop detector with a journal on disk, from which the next process continues."""
 
+import contextlib
 import dataclasses
 import time
 from pathlib import Path
@@ -115,11 +116,11 @@ class LiveMap:
             raise ValueError(f"{record.name or 'scan'}: expected points, found none")
         if record.mounting is None:
             record = dataclasses.replace(record, mounting=self._mounting.see(record.points))
+        seen = self.detector.finder.seen(record)  # first, because an invalid scan must not count below
         clock = self._clock.time(frame.time, frame.received)
         placed = self._continuity.placed(pose, clock)
         if placed is None:
             return None
-        seen = self.detector.finder.seen(record)
         loops = self.detector.add_seen(seen, time=clock, odometry=placed.pose, continues=placed.continues)
         compared, stamp, wall = self.detector.finder.compared, float(frame.time), time.time()
         stamp = stamp if np.isfinite(stamp) else 0.0
@@ -154,7 +155,7 @@ class LiveMap:
         """Continue after the last scan of an earlier process."""
         passed = min(max(time.time() - scan.wall, 0.0), MOST_WALL_S)
         self._clock.resume(scan.time, scan.stamp, received=time.monotonic() - passed)
-        self._continuity.resume(scan.pose, scan.time)
+        self._continuity.resume(scan.pose, scan.time, known=scan.continues)
         self._mounting = FirstScans(self._height, known=scan.seen.mounting)
         self._report("recall", f"the map continues after {len(self)} scans and {len(self.detector.loops)} loops")
 
@@ -170,6 +171,8 @@ class LiveMap:
                 self._synced = time.monotonic()
         except OSError as error:
             self._report("disk", f"{error}; the map is not written any more, and a restart continues before this scan")
+            with contextlib.suppress(OSError):
+                self._journal.close()
             self._journal = None
 
     def _edge(self, loop: Loop, received: float) -> LoopEdge:

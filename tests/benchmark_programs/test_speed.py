@@ -176,3 +176,11 @@ def test_bytes_are_counted_once_and_not_those_of_code():
     held_bytes = importlib.import_module("benchmarks.speed.long_drive").held_bytes
     array = np.zeros(1000)
     assert 8000 < held_bytes([array, array[1:], array[2:], np.zeros]) < 9000
+
+
+def test_the_latency_of_a_running_node_is_measured():
+    options = ("--rates", "5", "--seconds", "2", "--warm-s", "1", "--scans", "10", "--weights", "circular")
+    head, _, row = printed("speed.live", *options).strip().splitlines()
+    found = dict(zip(head.split("|"), row.split("|"), strict=True))
+    assert float(found[" taken "]) == float(found[" published "]) == 15 and float(found[" dropped "]) == 0
+    assert 0 < float(found[" frame 50 % [ms] "]) <= float(found[" frame 99 % [ms] "])

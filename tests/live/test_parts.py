@@ -124,6 +124,12 @@ def test_after_a_restart_the_way_is_known_only_if_the_odometry_continues(said, l
     assert continuity.placed(pose, 100.1 + seconds).continues
 
 
+def test_after_a_restart_an_old_pose_does_not_continue(said):
+    continuity = Continuity(said, expected=False)
+    continuity.resume(at(40), 100.0, known=False)
+    assert not continuity.placed(at(41), 101.0).continues and continuity.placed(at(42), 101.1).continues
+
+
 def test_the_mounting_is_that_of_the_first_scans(drive):
     first = FirstScans()
     found = [first.see(drive.points(i)) for i in range(SCANS + 1)]

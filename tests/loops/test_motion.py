@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.motion import UNKNOWN_M, Motion
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import transform
 
@@ -78,3 +78,20 @@ def test_odometry_is_taken_as_it_is():
         motion.add(float(frame), pose=transform(0.5 * frame, 0.0, 0.1 * frame))
     assert motion.travelled[-1] == pytest.approx(14.5) and set(motion.segments) == {0}
     assert motion.near_last(10.0, np.arange(len(motion))).sum() == 20
+
+
+def test_after_an_unknown_motion_nothing_is_known_about_the_way():
+    motion = Motion()
+    for i in range(3):
+        motion.add(float(i), pose=transform(float(i), 0.0, 0.0))
+    motion.add(3.0, pose=transform(500.0, 0.0, 1.0), continues=False)
+    motion.add(4.0, pose=transform(501.0, 0.0, 1.0))
+    assert motion.segments.tolist() == [0, 0, 0, 1, 1] and motion.keyframe == 3
+    assert motion.near_last(10.0, np.arange(5)).tolist() == [False, False, False, True, True]
+    assert motion.path.travelled[3] - motion.path.travelled[2] >= UNKNOWN_M
+    np.testing.assert_allclose(np.diff(motion.path.travelled)[[0, 1, 3]], 1.0, rtol=1e-6)
+    unknown = Motion()
+    for i in range(3):
+        unknown.add(float(i), link=link(1.0) if i else None)
+    unknown.add(3.0, link=link(1.0), continues=False)
+    assert unknown.segments.tolist() == [0, 0, 0, 1]
