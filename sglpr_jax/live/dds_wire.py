@@ -114,9 +114,9 @@ class DdsWire:
         """Topics with a publisher, and their types."""
         found: dict[str, set[str]] = {}
         for one in self._publications.read(N=10_000):
-            alive = one.sample_info.instance_state == InstanceState.Alive and one.topic_name is not None
-            if alive and one.topic_name.startswith(f"{PREFIX}/"):
-                found.setdefault(one.topic_name.removeprefix(PREFIX), set()).add(ros_type(one.type_name))
+            name, alive = one.topic_name, one.sample_info.instance_state == InstanceState.Alive
+            if alive and name is not None and one.type_name is not None and name.startswith(f"{PREFIX}/"):
+                found.setdefault(name.removeprefix(PREFIX), set()).add(ros_type(one.type_name))
         return found
 
     def close(self) -> None:
