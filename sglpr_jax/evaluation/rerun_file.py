@@ -23,7 +23,8 @@ VOXEL_M = 0.5
 TIMELINE = "frame"
 BEFORE, AFTER = (150, 150, 150), (40, 120, 220)
 RIGHT, WRONG = (60, 180, 75), (230, 30, 30)
-"""Colours of the trajectories and of the loops, red, green, blue."""
+SCAN = (110, 110, 110)
+"""Colours of the trajectories, the loops and the scans, red, green, blue."""
 
 
 def check_installed() -> None:
@@ -107,7 +108,7 @@ def _log_map(
             points = found.recording.record(frame, labels=False).points
             if points is not None and len(points):
                 placed = transformed(pose, _thinned(points).astype(np.float64)).astype(np.float32)
-                stream.log(f"map/scans/{frame}", rerun.Points3D(placed, radii=[0.05]))
+                stream.log(f"map/scans/{frame}", rerun.Points3D(placed, colors=[SCAN], radii=[0.05]))
 
 
 def _keyframes(poses: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
