@@ -59,6 +59,8 @@ class LiveCommand:
     """Topic of the point clouds."""
     odometry_topic: str | None = None
     """Topic of the odometry. Without odometry, loops are found by the scans alone."""
+    reliable: bool = False
+    """Request lost scans again (dds). Publishers that are best effort then do not match."""
     rate: NotNegative = 1.0
     """Speed of a replayed bag. 0 is as fast as possible."""
     poses: Path | None = None

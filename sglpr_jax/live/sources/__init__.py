@@ -47,6 +47,9 @@ class SourceOptions:
     """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh)."""
     odometry_topic: str | None = None
     """Topic of the odometry (Odometry or tf). None: no odometry, except that of a bag's own poses."""
+    reliable: bool = False
+    """Whether scans that were lost on the way are requested again (dds). Publishers that are best effort then do not
+    match."""
     rate: float = 1.0
     """Speed of a replayed bag. 0 is as fast as possible."""
     poses: Path | None = None

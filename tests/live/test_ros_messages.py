@@ -1,0 +1,104 @@
+"""Messages of ROS 2, against rosbags' own decoding."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.live.frame import LoopEdge
+from sglpr_jax.live.ros_messages import (
+    CLOUD,
+    EDGE,
+    MARKERS,
+    TRANSFORMS,
+    decode_cloud,
+    edge_message,
+    encode,
+    marker_message,
+    transform_message,
+    typestore,
+)
+from tests.live.messages import LIVOX, POINTS, cloud, decoded, livox
+
+POSE = np.eye(4)
+POSE[:3, :3] = Rotation.from_euler("xyz", [0.1, -0.2, 2.0]).as_matrix()
+POSE[:3, 3] = 1.5, -2.0, 0.25
+
+
+def edge(**changed) -> LoopEdge:
+    root = np.random.default_rng(3).normal(size=(6, 6))
+    fields = LoopEdge(40, 2, 1234.5, 1000.25, POSE, root @ root.T, 0.9, np.eye(4), np.eye(4), 0.01)
+    return fields._replace(**changed)
+
+
+@pytest.mark.parametrize("kind, message", [(CLOUD, cloud()), (LIVOX, livox())])
+@pytest.mark.parametrize("padding", [b"", b"\0\0\0"])
+def test_a_cloud_is_decoded(kind, message, padding):
+    header, records = decode_cloud(message + padding, kind)
+    assert header == (12.5, "lidar")
+    np.testing.assert_array_equal(records.points, POINTS)
+    assert records.lasers is not None and len(records.lasers) == len(POINTS)
+
+
+@pytest.mark.parametrize("kind, message", [(CLOUD, cloud()), (LIVOX, livox())])
+def test_a_damaged_cloud_is_one_clear_error(kind, message):
+    for length in (0, 3, 4, 9, 30, len(message) // 2):
+        with pytest.raises(ValueError, match="expected a cloud with points, found"):
+            decode_cloud(message[:length], kind)
+
+
+def test_a_cloud_without_z_names_its_fields():
+    two = typestore().deserialize_cdr(cloud(), CLOUD)
+    two.fields = two.fields[:2]
+    with pytest.raises(ValueError, match="expected the fields x, y and z, found x y"):
+        decode_cloud(encode(two), CLOUD)
+
+
+def test_an_edge_has_the_times_of_both_scans_and_their_pose():
+    found = decoded(encode(edge_message(edge())), EDGE)
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (1234, 500_000_000)
+    assert found.header.frame_id == "match/1000.250000000"
+    at, turned = found.pose.pose.position, found.pose.pose.orientation
+    np.testing.assert_allclose([at.x, at.y, at.z], POSE[:3, 3])
+    turn = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w]).as_matrix()
+    np.testing.assert_allclose(turn, POSE[:3, :3], atol=1e-12)
+
+
+def test_the_covariance_of_an_edge_is_about_the_axes_of_the_match():
+    """Small motions of the query in its own frame, seen as those of its pose in the match's frame."""
+    covariance = np.diag([0.4, 0.1, 0.05, 0.002, 0.001, 0.01]) ** 2
+    motions = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 20_000)
+    turns = Rotation.from_matrix(POSE[:3, :3])
+    moved = motions[:, :3] @ POSE[:3, :3].T
+    turned = (turns * Rotation.from_rotvec(motions[:, 3:]) * turns.inv()).as_rotvec()
+    expected = np.cov(np.concatenate([moved, turned], axis=1).T)
+    found = decoded(encode(edge_message(edge(covariance=covariance))), EDGE).pose.covariance.reshape(6, 6)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
+
+
+@pytest.mark.parametrize("time", [float("nan"), -3.0, 1e12])
+def test_a_time_that_no_stamp_holds_becomes_zero(time):
+    found = decoded(encode(edge_message(edge(query_time=time))), EDGE)
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (0, 0)
+
+
+def test_markers_are_lines_between_the_scans():
+    ends = [np.array([[0, 0, 0], [1, 2, 3.0]]), np.array([[4, 4, 4], [5, 6, 7.0]])]
+    (marker,) = decoded(encode(marker_message(ends, time=8.0, frame="odom")), MARKERS).markers
+    assert (marker.type, marker.action, marker.header.frame_id) == (marker.LINE_LIST, marker.ADD, "odom")
+    assert [(one.x, one.y, one.z) for one in marker.points] == [(0, 0, 0), (1, 2, 3), (4, 4, 4), (5, 6, 7)]
+
+
+def test_a_transform_names_both_frames():
+    (one,) = decoded(encode(transform_message(POSE, time=2.0, frame="map", child="odom")), TRANSFORMS).transforms
+    assert (one.header.frame_id, one.child_frame_id, one.header.stamp.sec) == ("map", "odom", 2)
+    assert one.transform.translation.x == 1.5
+
+
+def test_hashes_of_types_are_those_of_ros():
+    """As rmw_zenoh of Jazzy has them in its keys."""
+    published = {
+        CLOUD: "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+        TRANSFORMS: "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    }
+    assert {kind: typestore().hash_rihs01(kind) for kind in published} == published

@@ -1,0 +1,185 @@
+"""Source and sink of ROS 2 topics, with a connection in memory."""
+
+import itertools
+import time as clock
+
+import numpy as np
+import pytest
+
+from sglpr_jax.live.frame import FrameStatus, LoopEdge
+from sglpr_jax.live.ros_messages import CLOUD, EDGE, MARKERS, TRANSFORMS
+from sglpr_jax.live.ros_sink import RosSink
+from sglpr_jax.live.ros_source import TAKEN_OVER_S, RosSource
+from sglpr_jax.live.ros_wire import domain_of, ros_type, wire_type
+from sglpr_jax.live.sinks import SinkOptions
+from sglpr_jax.live.sources import SourceOptions
+from tests.live.messages import LIVOX, ODOMETRY, POINTS, Said, cloud, decoded, livox, odometry, received
+
+
+class Memory:
+    """A `Wire` without a network."""
+
+    def __init__(self):
+        self.topics: dict[str, set[str]] = {}
+        self.receive, self.sent, self.closed = {}, [], False
+
+    def subscribe(self, topic, kinds, receive, **_):
+        self.receive[topic] = receive
+
+    def advertise(self, topic, kind, **_):
+        return lambda cdr: self.sent.append((topic, kind, decoded(cdr, kind)))
+
+    def published(self):
+        return self.topics
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def said() -> Said:
+    return Said()
+
+
+@pytest.fixture
+def wire() -> Memory:
+    return Memory()
+
+
+@pytest.fixture
+def source(wire, said) -> RosSource:
+    return RosSource(wire, SourceOptions(topic="points", odometry_topic="/odom"), said, missing_s=0.0)
+
+
+def test_a_scan_has_points_time_and_pose(wire, source, said):
+    for seconds in (12.4, 12.6):
+        message = odometry(seconds, (seconds, 0, 0), child="lidar")
+        wire.receive["/odom"](received(ODOMETRY, message, at=clock.monotonic()))
+    wire.receive["/points"](received(CLOUD, cloud(12.5), at=3.0))
+    frame = next(source.frames())
+    np.testing.assert_array_equal(frame.record.points, POINTS)
+    assert (frame.time, frame.received, frame.record.name) == (12.5, 3.0, "")
+    np.testing.assert_allclose(frame.odometry[:3, 3], [12.5, 0, 0])
+    assert not said
+
+
+def test_of_two_scans_the_newer_one_is_taken(wire, source):
+    for seconds, message in ((1.0, cloud), (2.0, livox)):
+        kind = LIVOX if message is livox else CLOUD
+        wire.receive["/points"](received(kind, message(seconds)))
+    assert next(source.frames()).time == 2.0 and source.dropped == 1
+
+
+def test_an_invalid_cloud_is_reported_and_the_next_one_taken(wire, source, said):
+    wire.receive["/points"](received(CLOUD, cloud()[:50]))
+    frames = source.frames()
+    assert next(frames) is None
+    assert said["cloud"][0].startswith("/points: expected a cloud with points, found an invalid one (")
+    wire.receive["/points"](received(CLOUD, cloud()))
+    assert next(frames) is not None
+
+
+def test_scans_of_a_second_publisher_are_left_out_until_the_first_is_silent(wire, source, said):
+    frames = source.frames()
+    for publisher, at, taken in (
+        ("a", 1.0, True),
+        ("b", 1.1, False),
+        ("a", 1.2, True),
+        ("b", 1.3 + TAKEN_OVER_S, True),
+    ):
+        wire.receive["/points"](received(CLOUD, cloud(at), publisher=publisher, at=at))
+        assert (next(frames) is not None) == taken
+    assert said["publishers"] == ["/points: expected one publisher, found several; the scans of the first are used"]
+
+
+@pytest.mark.parametrize(
+    "topics, kind, found",
+    [
+        ({}, "missing", "found no such topic; existing topics: none; waiting"),
+        ({"/scan": {"sensor_msgs/msg/LaserScan"}}, "missing", "existing topics: /scan (sensor_msgs/msg/LaserScan);"),
+        ({"/points": {"std_msgs/msg/String"}}, "type", "found std_msgs/msg/String; waiting"),
+        ({"/points": {CLOUD}}, "silent", "found a publisher but no message for 0 s; waiting"),
+    ],
+)
+def test_a_topic_that_does_not_come_is_reported(wire, source, said, topics, kind, found):
+    wire.topics = topics
+    assert list(itertools.islice(source.frames(), 1)) == [None]
+    assert said[kind][0].startswith(f"/points: expected {CLOUD} or {LIVOX}, ") and found in said[kind][0]
+
+
+def test_a_closed_source_ends(wire, source):
+    source.close()
+    assert list(source.frames()) == [] and wire.closed
+
+
+def moved(x: float, y: float = 0.0) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    return pose
+
+
+def edge(query: int, match: int, world_from_query, world_from_match, match_from_query) -> LoopEdge:
+    return LoopEdge(
+        query, match, 50.0, 10.0, match_from_query, np.eye(6), 0.9, world_from_query, world_from_match, 0.01
+    )
+
+
+def status(time: float = 50.0) -> FrameStatus:
+    return FrameStatus(4, time, 0.01, 0.02, 0, 5, 100)
+
+
+def sent(wire: Memory, kind: str) -> list:
+    return [message for _, one, message in wire.sent if one == kind]
+
+
+def corrected(wire: Memory, sink: RosSink) -> list[float]:
+    sink.frame(status())
+    at = sent(wire, TRANSFORMS)[-1].transforms[0].transform.translation
+    return [at.x, at.y, at.z]
+
+
+def test_an_edge_is_published_drawn_and_corrects_the_transform(wire):
+    sink = RosSink(wire, SinkOptions())
+    assert corrected(wire, sink) == [0, 0, 0]
+    sink.loop(edge(80, 2, moved(9, 1), moved(0), moved(0.5)))
+    assert {topic for topic, *_ in wire.sent} == {"/tf", "/sglpr/loops", "/sglpr/loop_markers"}
+    ends = sent(wire, MARKERS)[-1].markers[0].points
+    assert [(one.x, one.y) for one in ends] == [(0, 0), (9, 1)]
+    assert corrected(wire, sink) == [-8.5, -1, 0]
+
+
+def test_a_match_after_a_loop_is_corrected_itself(wire):
+    sink = RosSink(wire, SinkOptions())
+    sink.loop(edge(80, 2, moved(9), moved(0), moved(0)))
+    sink.loop(edge(160, 90, moved(22), moved(10), moved(0)))  # frame 90 is at 1 in the map, so is frame 160
+    assert corrected(wire, sink) == [-21, 0, 0]
+    sink.loop(edge(170, 3, moved(23), moved(1), moved(0)))
+    assert corrected(wire, sink) == [-22, 0, 0]
+
+
+def test_an_edge_to_another_odometry_is_published_only(wire):
+    sink = RosSink(wire, SinkOptions())
+    sink.loop(edge(80, 2, moved(9), None, moved(0.5)))
+    assert len(sent(wire, EDGE)) == 1 and not sent(wire, MARKERS)
+    assert corrected(wire, sink) == [0, 0, 0]
+
+
+@pytest.mark.parametrize("time", [0.0, float("nan")])
+def test_the_transform_of_a_scan_without_time_has_the_present_one(wire, time):
+    RosSink(wire, SinkOptions()).frame(status(time))
+    assert sent(wire, TRANSFORMS)[0].transforms[0].header.stamp.sec > 1e9
+
+
+def test_names_of_types():
+    assert wire_type(CLOUD) == "sensor_msgs::msg::dds_::PointCloud2_"
+    assert ros_type(wire_type(CLOUD)) == CLOUD
+
+
+def test_the_domain_comes_from_the_text_or_the_environment(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    assert (domain_of("3", source="dds"), domain_of("", source="dds")) == (3, 7)
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    assert domain_of("", source="dds") == 0
+    for wrong in ("x", "-1", "233"):
+        with pytest.raises(ValueError, match=f"dds: expected a ROS 2 domain from 0 to 232, found {wrong}"):
+            domain_of(wrong, source="dds")
