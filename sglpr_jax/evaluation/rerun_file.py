@@ -80,7 +80,7 @@ def _layout(rerun: Any, *, with_map: bool) -> Any:
     views = importlib.import_module("rerun.blueprint")
     images = views.Spatial2DView(origin="pair", name="Query (cyan) on match (red)")
     lines = views.TimeSeriesView(origin="evidence", name="Evidence")
-    beside = views.Vertical(images, lines)
+    beside = views.Vertical(images, lines, views.TextLogView(origin="evidence/loop", name="Loops"))
     space = [views.Spatial3DView(origin="map", name="Map")] if with_map else []
     return views.Blueprint(views.Horizontal(*space, beside))
 
@@ -131,7 +131,10 @@ def _log_loops(rerun: Any, stream: Any, found: FoundLoops, poses: Float[np.ndarr
         stream.set_time(TIMELINE, sequence=loop.query)
         if poses is not None:
             ends = poses[[loop.match, loop.query], :3, 3]
-            stream.log(f"map/loops/{loop.query}", rerun.LineStrips3D([ends], colors=[colour], labels=[_said(loop)]))
+            stream.log(
+                f"map/loops/{loop.query}",
+                rerun.LineStrips3D([ends], colors=[colour], labels=[_said(loop)], show_labels=False),
+            )
         image = (255 * np.clip(overlay_of(found, loop), 0, 1)).astype(np.uint8)
         stream.log("pair", rerun.Image(image).compress(jpeg_quality=90))
         stream.log("evidence/loop", rerun.TextLog(f"query {loop.query}, match {loop.match}: {_said(loop)}"))
