@@ -76,6 +76,8 @@ class Index:
     """Squared lengths of the descriptors, up to the last query."""
     scale: Scale = 1
     """Scale of the described scans (`data.scaled`)."""
+    _last: tuple[bytes, Float[np.ndarray, "1 n"]] | None = dataclasses.field(default=None, repr=False)
+    """The last query and its rough distances, until places are added or removed."""
 
     @classmethod
     def empty(cls, width: int = 256, *, weights_hash: str = "", distance: str = "l2", scale: Scale = 1) -> "Index":
@@ -152,10 +154,12 @@ class Index:
         for name, values in new.items():
             self._columns.setdefault(name, GrowingArray(values[:0])).extend(values)
         self.ids += names
+        self._last = None
 
     def keep(self, flags: Bool[np.ndarray, " n"]) -> None:
         """Remove the places without a flag. The others stay in order, with new rows."""
         self._squares()
+        self._last = None
         for column in (self._lengths, *self._columns.values()):
             column.keep(flags)
         self.ids = [name for name, kept in zip(self.ids, flags, strict=True) if kept]
@@ -259,17 +263,27 @@ class Index:
             every = distance_function(self.distance)(queries, self.descriptors[rows])
             order = smallest(every, k)
             return rows[order], np.take_along_axis(every, order, axis=1)
-        descriptors, squares, rows = self.descriptors, self._squares(), np.flatnonzero(allowed)
+        rows = np.flatnonzero(allowed)
         few = min(k + SPARE, len(rows))
         if len(rows) * FEW <= len(self):
-            rough = squares[rows] - 2 * queries @ descriptors[rows].T
+            rough = self._squares()[rows] - 2 * queries @ self.descriptors[rows].T
             near = rows[np.argpartition(rough, few - 1, axis=1)[:, :few]]
         else:
-            rough = squares - 2 * queries @ descriptors.T
-            rough[:, ~allowed] = np.inf
-            near = np.argpartition(rough, few - 1, axis=1)[:, :few]
+            near = np.argpartition(np.where(allowed, self._rough(queries), np.inf), few - 1, axis=1)[:, :few]
         found = [nearest_of(query, self.descriptors[row], row, k) for query, row in zip(queries, near, strict=True)]
         return np.stack([rows for rows, _ in found]), np.stack([distances for _, distances in found])
+
+    def _rough(self, queries: Float[np.ndarray, "q d"]) -> Float[np.ndarray, "q n"]:
+        """Return the squared distances in float32, without the squared lengths of the queries.
+
+        Those of the last query are kept, because the loop search asks for its nearest places several times.
+        """
+        key = queries.tobytes() if len(queries) == 1 else None
+        if key is not None and self._last is not None and self._last[0] == key:
+            return self._last[1]
+        found = self._squares() - 2 * queries @ self.descriptors.T
+        self._last = None if key is None else (key, found)
+        return found
 
     def _squares(self) -> Float[np.ndarray, " n"]:
         """Return the squared lengths of all descriptors, after computing those of new places."""

@@ -194,3 +194,17 @@ def test_no_places_begin_no_column():
     assert len(index) == 2 and index.times is None and index.positions is None
     with pytest.raises(ValueError, match="times of shape"):
         index.add(np.zeros((0, WIDTH)), times=np.zeros(1))
+
+
+def test_the_same_query_finds_places_that_were_added_or_removed_since():
+    """Its distances to the places before are kept."""
+    rng = np.random.default_rng(0)
+    index = Index.empty(8)
+    index.add(rng.normal(size=(20, 8)))
+    query = rng.normal(size=8).astype(np.float32)
+    before = index.query(query, 20).rows
+    assert (index.query(query, 19, exclude=np.arange(20) == before[0]).rows == before[1:]).all()
+    index.add(query)
+    assert index.query(query).rows[0] == 20
+    index.keep(np.arange(21) != 20)
+    assert (index.query(query, 20).rows == before).all()
