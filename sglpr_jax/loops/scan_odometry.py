@@ -46,7 +46,7 @@ class _Registered(NamedTuple):
     points: int
     """Number of points after downsampling."""
     overlap: float
-    """Share of points with a point of the previous scans within a voxel. 1 for the first scan."""
+    """Share of points with a point of the previous scans within a voxel. 1 for the first scans."""
 
 
 def scan_odometry(
@@ -165,7 +165,7 @@ class _FrontEnd:
 
         before = list(self._before)
         self._before.append(transformed(pose, mapped))
-        if not before:
+        if len(before) < PREVIOUS:
             return 1.0
         tree = KDTree(np.concatenate(before), balanced_tree=False)
         apart, _ = tree.query(transformed(pose, source), distance_upper_bound=self._voxel_m)

@@ -33,8 +33,8 @@ class Slam(NamedTuple):
 
 def slam(
     recording: Recording | Path | str,
-    params: Params | str = DEFAULT_WEIGHTS,
     *,
+    params: Params | str = DEFAULT_WEIGHTS,
     config: DetectorConfig = DetectorConfig(),
     odometry: OdometryConfig = OdometryConfig(),
     registered: bool | None = None,
