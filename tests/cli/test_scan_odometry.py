@@ -53,6 +53,14 @@ def test_loops_of_scans_alone_end_with_a_trajectory(command, run, tmp_path):
 
 
 @pytest.mark.slow
+def test_several_recordings_have_their_own_odometry(command, run, street, tmp_path):
+    ended = command("loops", street, *run, "--odometry", "auto", "--no-register", "--out", tmp_path / "found")
+    assert ended.status == 0, ended.error
+    assert {"trajectory-street.tum", "trajectory-street~2.tum"} < {path.name for path in (tmp_path / "found").iterdir()}
+    assert not list((tmp_path / "found").glob("unfinished*"))
+
+
+@pytest.mark.slow
 def test_a_map_of_scans_alone(command, run, tmp_path):
     ended = command("map", *run, "--poses", "auto", "--out", tmp_path / "street.safetensors")
     assert ended.status == 0, ended.error
