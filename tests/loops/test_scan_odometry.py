@@ -1,13 +1,17 @@
 """Odometry from the scans of a simulated street, and what is said of scans that do not carry it."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import of_images, of_scans, with_points
+from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.data.readable import only
+from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.loops import kept_poses, scan_odometry
@@ -120,6 +124,26 @@ def test_poses_are_those_at_the_times_of_the_scans(start):
     late = only(of_scans(dict.fromkeys(start.paths[1:], np.zeros((1, 3))), times=times[1:]), range(len(start) - 1))
     found = scan_odometry._at_times_of_scans(true[1:], late, np.full(len(late), 0.1))
     np.testing.assert_allclose(found[2:, 0, 3] - found[1, 0, 3], true[2:-1, 0, 3] - true[1, 0, 3], atol=1e-6)
+
+
+def test_the_motion_within_scans_is_removed():
+    """An accelerating, turning sensor between walls: poses are those at the times of the scans, the first points."""
+    rng, times, clouds, stamps = np.random.default_rng(0), 0.1 * np.arange(16), {}, np.linspace(0, 0.1, 6000)
+    walls = rng.uniform([-30, -20, -1.5], [60, 20, 4], (20_000, 3))
+    walls[::2, 1] = np.sign(walls[::2, 1]) * rng.choice([8, 12, 15], 10_000)
+    for row, time in enumerate(times):
+        x, turned = 3 * (time + stamps) ** 2, 0.2 * (time + stamps) ** 2
+        seen = rng.permutation(walls)[:6000] - np.stack([x, 0 * x, 0 * x], axis=1)
+        rotations = Rotation.from_rotvec(np.outer(-turned, [0, 0, 1]))
+        clouds[Path(f"{row:06d}")] = rotations.apply(seen).astype(np.float32)
+    plain = of_scans(clouds, times=times)
+    timed = dataclasses.replace(
+        plain, read=lambda path, *_: Record(points=clouds[path], time_field=TimeField("t", stamps))
+    )
+    still, moved = (scan_odometry.scan_odometry(one)[:, 0, 3] for one in (timed, plain))
+    np.testing.assert_allclose(still, 3 * times**2, atol=0.06)
+    assert moved[-1] - 3 * times[-1] ** 2 > 0.3
+    assert scan_odometry.about(timed, OdometryConfig(), scale=1).endswith("motion within scans removed")
 
 
 def test_images_and_a_missing_library_are_clear_errors(start, tmp_path, monkeypatch):
