@@ -210,7 +210,7 @@ def _warn_of_doubtful(recording: Recording, registered: dict[int, _Registered]) 
     if apart:
         warn(
             f"{recording.name}: expected scans that overlap the previous ones, found {len(apart)} that do not, first "
-            f"scan {recording.ids[apart[0]]} ({registered[apart[0]].overlap:.0%}); the odometry may be wrong from there on"
+            f"scan {recording.ids[apart[0]]} ({registered[apart[0]].overlap:.0%}); the odometry may be wrong from there"
         )
 
 
