@@ -52,6 +52,8 @@ from .loops.loop import Loop as Loop
 from .loops.odometry import read_odometry as read_odometry
 from .loops.optimization import optimize_trajectory as optimize_trajectory
 from .loops.places import PlaceMap as PlaceMap
+from .loops.scan_odometry import scan_odometry as scan_odometry
+from .loops.slam import slam as slam
 from .models.average import average as average
 from .models.backbones.circular_config import CircularConfig as CircularConfig
 from .models.backbones.sglpr_config import SglprConfig as SglprConfig

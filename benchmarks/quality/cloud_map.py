@@ -1,13 +1,13 @@
 """Measures relocalisation in a map that is a point cloud of another sensor, with its trajectory.
 
     python -m benchmarks.quality.cloud_map --seeds 201 202 --out build/cloud_map
-    python -m benchmarks.quality.cloud_map --seeds 201 202 --kiss-icp --out build/cloud_map
+    python -m benchmarks.quality.cloud_map --seeds 201 202 --kiss-icp --map-scans 600 --maps cloud --out build/cloud_map
 
 A simulated town is driven by hdl64e. Its scans at noisy poses (`map_drives.noisy`) are one cloud in voxels. With
---kiss-icp, the poses are those of kiss-icp, which the program expects in `DRIVE-kiss.tum` beside the folder of the
-drive. On another day, other sensors drive the same streets, partly in the opposite direction. Each of their scans
-within 5 m of the first drive is located by `PlaceMap.relocate`. It is right within 0.5 m (horizontally) and 2 degrees
-of the true pose relative to the nearest pose of the first drive, so that drift of kiss-icp is not counted.
+--kiss-icp, the poses are those that kiss-icp computes from the scans, of which it needs 10 a second. On another day,
+other sensors drive the same streets, partly in the opposite direction. Each of their scans within 5 m of the first
+drive is located by `PlaceMap.relocate`. It is right within 0.5 m (horizontally) and 2 degrees of the true pose relative
+to the nearest pose of the first drive, so that drift of kiss-icp is not counted.
 
 Maps: `cloud` (the feature), `all points` (the same without removing hidden points), `scans` (the scans of hdl64e).
 """
@@ -23,11 +23,13 @@ import tyro
 from jaxtyping import Float, Float32
 
 import sglpr_jax
-from benchmarks.quality.map_drives import Drive, driven, noisy
+from benchmarks.quality.map_drives import DRIVE_S, Drive, driven, noisy
 from sglpr_jax.data.readers import cloud_map
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.loops.loop_files import write_tum
+from sglpr_jax.loops.optimization import trajectory_error
+from sglpr_jax.loops.scan_odometry import scan_odometry
 from sglpr_jax.loops.transforms import inverse
 from sglpr_jax.poses import distances
 
@@ -46,7 +48,11 @@ class Command:
     """Sensors that are located."""
     maps: tuple[str, ...] = ("cloud", "all points", "scans")
     scans: int = 180
-    """Of each drive."""
+    """Of each drive, which takes a minute."""
+    map_scans: int | None = None
+    """Of the first drive, if another number."""
+    map_azimuth_steps: int = 1800
+    """Firings of the first drive's sensor per turn."""
     every: int = 2
     """Every k-th scan is a query."""
     spacing_m: float = 4.0
@@ -54,7 +60,7 @@ class Command:
     voxel_m: float = 0.15
     """Edge of the voxels of the cloud, in metres."""
     kiss_icp: bool = False
-    """Poses of kiss-icp instead of noisy ones."""
+    """Poses of kiss-icp instead of noisy ones (extra odometry)."""
     weights: str = "sglpr"
     out: Path = Path("build/cloud_map")
 
@@ -92,12 +98,14 @@ def unhidden(recording: Recording) -> Recording:
 
 def opened(command: Command, seed: int) -> tuple[Drive, dict[str, Callable[[], tuple[Recording, np.ndarray]]]]:
     """First drive, and for each map a function that opens its recording and poses."""
-    drive = driven(command.out, seed=seed, sensor="hdl64e", day=0, scans=command.scans, azimuth_steps=1800)
+    scans, steps = command.map_scans or command.scans, command.map_azimuth_steps
+    drive = driven(command.out, seed=seed, sensor="hdl64e", day=0, scans=scans, azimuth_steps=steps)
     kind = "kiss" if command.kiss_icp else "noisy"
     trajectory = drive.folder.with_name(f"{drive.folder.name}-{kind}.tum")
-    if not command.kiss_icp:
-        found = noisy(drive.world_from_lidar, seed=seed)
-        write_tum(trajectory, found, 0.5 + np.arange(len(found)) / 3)
+    if not trajectory.exists():
+        found = scan_odometry(drive.recording()) if command.kiss_icp else noisy(drive.world_from_lidar, seed=seed)
+        print(f"trajectory: {trajectory_error(found, drive.world_from_lidar[:, :3, 3]):.2f} m off", flush=True)
+        write_tum(trajectory, found, 0.5 + np.arange(len(found)) * DRIVE_S / scans)
     poses = sglpr_jax.read_odometry(trajectory, format="tum")
     cloud = drive.folder.with_name(f"{drive.folder.name}-{kind}-{command.voxel_m:g}.pcd")
     if not cloud.exists():

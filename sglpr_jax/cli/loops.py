@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -16,6 +16,7 @@ from sglpr_jax.cli.recording import (
     resolved_scale,
 )
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.scan_odometry import AUTO, check_auto, open_with_scan_odometry, remove_odometry
 from sglpr_jax.cli.several_loops import search_several
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.data.warning import warn
@@ -32,6 +33,7 @@ from sglpr_jax.loops.config import (
     ConsistencyConfig,
     DetectorConfig,
     DriftModel,
+    OdometryConfig,
     SequenceConfig,
     VerificationConfig,
 )
@@ -59,6 +61,7 @@ class LoopsCommand:
     Example:
       bin/loops my_scans --out found
       bin/loops my_scans --odometry odometry.tum --out found
+      bin/loops my_scans --odometry auto --optimize --out found
       bin/loops drive.mcap --odometry drive.mcap --out found
       bin/loops KITTI --seq 08 --odometry KITTI/poses/08.txt --odometry-format kitti --out found
       bin/loops my_scans --odometry odometry.tum --optimize --out found
@@ -70,12 +73,15 @@ class LoopsCommand:
     """A dataset, a bag or a folder of scans, in any supported layout, or several of them."""
     out: Path
     """Output folder."""
-    odometry: Path | tuple[Path, ...] | None = None
+    odometry: Literal["auto"] | Path | tuple[Path, ...] | None = None
     """File with a pose for each scan, tum file with poses at other times, which are interpolated, or the bag itself.
-    Without odometry, loops are found by the scans alone. Several recordings need one file each, in the same order."""
+    `auto` computes odometry from the scans (extra odometry), and deskews them if their points have times. Without
+    odometry, loops are found by the scans alone. Several recordings need one file each, in the same order."""
     odometry_format: OdometryFormat = "auto"
     """Format of --odometry. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
     recognises tum and .g2o."""
+    scan_odometry: OdometryConfig = OdometryConfig()
+    """Settings of --odometry auto."""
     drift_percent: float = DRIFT_PERCENT
     """Position drift of the odometry: one standard deviation, in percent of the travelled distance. Loops that need
     more than four standard deviations are rejected."""
@@ -127,7 +133,7 @@ class LoopsCommand:
     @property
     def odometry_files(self) -> tuple[Path, ...]:
         """Files of the odometry, or an empty tuple."""
-        if self.odometry is None:
+        if self.odometry is None or self.odometry == AUTO:
             return ()
         return (self.odometry,) if isinstance(self.odometry, Path) else self.odometry
 
@@ -179,8 +185,10 @@ def _check(command: LoopsCommand) -> None:
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")
     written = {(command.out / name).resolve() for name in TRAJECTORIES}
-    if command.optimize and not files:
+    if command.odometry is None and command.optimize:
         raise ValueError("--optimize corrects odometry: expected --odometry, found none")
+    if command.odometry == AUTO:
+        check_auto()
     if command.optimize:
         check_installed()
     for path in (*files, command.source.poses, command.source.times):
@@ -208,12 +216,14 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
 
     source, (root,) = command.source, command.recordings
     params = load(command.weights)
-    if not command.odometry_files:
-        recording, odometry = source.open(root), None
+    if command.odometry == AUTO:
+        command, (recording,), (odometry,) = open_with_scan_odometry(command)
+    elif not command.odometry_files:
+        recording, odometry = command.submap.prepared(source.open(root), None), None
     else:
         (path,) = command.odometry_files
         recording, odometry = open_with_poses(source, root, path, format=command.odometry_format)
-    recording = command.submap.prepared(recording, odometry)
+        recording = command.submap.prepared(recording, odometry)
     scale = resolved_scale(command.scale, recording)
     register = command.register and can_register(recording)
     if command.register and not register:
@@ -249,6 +259,7 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(command.out / UNFINISHED)
+    remove_odometry(command)
     return 0
 
 

@@ -9,19 +9,26 @@ import tyro
 
 from sglpr_jax.cli.recording import RecordingOptions, SubmapOptions, open_with_poses, report_bad_scan, resolved_scale
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.cli.scan_odometry import AUTO, ENDING, check_auto, odometry_of, with_deskew
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
 from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
+from sglpr_jax.loops.config import OdometryConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 
 if TYPE_CHECKING:
     import numpy as np
+    from jaxtyping import Float
 
+    from sglpr_jax.data import Recording
+    from sglpr_jax.data.choices import Scale
     from sglpr_jax.loops.places import PlaceMap
     from sglpr_jax.models.params import Params
 
 UNFINISHED = ".unfinished"
 """Suffix of the checkpoint directory of a running command, beside the map."""
+TRAJECTORY = ".odometry.tum"
+"""Suffix of the odometry of --poses auto, beside the map."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,20 +41,24 @@ class MapCommand:
       bin/map my_scans --poses poses.tum --out town.safetensors
       bin/map today --poses today.tum --add-to town.safetensors --out town.safetensors
       bin/map other --poses other.tum --add-to town.safetensors --frame align --out town.safetensors
+      bin/map my_scans --poses auto --out town.safetensors
       bin/map town.pcd --poses trajectory.tum --out town.safetensors
     """
 
     recording: Annotated[Path, tyro.conf.Positional]
     """A dataset, a bag or a folder of scans, in any supported layout. Or a point cloud map of another tool (.pcd, .ply,
     .las, .laz), whose places are seen from the poses."""
-    poses: Path
+    poses: Literal["auto"] | Path
     """File with a pose in the world frame for each scan, tum file with poses at other times, which are interpolated, or
-    the bag itself. Use a corrected trajectory, not raw odometry. For a point cloud map, the poses of its LiDAR."""
+    the bag itself. Use a corrected trajectory, not raw odometry. For a point cloud map, the poses of its LiDAR. `auto`
+    computes odometry from the scans (extra odometry) and writes it beside the map, for a drive without revisits."""
     out: Path
     """Map to write (.safetensors)."""
     pose_format: OdometryFormat = "auto"
     """Format of --poses. 12 numbers a line are kitti (camera axes) or lidar (z up), and 8 numbers are tum. `auto`
     recognises tum and .g2o."""
+    scan_odometry: OdometryConfig = OdometryConfig()
+    """Settings of --poses auto."""
     add_to: Path | None = None
     """Existing map, made with the same weights. The new map also contains its places."""
     frame: Literal["check", "same", "align"] = "check"
@@ -94,9 +105,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
     before = None
     if command.add_to is not None:
         before = PlaceMap.load(command.add_to, weights_hash=weights_hash(params))
-    recording, poses = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
-    recording = command.submap.prepared(recording, poses)
-    scale = resolved_scale(command.scale, recording)
+    recording, poses, scale = _opened(command)
     if before is not None:
         with naming(f"{command.add_to}"):
             check_scale(scale, before.scale)
@@ -130,7 +139,26 @@ def _add_places(command: MapCommand, params: "Params") -> int:
         print("run the same command again to continue", file=sys.stderr)
         return stop.exit_status
     remove(unfinished)
+    command.out.with_suffix(ENDING).unlink(missing_ok=True)
     return 0
+
+
+def _opened(command: MapCommand) -> "tuple[Recording, Float[np.ndarray, 'n 4 4'], Scale]":
+    """The recording, deskewed and with submaps, the poses of its scans and the scale. Odometry of scans is written."""
+    from sglpr_jax.loops.loop_files import write_tum
+
+    if command.poses != AUTO:
+        given = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
+        recording = command.submap.prepared(*given)
+        return recording, given[1], resolved_scale(command.scale, recording)
+    check_auto()
+    opened = command.source.open(command.recording)
+    scale = resolved_scale(command.scale, opened)
+    kept_in = command.out.with_suffix(ENDING)
+    poses = odometry_of(opened, command.scan_odometry, scale=scale, kept_in=kept_in, skip_bad=command.skip_bad)
+    times = opened.numbers.astype(float) if opened.times is None else opened.times
+    write_tum(command.out.with_suffix(TRAJECTORY), poses, times)
+    return with_deskew(command.submap, [opened]).prepared(opened, poses), poses, scale
 
 
 def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]) -> "PlaceMap":

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from sglpr_jax.cli.config_file import record_command
 from sglpr_jax.cli.recording import open_with_poses, report_bad_scan, resolved_scale
 from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
+from sglpr_jax.cli.scan_odometry import AUTO, open_with_scan_odometry, remove_odometry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,7 +30,10 @@ def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) 
     from sglpr_jax.models.weights_file import load
 
     params = load(command.weights)
-    recordings, odometry = _opened(command)
+    if command.odometry == AUTO:
+        command, recordings, odometry = open_with_scan_odometry(command)
+    else:
+        recordings, odometry = _opened(command)
     scale = resolved_scale(command.scale, *recordings)
     steps = sum((1 + number) * len(recording) for number, recording in enumerate(recordings))
     with stop_on_signal() as stop, progress_bar(f"loops of {len(recordings)} recordings", steps) as show:
@@ -61,6 +65,7 @@ def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) 
     for number in range(len(recordings)):
         remove(unfinished / f"{number}")
     remove(unfinished)
+    remove_odometry(command)
     return 0
 
 

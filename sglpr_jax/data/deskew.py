@@ -159,6 +159,22 @@ def _neighbours(times: Float[np.ndarray, " n"], row: int) -> list[int]:
     return [one for one in rows if abs(times[one] - times[row]) <= WIDEST_S]
 
 
+def has_point_times(recording: Recording) -> bool:
+    """Whether scans have increasing times and the points of the first readable scan have valid times."""
+    if recording.has_images or recording.times is None or not (np.diff(recording.times) > 0).all():
+        return False
+    for row in range(min(len(recording), TRIED)):
+        try:
+            record = recording.record(row, labels=False)
+        except (ValueError, OSError):
+            continue
+        try:
+            return record.point_times is not None
+        except ValueError:
+            return False
+    return False
+
+
 def _check_point_times(recording: Recording) -> None:
     """Raise ValueError if the points of the first readable scan have no times."""
     for row in range(min(len(recording), TRIED)):

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from sglpr_jax.data.density_grid import RESOLUTION_M
-from sglpr_jax.fields import check_fields
+from sglpr_jax.fields import NotNegative, Positive, check_fields
 from sglpr_jax.loops.choices import (
     DRIFT_DEG_PER_100M,
     DRIFT_HEIGHT_PERCENT,
@@ -243,3 +243,26 @@ class DetectorConfig:
             raise ValueError(f"expected keyframe_m of 0 or more, found {self.keyframe_m}")
         if self.max_places is not None and self.max_places < 1:
             raise ValueError(f"expected max_places of 1 or more, found {self.max_places}")
+
+
+@dataclasses.dataclass(frozen=True)
+class OdometryConfig:
+    """Settings of odometry from the scans (kiss-icp). Lengths are divided by the scale of a recording."""
+
+    max_range_m: Positive = 100.0
+    """Maximum range of the points that are registered, in metres."""
+    min_range_m: NotNegative = 0.0
+    """Minimum range of the points, in metres. It excludes points on the vehicle."""
+    voxel_m: Positive | None = None
+    """Edge of the voxels of the local map, in metres. By default a hundredth of the maximum range."""
+
+    def __post_init__(self):
+        """Raises ValueError if a field has an invalid value or no range is left."""
+        check_fields(self)
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"expected min_range_m < max_range_m = {self.max_range_m:g}, found {self.min_range_m:g}")
+
+    @property
+    def effective(self) -> "OdometryConfig":
+        """The same settings with the edge of the voxels that is used."""
+        return dataclasses.replace(self, voxel_m=self.max_range_m / 100 if self.voxel_m is None else self.voxel_m)

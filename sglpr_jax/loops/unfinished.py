@@ -61,7 +61,7 @@ def settings(
         "format": FORMAT,
         "name": recording.name,
         "recording": fingerprint(recording),
-        "scans": _sample(recording),
+        "scans": scans_sample(recording),
         "sensor": None if recording.mounting is None else recording.mounting.fields,
         "gravity": _digest(each_mounting(recording)),
         "times": _digest(recording.times),
@@ -74,7 +74,7 @@ def settings(
     return json.loads(json.dumps(found))
 
 
-def _sample(recording: Recording) -> str:
+def scans_sample(recording: Recording) -> str:
     """Hash the bytes of the first, the middle and the last scan file, or the points of these scans of a bag.
 
     Sizes and times of files may agree by chance.

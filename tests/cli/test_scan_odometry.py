@@ -1,0 +1,94 @@
+"""Commands compute odometry from the scans."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from sglpr_jax.data.formats.pose_files import read_tum
+from sglpr_jax.loops import scan_odometry
+from sglpr_jax.sim.recording import simulate_recording
+from sglpr_jax.sim.sensor import Sensor
+
+from .conftest import assert_one_line_error
+
+SCANS = 8
+
+
+@pytest.fixture(scope="module")
+def street(once):
+    """A folder of scans of a street."""
+
+    def make(folder):
+        folder.mkdir()
+        sensor = Sensor(elevations_deg=tuple(np.linspace(2, -24, 32)), azimuth_steps=300)
+        recording = simulate_recording("08", scans=240, sensor=sensor, seed=3)
+        for row in range(SCANS):
+            recording.render(row)[0].astype("<f4").tofile(folder / f"{row:06d}.bin")
+        np.savetxt(folder / "times.txt", recording.times[:SCANS])
+
+    return once("street", make)
+
+
+@pytest.fixture
+def run(street):
+    """Arguments of a command on the street."""
+    return (street, "--format", "kitti", "--sensor-height", "1.73")
+
+
+@pytest.mark.slow
+def test_loops_of_scans_alone_end_with_a_trajectory(command, run, tmp_path):
+    out = tmp_path / "found"
+    flags = ("--odometry", "auto", "--optimize", "--scan-odometry.max-range-m", "80", "--out", out)
+    ended = command("loops", *run, *flags)
+    assert ended.status == 0, ended.error
+    assert "points up to 80 m, voxels of 0.8 m, without times of points\n" in ended.error
+    poses = read_tum(out / "trajectory.tum")[0]
+    np.testing.assert_allclose(read_tum(out / "trajectory-optimized.tum")[0], poses, atol=1e-6)
+    assert poses.shape == (SCANS, 4, 4) and np.linalg.norm(poses[-1, :3, 3]) > 10
+    values = json.loads((out / "command.json").read_text())
+    assert (values["odometry"], values["scan-odometry.voxel-m"]) == ("auto", 0.8)
+    assert not [path for path in out.iterdir() if path.name.startswith("unfinished")]
+
+
+@pytest.mark.slow
+def test_several_recordings_have_their_own_odometry(command, run, street, tmp_path):
+    ended = command("loops", street, *run, "--odometry", "auto", "--no-register", "--out", tmp_path / "found")
+    assert ended.status == 0, ended.error
+    assert {"trajectory-street.tum", "trajectory-street~2.tum"} < {path.name for path in (tmp_path / "found").iterdir()}
+    assert not list((tmp_path / "found").glob("unfinished*"))
+
+
+@pytest.mark.slow
+def test_a_map_of_scans_alone(command, run, tmp_path):
+    ended = command("map", *run, "--poses", "auto", "--out", tmp_path / "street.safetensors")
+    assert ended.status == 0, ended.error
+    assert read_tum(tmp_path / "street.odometry.tum")[0].shape == (SCANS, 4, 4)
+    assert {path.name for path in tmp_path.iterdir()} == {"street.safetensors", "street.odometry.tum"}
+
+
+def test_an_interrupted_run_keeps_its_odometry(command, run, tmp_path, monkeypatch):
+    out, compute = tmp_path / "found", scan_odometry.scan_odometry
+
+    def stopped(recording, *, should_stop, on_progress, **options):
+        def count(done):
+            should_stop.signal = 2 if done == 3 else None
+
+        return compute(recording, should_stop=should_stop, on_progress=count, **options)
+
+    monkeypatch.setattr(scan_odometry, "scan_odometry", stopped)
+    ended = command("loops", *run, "--odometry", "auto", "--out", out)
+    assert ended.status == 130
+    assert f"odometry of 3 of {SCANS} scans; run the same command again to continue\n" in ended.out
+    assert [path.name for path in out.iterdir()] == ["unfinished-0.odometry.npz"]
+
+
+def test_images_and_a_missing_library_are_one_clear_error(command, images, run, tmp_path, monkeypatch):
+    flags = ("--odometry", "auto", "--out", tmp_path / "found")
+    ended = command("loops", images, "--seq", "06", *flags)
+    assert_one_line_error(ended, "06: expected scans for odometry, found ready-made images")
+    monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
+    for given in (("loops", *run, *flags), ("map", *run, "--poses", "auto", "--out", tmp_path / "map.safetensors")):
+        assert_one_line_error(command(*given), "needs kiss-icp: pip install 'sglpr-jax[odometry]'")
+    assert not list(tmp_path.iterdir())
