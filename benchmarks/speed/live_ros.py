@@ -1,4 +1,4 @@
-"""Publisher of scans and odometry on topics of ROS 2, for `live_dds` and `live_zenoh`."""
+"""Publisher of scans and odometry on topics of ROS, for `live_dds`, `live_zenoh` and `live_ros1`."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""ROS 2 messages as they travel: decoding of scans, encoding of loop edges, markers and transforms (CDR, XCDR1).
+"""ROS messages as they travel: decoding of scans, encoding of loop edges, markers and transforms (CDR, XCDR1).
 
 Messages are encoded by rosbags. Scans and poses are decoded by the readers of bags (`data.formats`).
 """
@@ -45,26 +45,36 @@ def typestore() -> Any:
     return types
 
 
+@functools.cache
+def ros1_typestore() -> Any:
+    """Definitions of messages by rosbags: those of ROS 1 Noetic, and tf's."""
+    types = get_typestore(Stores.ROS1_NOETIC)
+    types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TRANSFORMS))
+    return types
+
+
 def encode(message: Any) -> bytes:
     """Encode a message of `typestore`, with the four bytes of the encapsulation header."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
-def decode_cloud(cdr: bytes, kind: str) -> tuple[Header, Records]:
+def decode_cloud(raw: bytes, kind: str, *, cdr: bool = True) -> tuple[Header, Records]:
     """Decode a scan.
 
     Arguments:
-      cdr: Message with its encapsulation header.
+      raw: The encoded message.
       kind: Type of the message, one of `CLOUDS`.
+      cdr: Whether it is encoded as ROS 2 does, with the encapsulation header, or as ROS 1.
 
     Raises:
       ValueError: If the message is damaged, or the cloud has no x, y and z.
     """
     try:
-        header = RosMessage(cdr, cdr=True).header()
+        header = RosMessage(raw, cdr=cdr).header()
         if kind == CLOUD:
-            return header, read_point_cloud2(typestore().deserialize_cdr(cdr, kind))
-        return header, read_custom_msg(RosMessage(cdr, cdr=True))
+            decode = typestore().deserialize_cdr if cdr else ros1_typestore().deserialize_ros1
+            return header, read_point_cloud2(decode(raw, kind))
+        return header, read_custom_msg(RosMessage(raw, cdr=cdr))
     except Exception as error:  # the sender defines the lengths, types and names of the fields
         raise ValueError(f"expected a cloud with points, found an invalid one ({in_short(error)})") from error
 

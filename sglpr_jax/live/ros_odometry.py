@@ -41,7 +41,7 @@ class LiveOdometry:
 
     def receive(self, message: Received) -> None:
         """Add the poses of a message of odometry or tf."""
-        found = RosMessage(message.cdr, cdr=True)
+        found = RosMessage(message.raw, cdr=message.cdr)
         poses = read_transforms(found) if message.kind == TRANSFORMS else [POSES[message.kind](found)]
         with self._changed:
             for pose in map(_plain, poses):
@@ -58,7 +58,7 @@ class LiveOdometry:
     def receive_static(self, message: Received) -> None:
         """Add the transforms of a message of /tf_static."""
         with self._changed:
-            for pose in map(_plain, read_transforms(RosMessage(message.cdr, cdr=True))):
+            for pose in map(_plain, read_transforms(RosMessage(message.raw, cdr=message.cdr))):
                 self._static[pose.frame, pose.child] = pose
 
     def pose(self, time: float, lidar: str, *, wait_s: float) -> Float[np.ndarray, "4 4"] | None:

@@ -1,4 +1,4 @@
-"""Loop edges, markers and the transform from map to odometry on ROS 2 topics. The same for DDS and zenoh."""
+"""Loop edges, markers and the transform from map to odometry on ROS topics. The same for DDS, zenoh and rospy."""
 
 import bisect
 import time

@@ -1,4 +1,4 @@
-"""Scans, and poses by odometry, from ROS 2 topics. The same for DDS and zenoh."""
+"""Scans, and poses by odometry, from ROS topics. The same for DDS, zenoh and rospy."""
 
 import threading
 import time
@@ -86,7 +86,7 @@ class RosSource:
     def _frame(self, message: Received) -> LiveFrame | None:
         """Decode a scan and find its pose. Returns None, with a report, for an invalid scan."""
         try:
-            header, records = decode_cloud(message.cdr, message.kind)
+            header, records = decode_cloud(message.raw, message.kind, cdr=message.cdr)
         except ValueError as error:
             self._report("cloud", f"{self.topic}: {error}")
             return None

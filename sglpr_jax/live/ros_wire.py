@@ -1,4 +1,4 @@
-"""Interface of the connections to ROS 2 (DDS, zenoh), and the names of topics and types on both."""
+"""Interface of the connections to ROS (DDS, zenoh, rospy), and the names of topics and types on both."""
 
 import os
 from collections.abc import Callable, Collection
@@ -10,12 +10,14 @@ class Received(NamedTuple):
 
     kind: str
     """Type, such as "sensor_msgs/msg/PointCloud2"."""
-    cdr: bytes
-    """The message with its encapsulation header."""
+    raw: bytes
+    """The message as it is encoded."""
     publisher: Any
     """Value that tells one publisher of the topic from others."""
     at: float
     """Time of arrival by `time.monotonic()`, in seconds."""
+    cdr: bool = True
+    """Whether the message is encoded as ROS 2 does (CDR, with its encapsulation header), not as ROS 1."""
 
 
 Receive = Callable[[Received], None]
@@ -24,7 +26,7 @@ Receive = Callable[[Received], None]
 
 @runtime_checkable
 class Wire(Protocol):
-    """A connection to ROS 2. Topics and types have the names that `ros2 topic list -t` prints."""
+    """A connection to ROS. Topics and types have the names that `ros2 topic list -t` prints."""
 
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
@@ -42,7 +44,7 @@ class Wire(Protocol):
         ...
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """Return a function that publishes messages of one type. With `latched`, later subscribers receive the last
+        """Return a function that publishes messages of one type, given as CDR. With `latched`, later subscribers receive the last
         `depth` messages."""
         ...
 

@@ -209,4 +209,4 @@ def test_an_endpoint_that_is_none_is_one_clear_error(said):
 
 
 def received_frame(message: Received) -> str:
-    return decoded(message.cdr, message.kind).header.frame_id
+    return decoded(message.raw, message.kind).header.frame_id

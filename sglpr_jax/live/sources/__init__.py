@@ -14,7 +14,7 @@ from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUni
 from sglpr_jax.live.frame import LiveFrame
 from sglpr_jax.live.report import Report
 
-SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live"}
+SOURCES = {"folder": None, "bag": "ros", "dds": "live", "zenoh": "live", "ros1": "live"}
 """Names of the sources, with the extra that each needs."""
 WAIT_S = 0.2
 """Maximum time that `Source.frames` blocks before it yields None, in seconds."""
@@ -44,7 +44,7 @@ class SourceOptions:
     """Options of all sources. Each source uses those that apply to it."""
 
     topic: str | None = None
-    """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh)."""
+    """Topic of the point clouds. None: the only one (bag), or `/points` (dds, zenoh, ros1)."""
     odometry_topic: str | None = None
     """Topic of the odometry (Odometry or tf). None: no odometry, except that of a bag's own poses."""
     reliable: bool = False
