@@ -35,8 +35,8 @@ class LiveCommand:
     """Find loop closures while the robot drives, and publish them at once.
 
     Sources: `folder:PATH` (a folder into which scans are written), `bag:PATH` (a bag at its own pace), `dds` or
-    `dds:DOMAIN` (ROS 2), `zenoh` or `zenoh:ENDPOINT`, `ros1` or `ros1:MASTER`. Sinks: `json` (lines on standard output),
-    `json:FILE`, `dds`, `zenoh`, `ros1`.
+    `dds:DOMAIN` (ROS 2), `zenoh` or `zenoh:ENDPOINT`, `ros1` or `ros1:MASTER`. Sinks: `json` (lines on standard
+    output), `json:FILE`, `dds`, `zenoh`, `ros1`.
 
     The output folder holds the map. A command with the same --out continues it, also after a crash. Ctrl-C or SIGTERM
     ends the command and writes loops.g2o, loops.csv, rejected.jsonl and trajectory.tum.

@@ -56,7 +56,7 @@ class Ros1Wire:
     def subscribe(
         self, topic: str, kinds: Collection[str], receive: Receive, *, depth: int, reliable: bool, latched: bool
     ) -> None:
-        """Receive the messages of a topic that have one of these types. ROS 1 is reliable, and the publisher latches."""
+        """Receive the messages of a topic that have one of these types. ROS 1 has no other settings."""
 
         def take(message: Any) -> None:
             try:

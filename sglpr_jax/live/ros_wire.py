@@ -44,8 +44,8 @@ class Wire(Protocol):
         ...
 
     def advertise(self, topic: str, kind: str, *, depth: int, latched: bool) -> Callable[[bytes], None]:
-        """Return a function that publishes messages of one type, given as CDR. With `latched`, later subscribers receive the last
-        `depth` messages."""
+        """Return a function that publishes messages of one type, given as CDR. With `latched`, later subscribers
+        receive the last `depth` messages."""
         ...
 
     def published(self) -> dict[str, set[str]]:

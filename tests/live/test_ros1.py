@@ -18,7 +18,7 @@ from sglpr_jax.live import ros1_wire
 from sglpr_jax.live.ros_messages import CLOUD, EDGE, MARKERS, TRANSFORMS, decode_cloud, ros1_typestore
 from sglpr_jax.live.sources import SourceOptions, open_source
 from tests import bags
-from tests.live.messages import LIVOX, POINTS, Said
+from tests.live.messages import LIVOX, POINTS
 from tests.live.test_wires import LATE, until
 
 ROSCORE = shutil.which("roscore")
