@@ -49,7 +49,7 @@ def main():
         ("/tf", TFMessage, lambda m: ("tf", m.transforms[0].header.frame_id, m.transforms[0].child_frame_id)),
     ):
         rospy.Subscriber(topic, of, lambda message, described=described: say(*described(message)))
-    for step in range(1000):
+    for step in range(5000):
         seconds = 100 + step * 0.05
         tf.publish(transform(seconds, "odom", "base", step * 0.1, 0))
         scans.publish(cloud(seconds) if kind is PointCloud2 else kind())
