@@ -160,7 +160,7 @@ def _class_of(kind: str) -> Any:
 
 
 def _ros1_of(cdr: bytes, kind: str) -> bytes:
-    """Encode a message of `typestore` for ROS 1. Its markers have the fields of those of ROS 2 Foxy."""
+    """Encode a message of `typestore` for ROS 1. Its markers have the fields of ROS 2 Foxy."""
     foxy = _foxy()
     fewer = foxy.serialize_cdr(typestore().deserialize_cdr(cdr, kind), kind)
     return bytes(foxy.cdr_to_ros1(fewer, kind))

@@ -11,7 +11,7 @@ class Received(NamedTuple):
     kind: str
     """Type, such as "sensor_msgs/msg/PointCloud2"."""
     raw: bytes
-    """The message as it is encoded."""
+    """The encoded message."""
     publisher: Any
     """Value that tells one publisher of the topic from others."""
     at: float

@@ -99,7 +99,7 @@ def scan_odometry(
 
 
 def _register(recording: Recording, kept: KeptPoses, front_end: "_FrontEnd", scale: Scale, **options: Any) -> None:
-    """Add the poses of all further scans to `kept`, and warn of those that are doubtful."""
+    """Add the poses of all further scans to `kept`, and warn of doubtful ones."""
     timed = has_point_times(recording)
     known, registered = list(kept.poses), dict[int, _Registered]()
     try:
