@@ -162,7 +162,7 @@ def test_a_bag_is_replayed_at_its_own_pace_and_drops_what_is_late(bag, said):
 def test_an_unknown_source_or_sink_is_refused(text, said):
     with pytest.raises(ValueError, match="expected one of the sources folder, bag, dds, zenoh, ros1, found"):
         open_source(text, SourceOptions(), said)
-    with pytest.raises(ValueError, match="expected one of the sinks json, dds, zenoh, ros1, found"):
+    with pytest.raises(ValueError, match="expected one of the sinks json, dds, zenoh, ros1, rerun, found"):
         open_sink(text, SinkOptions(), said)
 
 

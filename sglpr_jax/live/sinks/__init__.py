@@ -10,7 +10,7 @@ from sglpr_jax.live.frame import FrameStatus, LoopEdge
 from sglpr_jax.live.report import Report
 from sglpr_jax.live.sources import check_name, module_of
 
-SINKS = {"json": None, "dds": "live", "zenoh": "live", "ros1": "live"}
+SINKS = {"json": None, "dds": "live", "zenoh": "live", "ros1": "live", "rerun": "view"}
 """Names of the sinks, with the extra that each needs."""
 
 
