@@ -9,6 +9,7 @@ Each extra of pyproject.toml is resolved with all that it needs, from wheels onl
 
 import argparse
 import datetime
+import os
 import re
 import shutil
 import subprocess
@@ -34,7 +35,9 @@ AT_ONCE = 8
 """Number of programs that run at a time. They wait for the network most of the time."""
 NOT_OF_USERS = ("dev",)
 """Extras of those who work on the library itself."""
-UNAVAILABLE = re.compile(r"Because (?:only )?([\w.-]+?)(?:\[\w+\])?(?:[<>=!]=?\S+)? (?:has|have) no (?:usable )?wheels")
+UNAVAILABLE = re.compile(r"\b([A-Za-z][\w.-]*?)(?:[<>=!]\S*)? (?:has|have) no (?:usable )?wheels")
+MACOS = "14.0"
+"""Version of macOS. By default uv takes 13.0, for which small-gicp has no wheel."""
 
 
 class Missing(NamedTuple):
@@ -51,16 +54,22 @@ def main() -> None:
     """Parse the command line, and print the table and what is missing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pythons", nargs="*", default=PYTHONS)
+    parser.add_argument("--platforms", nargs="*", default=list(PLATFORMS), choices=PLATFORMS)
     parser.add_argument("--extras", nargs="*", help="default: all, and what is required")
     options = parser.parse_args()
     if shutil.which("uv") is None:
         sys.exit("expected the program uv, found none; pip install uv")
     wanted = {name: needs for name, needs in requirements() if options.extras is None or name in options.extras}
-    asked = [(*one, platform, python) for one in wanted.items() for platform in PLATFORMS for python in options.pythons]
+    asked = [
+        (*one, platform, python)
+        for one in wanted.items()
+        for platform in options.platforms
+        for python in options.pythons
+    ]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         missing = [one for found in pool.map(lambda one: absent(*one), asked) for one in found]
     print(f"{datetime.date.today()}, Python {', '.join(options.pythons)}\n")
-    print(table(list(wanted), missing, options.pythons), end="\n\n")
+    print(table(list(wanted), missing, options), end="\n\n")
     print("\n".join(f"{platform}, {name}: {reason}" for platform, name, reason in reasons(missing)))
 
 
@@ -88,7 +97,8 @@ def reason_against(needs: list[str], platform: str, python: str) -> str:
     """An empty text if wheels of all requirements fit the platform, else why not."""
     command = ["uv", "pip", "compile", "-", "--quiet", "--no-config", "--only-binary", ":all:", "--color", "never"]
     command += ["--python-platform", PLATFORMS[platform], "--python-version", python]
-    done = subprocess.run(command, input="\n".join(needs), capture_output=True, text=True)
+    environment = os.environ | {"MACOSX_DEPLOYMENT_TARGET": MACOS}
+    done = subprocess.run(command, input="\n".join(needs), env=environment, capture_output=True, text=True)
     if not done.returncode:
         return ""
     if "No solution found" not in done.stderr:
@@ -97,14 +107,14 @@ def reason_against(needs: list[str], platform: str, python: str) -> str:
     return f"no wheel of {found[1]}" if found else " ".join(done.stderr.split())
 
 
-def table(extras: list[str], missing: list[Missing], pythons: tuple[str, ...]) -> str:
+def table(extras: list[str], missing: list[Missing], options: argparse.Namespace) -> str:
     """A row for each extra, a column for each platform: yes, or what is missing."""
-    rows = [f"| | {' | '.join(PLATFORMS)} |", "|---" * (len(PLATFORMS) + 1) + "|"]
+    rows = [f"| | {' | '.join(options.platforms)} |", "|---" * (len(options.platforms) + 1) + "|"]
     for extra in extras:
-        cells = (
-            cell([one for one in missing if (one.extra, one.platform) == (extra, name)], pythons) for name in PLATFORMS
+        of_platforms = (
+            [one for one in missing if (one.extra, one.platform) == (extra, name)] for name in options.platforms
         )
-        rows.append(f"| `{extra}` | {' | '.join(cells)} |")
+        rows.append(f"| `{extra}` | {' | '.join(cell(found, options.pythons) for found in of_platforms)} |")
     return "\n".join(rows)
 
 
