@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
+from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.fields import NotNegative
@@ -107,13 +108,7 @@ class LiveCommand:
     @property
     def detector(self) -> DetectorConfig:
         """Settings of the detector."""
-        drift = DriftModel(
-            metres_per_metre=self.drift_percent / 100,
-            degrees_per_metre=self.drift_deg_per_100m / 100,
-            height_per_metre=self.drift_height_percent / 100,
-        )
-        names = [field.name for field in dataclasses.fields(DetectorConfig) if field.name != "drift"]
-        return DetectorConfig(drift=drift, **{name: getattr(self, name) for name in names})
+        return detector_config(self)
 
 
 def live(command: LiveCommand) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sglpr_jax.cli.config_file import record_command
+from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.recording import (
     PosedRecordingOptions,
     SubmapOptions,
@@ -143,33 +144,15 @@ def loops_of_recording(command: LoopsCommand) -> int:
     from sglpr_jax.loops.unfinished import alone  # slow import, not needed for --help
 
     _check(command)
-    config = _config(command)
+    config = detector_config(command)
     with alone(command.out / UNFINISHED):
         if len(command.recordings) > 1:
             return search_several(command, config, unfinished=command.out / UNFINISHED)
         return _search(command, config)
 
 
-def _config(command: LoopsCommand) -> DetectorConfig:
-    same = {
-        field.name: getattr(command, field.name)
-        for field in dataclasses.fields(DetectorConfig)
-        if field.name != "drift"
-    }
-    return DetectorConfig(drift=_drift(command), **same)
-
-
-def _drift(command: LoopsCommand) -> DriftModel:
-    return DriftModel(
-        metres_per_metre=command.drift_percent / 100,
-        degrees_per_metre=command.drift_deg_per_100m / 100,
-        height_per_metre=command.drift_height_percent / 100,
-    )
-
-
 def _check(command: LoopsCommand) -> None:
     """Raises ValueError or ImportError before the search, if it would end in an error or overwrite an input."""
-    from sglpr_jax.evaluation import rerun_file
     from sglpr_jax.loops.folder import TRAJECTORIES
     from sglpr_jax.loops.optimization import check_installed
 
@@ -181,6 +164,8 @@ def _check(command: LoopsCommand) -> None:
     if command.rerun is not None:
         if len(recordings) > 1:
             raise ValueError("--rerun shows one recording, found several recordings")
+        from sglpr_jax.evaluation import rerun_file  # slow import, not needed without --rerun
+
         rerun_file.check_installed()
     if len(recordings) > 1 and (command.source.poses or command.source.times):
         raise ValueError("--poses and --times are those of one recording, found several recordings")

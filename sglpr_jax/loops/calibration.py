@@ -19,7 +19,7 @@ from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.path import Path
+from sglpr_jax.loops.driven_path import DrivenPath
 from sglpr_jax.loops.pose_search import occupied, query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.rivals import distance_share, rival_share
@@ -119,7 +119,7 @@ class _Places:
             assert seen is not None  # the stream raises the error of a bad scan
             self.images.append(seen.image)
             self.finder.index.add(seen.descriptor)
-        self.positions, self.way, self.path = odometry[:, :3, 3], travelled(odometry), Path.of(odometry)
+        self.positions, self.way, self.path = odometry[:, :3, 3], travelled(odometry), DrivenPath.of(odometry)
 
     def apart(self, frame: int) -> Float[np.ndarray, " n"]:
         return np.linalg.norm(self.positions - self.positions[frame], axis=1)

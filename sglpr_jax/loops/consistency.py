@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.loops.config import ConsistencyConfig, DriftModel
+from sglpr_jax.loops.driven_path import DrivenPath
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.path import Path
 from sglpr_jax.loops.planar import compose, frames_of, inverted, planar, planar_loops, relative
 
 BLOCK = 64
@@ -44,13 +44,13 @@ def agree(
     Returns:
       Whether loop i of `loops` is consistent with loop j of `others`.
     """
-    path = Path.of(odometry, mounting=mounting)
+    path = DrivenPath.of(odometry, mounting=mounting)
     others = loops if others is None else others
     return agree_along(path, loops, others, way=way, mounting=mounting, drift=drift, config=config)
 
 
 def agree_along(
-    path: Path,
+    path: DrivenPath,
     loops: Sequence[Loop],
     others: Sequence[Loop],
     *,
@@ -103,7 +103,7 @@ def _members_from(start: np.int64, pairs: Bool[np.ndarray, "n n"], degrees: Int[
 
 
 def _columns(
-    loops: Sequence[Loop], path: Path, way: Float[np.ndarray, " n"], mounting: AnyMounting
+    loops: Sequence[Loop], path: DrivenPath, way: Float[np.ndarray, " n"], mounting: AnyMounting
 ) -> dict[str, np.ndarray]:
     query, match = frames_of(loops)
     level = path.level(mounting)

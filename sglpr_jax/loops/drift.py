@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.driven_path import Between, DrivenPath
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.path import Between, Path
 from sglpr_jax.loops.planar import compose, frames_of, planar, planar_loops, wrapped
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import travelled
@@ -47,12 +47,12 @@ def deviations(
       mounting: Mounting of the LiDAR, or that at each frame. The comparison is made in the plane of the ground.
       guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
     """
-    path = Path.of(odometry, mounting=mounting, guessed_m=guessed_m)
+    path = DrivenPath.of(odometry, mounting=mounting, guessed_m=guessed_m)
     return deviations_along(path, loops, drift=drift, mounting=mounting)
 
 
 def deviations_along(
-    path: Path, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
+    path: DrivenPath, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
 ) -> Float[np.ndarray, " k"]:
     """Return `deviations` of each loop from a path. The time is independent of the length of the path."""
     poses, covariances = planar_loops(loops, mounting)
@@ -70,7 +70,7 @@ def deviations_along(
 
 
 def height_deviations(
-    path: Path, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
+    path: DrivenPath, loops: Sequence[Loop], *, drift: DriftModel = DriftModel(), mounting: AnyMounting = None
 ) -> Float[np.ndarray, " k"]:
     """Deviation of each loop from a path in height, in standard deviations. The arguments are those of
     `deviations_along`."""
@@ -83,7 +83,9 @@ def height_deviations(
     return np.abs(apart) / spread
 
 
-def on_other_floor(path: Path, frames: Int[np.ndarray, " k"], found: Peak, drift: DriftModel) -> Bool[np.ndarray, " k"]:
+def on_other_floor(
+    path: DrivenPath, frames: Int[np.ndarray, " k"], found: Peak, drift: DriftModel
+) -> Bool[np.ndarray, " k"]:
     """Whether a path contradicts the pose of the last frame found at each of some other frames, by height alone.
 
     Arguments:

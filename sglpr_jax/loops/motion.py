@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import MotionConfig
-from sglpr_jax.loops.path import Path
+from sglpr_jax.loops.driven_path import DrivenPath
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
@@ -31,7 +31,7 @@ class Motion:
     def __init__(self, config: MotionConfig = MotionConfig()):
         self.config = config
         self.keyframe = 0
-        self.path = Path()
+        self.path = DrivenPath()
         """Planar poses of all added frames or, with odometry, its gravity-aligned poses."""
         self._numbers = GrowingArray(np.empty(0, NUMBERS))
         self._coasted = 0

@@ -27,8 +27,8 @@ MIN_POINTS = 100
 PREVIOUS = 3
 """Number of previous scans that a scan must overlap."""
 MIN_OVERLAP = 0.55
-"""Minimum share of points with a point of the previous scans within a voxel. In simulated streets it is .62 or more,
-and mostly less than .55 for a scan of another place."""
+"""Minimum share of points with a point of the previous scans within a voxel. Consecutive scans of simulated streets
+have more, scans of other places mostly less."""
 
 
 class _Input(NamedTuple):

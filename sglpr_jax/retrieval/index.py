@@ -279,8 +279,9 @@ class Index:
         Those of the last query are kept, because the loop search asks for its nearest places several times.
         """
         key = queries.tobytes() if len(queries) == 1 else None
-        if key is not None and self._last is not None and self._last[0] == key:
-            return self._last[1]
+        last = self._last  # read once, because another thread may replace it
+        if last is not None and last[0] == key:
+            return last[1]
         found = self._squares() - 2 * queries @ self.descriptors.T
         self._last = None if key is None else (key, found)
         return found

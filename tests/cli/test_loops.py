@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.cli import loops
+from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data import open_recording
@@ -99,7 +100,7 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
 
 def test_every_setting_of_the_detector_is_a_flag():
     command = parse_command(LoopsCommand, "loops", ["scans", "--out", "found"])
-    assert loops._config(command) == DetectorConfig()
+    assert detector_config(command) == DetectorConfig()
     flags = ["--candidates.candidates", "10", "--sequence.support", "3", "--candidates.rivals.of-query", "4"]
     changed = loops._config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
     assert (changed.candidates.candidates, changed.sequence.support, changed.candidates.rivals.of_query) == (10, 3, 4)

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.drift import deviations, on_other_floor, step_deviations
+from sglpr_jax.loops.driven_path import DrivenPath
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.loop_files import read_g2o, write_g2o
-from sglpr_jax.loops.path import Path
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
@@ -150,4 +150,4 @@ def test_another_floor_is_seen_in_a_world_that_is_tilted(roll, pitch):
         poses = world @ ramp(3, rise_m)
         frames = np.array([len(poses) - 101, len(poses) - 201])
         peaks = Peak(*np.zeros((6, 2)))
-        assert (on_other_floor(Path.of(poses), frames, peaks, DriftModel()) == other).all()
+        assert (on_other_floor(DrivenPath.of(poses), frames, peaks, DriftModel()) == other).all()

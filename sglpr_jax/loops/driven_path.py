@@ -36,7 +36,7 @@ class Between(NamedTuple):
         return Between(self.length, self.first @ rotation.T, *twice)
 
 
-class Path:
+class DrivenPath:
     """Gravity-aligned poses of the sensor in one fixed frame. Adding a pose takes constant time."""
 
     def __init__(self):
@@ -52,7 +52,7 @@ class Path:
         *,
         mounting: AnyMounting = None,
         guessed_m: Float[np.ndarray, " n"] | None = None,
-    ) -> "Path":
+    ) -> "DrivenPath":
         """Path of the odometry of a LiDAR with this `mounting`. For `guessed_m` see `extend`."""
         found = cls()
         found.extend(odometry @ inverse(uprights(mounting, np.arange(len(odometry)))), guessed_m)
