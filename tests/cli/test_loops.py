@@ -102,10 +102,10 @@ def test_every_setting_of_the_detector_is_a_flag():
     command = parse_command(LoopsCommand, "loops", ["scans", "--out", "found"])
     assert detector_config(command) == DetectorConfig()
     flags = ["--candidates.candidates", "10", "--sequence.support", "3", "--candidates.rivals.of-query", "4"]
-    changed = loops._config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
+    changed = detector_config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
     assert (changed.candidates.candidates, changed.sequence.support, changed.candidates.rivals.of_query) == (10, 3, 4)
     flags = ["--keyframe-m", "1.5", "--max-places", "100"]
-    limited = loops._config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
+    limited = detector_config(parse_command(LoopsCommand, "loops", ["scans", "--out", "found", *flags]))
     assert (limited.keyframe_m, limited.max_places) == (1.5, 100)
 
 
