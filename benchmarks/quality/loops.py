@@ -33,10 +33,10 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import settled
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.optimization import optimized, trajectory_error
-from sglpr_jax.loops.pose_search import query_spectra
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.reliability import Bin, reliability_of
 from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.spectra import query_spectra
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
@@ -142,16 +142,17 @@ class Speed:
             finder.add_seen(Seen(row, image, records[0].mounting), time=frame / 10, compared=Compared([], None))
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
         rules = finder.config.rivals
-        sizes = finder.config.candidates + 1, rules.of_query + rules.of_match
-        spectra = query_spectra(image)
-        peak = finder.comparer.search(spectra, [image], 1).one(0)
+        rivals, rows = rules.of_query + rules.of_match, np.arange(finder.config.further)
+        spectra, there = query_spectra(image), finder.stored.spectra(np.zeros(1, int))
+        peak = finder.comparer.search(spectra, there).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
             ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None, continues=True))),
             ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
-            ("comparison", lambda i: finder.comparer.search(spectra, [image] * sizes[0], sizes[0])),
+            ("coarse comparison", lambda i: finder.comparer.possible(spectra, rows)),
+            ("comparison", lambda i: finder.comparer.search(spectra, there * finder.config.candidates)),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),
-            ("rivals", lambda i: finder.comparer.search(spectra, [image] * sizes[1], sizes[1])),
+            ("rivals", lambda i: finder.comparer.search(spectra, there * rivals)),
             ("all of it", lambda i: detector.add(records[i % 20], time=float(next(clock)))),
         ):
             work(0)

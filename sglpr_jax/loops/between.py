@@ -12,16 +12,17 @@ from jaxtyping import Bool, Float
 from scipy.special import expit, logit
 
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.compared_image import occupied
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.planar import frames_of
-from sglpr_jax.loops.pose_search import occupied, query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel
 from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals_around
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.sequence import added_log_odds, agree_in_motion
+from sglpr_jax.loops.spectra import query_spectra
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.loops.verification import refined
 
@@ -59,22 +60,19 @@ def candidates_between(
     for row in range(len(queries.stored)):
         if should_stop():
             break
-        found.append(_candidate(queries, matches, row))
+        found += _candidates(queries, matches, row)
         on_progress(row + 1)
     return found
 
 
-def _candidate(queries: CandidateFinder, matches: CandidateFinder, row: int) -> Candidate:
-    """The best match of the stored scan `row`."""
+def _candidates(queries: CandidateFinder, matches: CandidateFinder, row: int) -> list[Candidate]:
+    """The best match of the stored scan `row`, or an empty list."""
     config, stored = matches.config, matches.stored
     seen = Seen(queries.index.descriptors[row], queries.stored.image(row), None)
-    compared = matches.comparer.similar(seen.descriptor, np.zeros(len(stored), bool))
-    spectra = query_spectra(seen.image, config=matches.verification)
-    images = [stored.image(one) for one in compared.tolist()]
-    peaks = matches.comparer.search(spectra, images, config.candidates + config.elsewhere)
-    compared, peaks = matches.comparer.with_further(
-        seen, spectra, compared, peaks, np.zeros(len(stored), bool), fit=matches.comparer.fit
-    )
+    spectra, none = query_spectra(seen.image, config=matches.verification), np.zeros(len(stored), bool)
+    compared, peaks = matches.comparer.compared(seen.descriptor, spectra, none, fit=matches.comparer.fit)
+    if not len(compared):
+        return []
     best = int(np.argmax(peaks.correlation))
     peak, match_row = peaks.one(best), int(compared[best])
     query, match = int(queries.stored.frames[row]), int(stored.frames[match_row])
@@ -92,8 +90,7 @@ def _candidate(queries: CandidateFinder, matches: CandidateFinder, row: int) -> 
             frames, descriptors = finder.stored.frames, finder.index.descriptors
             about = {"count": count, "exclude_s": config.exclude_s, "config": rules}
             rows = rivals_around(seen.descriptor, descriptors, frames, frame, finder.motion, **about)
-            others = [finder.stored.image(one) for one in rows.tolist()]
-            found = matches.comparer.search(spectra, others, rules.of_query + rules.of_match)
+            found = matches.comparer.search(spectra, finder.stored.spectra(rows))
             expected = [expected_poses(finder.motion, frame, frames[rows], frame_from_query, config=rules)]
             apart = np.linalg.norm(descriptors[rows] - seen.descriptor, axis=1)
             here = distance_share(distance, apart, expected, config=rules)
@@ -104,7 +101,7 @@ def _candidate(queries: CandidateFinder, matches: CandidateFinder, row: int) -> 
         )
     cells = min(occupied(one, matches.verification) for one in (seen.image, image))
     evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
-    return Candidate(query, match, alignment, evidence)
+    return [Candidate(query, match, alignment, evidence)]
 
 
 def probable_loops(

@@ -18,12 +18,14 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.compared_image import occupied
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.driven_path import DrivenPath
-from sglpr_jax.loops.pose_search import occupied, query_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
 from sglpr_jax.loops.rivals import distance_share, rival_share
 from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.spectra import query_spectra
+from sglpr_jax.loops.stored_scans import image_spectrum
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
@@ -155,7 +157,7 @@ class _Places:
         found = finder.index.query(query.descriptor, RIVALS, exclude=~elsewhere).rows
         rows = [row, *found[found >= 0].tolist()]
         spectra = query_spectra(query.image, config=finder.verification)
-        peaks = finder.comparer.search(spectra, [self.images[k] for k in rows], 1 + RIVALS)
+        peaks = finder.comparer.search(spectra, [image_spectrum(self.images[k], finder.verification) for k in rows])
         peak = peaks.one(0)
         share = rival_share(peaks.some(slice(1, None)), float(peak.correlation), [])
         fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))

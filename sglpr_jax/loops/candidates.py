@@ -2,21 +2,24 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Array, Bool, Complex, Float, UInt8
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.background import Background
+from sglpr_jax.loops.compared_image import within_reach
 from sglpr_jax.loops.comparison import Candidate, Comparer
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
-from sglpr_jax.loops.pose_search import Peak, query_spectra, within_reach
+from sglpr_jax.loops.pose_search import Peak, search_near
 from sglpr_jax.loops.seen import Seen, described
-from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.loops.spectra import query_spectra
+from sglpr_jax.loops.stored_scans import StoredScans, image_spectrum
 from sglpr_jax.loops.transforms import inverse
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
@@ -54,9 +57,9 @@ class CandidateFinder:
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
-        self.params, self.config, self.verification, self.drift = params, config, verification, drift
+        self.params, self.config, self.verification, self.drift = jax.device_put(params), config, verification, drift
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
-        self.stored = StoredScans(index, keyframe_m=keyframe_m, max_places=max_places)
+        self.stored = StoredScans(index, verification=verification, keyframe_m=keyframe_m, max_places=max_places)
         """Descriptors, and centres of the images without the background, for comparison."""
         self.compared = Compared([], None)
         """Comparisons of the last frame."""
@@ -71,8 +74,8 @@ class CandidateFinder:
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
         self._times = GrowingArray(np.empty(0))
-        self._keyframe = np.zeros((0, 0), np.uint8)
-        """Image of the keyframe of the motion, as in `stored`."""
+        self._keyframe = np.zeros((0, 0), np.complex64)
+        """Spectrum of the image of the motion's keyframe, as in `stored`."""
 
     def __len__(self) -> int:
         """Number of added frames."""
@@ -156,7 +159,7 @@ class CandidateFinder:
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
         if self.motion.keyframe == frame:
-            self._keyframe = detail
+            self._keyframe = image_spectrum(detail, self.verification) if not empty else self._keyframe[:0]
         self._keep(frame, seen, detail, time, empty)
         self.has_odometry = pose is not None
         self.compared = compared
@@ -200,24 +203,23 @@ class CandidateFinder:
             self.motion.add(clock, pose=pose, continues=continues)
             return Compared([], None)
         excluded = self._excluded(time, pose, continues=continues)
-        compare = self.comparer
-        rows = compare.similar(seen.descriptor, excluded)
-        key = self.motion.keyframe
-        linked = pose is None and continues and len(self) > 0 and not self.empty[key]
-        matches = [self.stored.image(row) for row in rows.tolist()] + 2 * linked * [self._keyframe]
-        priors = np.full((len(matches), 3), np.nan)
-        if linked:
-            priors[-1] = self.motion.prior(clock)
         spectra = query_spectra(seen.image, config=self.verification)
-        peaks = compare.search(spectra, matches, self.config.candidates + self.config.elsewhere + 2 * linked, priors)
-        link = self.motion.link(peaks.one(len(rows)), peaks.one(len(rows) + 1)) if linked else None
+        link = self._link(spectra, clock) if pose is None and continues else None
         self.motion.add(clock, pose=pose, link=link, continues=continues)
+        fit = self.comparer.fit if pose is None else self.comparer.fit_on_floor
+        rows, found = self.comparer.compared(seen.descriptor, spectra, excluded, fit=fit)
         if not len(rows):
             return Compared([], link)
-        fit = compare.fit if pose is None else compare.fit_on_floor
-        rows, found = compare.with_further(seen, spectra, rows, peaks.some(slice(len(rows))), excluded, fit=fit)
         best = int(np.argmax(fit(rows, found)))
-        return Compared([compare.candidate(len(self), seen, spectra, rows, found, best)], link)
+        return Compared([self.comparer.candidate(len(self), seen, spectra, rows, found, best)], link)
+
+    def _link(self, spectra: Complex[Array, "2 s t f"], clock: float) -> Peak | None:
+        """Pose of the next frame in the frame of the motion's keyframe. None if there is no image to compare with."""
+        if not len(self) or self.empty[self.motion.keyframe]:
+            return None
+        prior = self.motion.prior(clock)
+        peaks = jax.device_get(search_near(spectra, self._keyframe, prior, config=self.verification))
+        return self.motion.link(peaks.one(0), peaks.one(1))
 
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self):

@@ -6,19 +6,23 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Float32, Int, UInt8
+from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int
 
+from sglpr_jax.loops.compared_image import occupied
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
 from sglpr_jax.loops.drift import on_other_floor
 from sglpr_jax.loops.motion import Motion
-from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, occupied, search_spectra
+from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, search_spectra
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals
 from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.shortlist import shortlist
+from sglpr_jax.loops.shortlist import coarse_correlations
 from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.loops.verification import Alignment, refined
+
+BATCH, COARSE_BATCH = 10, 30
+"""Number of matches of a batch, of the exact and of the coarse comparison."""
 
 
 class Candidate(NamedTuple):
@@ -60,26 +64,37 @@ class Comparer:
         other = on_other_floor(self.motion.path, frames, found, self.drift) & self.motion.same(-1, frames)
         return np.asarray(found.correlation - 2 * other)
 
-    def with_further(
+    def compared(
         self,
-        seen: Seen,
-        spectra: Complex[Array, "s t f"],
-        rows: Int[np.ndarray, " k"],
-        found: Peak,
+        descriptor: Float32[np.ndarray, " d"],
+        spectra: Complex[Array, "2 s t f"],
         excluded: Bool[np.ndarray, " n"],
         *,
         fit: Callable[[Int[np.ndarray, " k"], Peak], Float[np.ndarray, " k"]],
-    ) -> tuple[Int[np.ndarray, " j"], Peak]:
-        """Compared scans and their peaks, with further scans if none of the compared ones fits well."""
-        config = self.config
-        if fit(rows, found).max() >= config.good_correlation:
+    ) -> tuple[Int[np.ndarray, " k"], Peak]:
+        """Stored scans that may show the place of a query, and its peaks over their images.
+
+        These are the `similar` ones and, if none of them fits well, the best of `further` ones by a coarse comparison.
+        Scans below `min_coarse_correlation` are left out.
+        """
+        config, similar = self.config, self.similar(descriptor, excluded)
+        rows = self.possible(spectra, similar)
+        found = self.search(spectra, self.stored.spectra(rows))
+        if len(rows) and fit(rows, found).max() >= config.good_correlation:
             return rows, found
-        pool = self.nearest(seen.descriptor, config.further, excluded)
-        pool = pool[~np.isin(pool, rows)]
-        images = [self.stored.image(row) for row in pool.tolist()]
-        chosen = pool[shortlist(seen.image, images, config.candidates, size=config.further, config=self.verification)]
-        more = self.search(spectra, [self.stored.image(row) for row in chosen.tolist()], config.candidates)
+        pool = self.nearest(descriptor, config.further, excluded)
+        chosen = self.possible(spectra, pool[~np.isin(pool, similar)])[: config.candidates]
+        more = self.search(spectra, self.stored.spectra(chosen))
         return np.concatenate([rows, chosen]), Peak(*map(np.concatenate, zip(found, more, strict=True)))
+
+    def possible(self, spectra: Complex[Array, "2 s t f"], rows: Int[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:
+        """Those of some stored scans that the coarse comparison does not rule out, the best first."""
+        if not len(rows):
+            return rows
+        matches = batched(self.stored.spectra(rows), COARSE_BATCH)
+        found = np.asarray(coarse_correlations(spectra, matches, len(rows), config=self.verification))[: len(rows)]
+        best = np.argsort(-found, kind="stable")
+        return rows[best[found[best] >= self.config.min_coarse_correlation]]
 
     def about(self, row: int) -> Bool[np.ndarray, " n"]:
         """Whether each stored scan was recorded at about the same time as one of them."""
@@ -99,7 +114,7 @@ class Comparer:
         self,
         query: int,
         seen: Seen,
-        spectra: Complex[Array, "s t f"],
+        spectra: Complex[Array, "2 s t f"],
         compared: Int[np.ndarray, " k"],
         peaks: Peak,
         best: int,
@@ -116,7 +131,7 @@ class Comparer:
             rules, known = self.config.rivals, self.stored.index.descriptors
             exclude_s = self.config.exclude_s
             rows = rivals(seen.descriptor, known, frames, match, self.motion, exclude_s=exclude_s, config=rules)
-            found = self.search(spectra, [stored.image(one) for one in rows.tolist()], rules.of_query + rules.of_match)
+            found = self.search(spectra, stored.spectra(rows))
             by_motion = expected_poses(self.motion, query, frames[rows], np.eye(4), config=rules)
             shares = self.shares(seen, match, distance, peak, rows, found, [by_motion])
             far = ~self.about(row)[compared] & self.motion.same(match, frames[compared])
@@ -146,18 +161,16 @@ class Comparer:
             rival_share(found, float(peak.correlation), expected, config=rules),
         )
 
-    def search(
-        self,
-        spectra: Complex[Array, "s t f"],
-        matches: Sequence[UInt8[np.ndarray, "n n"]],
-        size: int,
-        priors: Float[np.ndarray, "k 3"] | None = None,
-    ) -> Peak:
-        """Poses of a query in the frames of some matches. The batch is padded to `size`, so that it compiles once."""
+    def search(self, spectra: Complex[Array, "2 s t f"], matches: Sequence[Complex64[np.ndarray, "s f"]]) -> Peak:
+        """Poses of a query in the frames of some matches."""
         if not matches:
             return NO_PEAKS
-        chosen = np.arange(size) % len(matches)
-        expected = np.full((size, 3), np.nan) if priors is None else priors[chosen]
-        padded = np.stack([matches[k] for k in chosen.tolist()])
-        found = jax.device_get(search_spectra(spectra, padded, expected.astype(np.float32), config=self.verification))
-        return found.some(slice(len(matches)))
+        found = search_spectra(spectra, batched(matches, BATCH), len(matches), config=self.verification)
+        return jax.device_get(found).some(slice(len(matches)))
+
+
+def batched(matches: Sequence[Complex64[np.ndarray, "s f"]], multiple: int) -> Complex64[np.ndarray, "k s f"]:
+    """Stack spectra, and pad them to a multiple of a number, because each size compiles its own program."""
+    found = np.zeros((-(-len(matches) // multiple) * multiple, *matches[0].shape), np.complex64)
+    found[: len(matches)] = matches
+    return found

@@ -115,6 +115,8 @@ class CandidateConfig:
     further: PlaceCountOrNone = 25
     """If no compared image has this correlation, more of the nearest descriptors are compared, `further` altogether:
     first on coarse cells, then the best `candidates` of them like the others."""
+    min_coarse_correlation: float = 0.3
+    """Minimum correlation by the coarse comparison (`loops.shortlist`) of an image that is compared exactly."""
     exclude_s: float = EXCLUDED_S
     exclude_frames: int = EXCLUDED_FRAMES
     """Minimum age of a match in seconds, or in frames if there are no times."""

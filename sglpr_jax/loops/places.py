@@ -18,6 +18,7 @@ from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
+from sglpr_jax.loops.compared_image import occupied, within_reach
 from sglpr_jax.loops.config import CandidateConfig, RivalConfig
 from sglpr_jax.loops.given import check_is, given_record
 from sglpr_jax.loops.loop import planar_loop
@@ -25,12 +26,13 @@ from sglpr_jax.loops.mapped_scans import map_scans
 from sglpr_jax.loops.mountings import upright_from_lidar
 from sglpr_jax.loops.place_file import REQUIRED, read_places, write_places
 from sglpr_jax.loops.place_names import Content, free_names
-from sglpr_jax.loops.pose_search import Peak, occupied, query_spectra, search_spectra, within_reach
+from sglpr_jax.loops.pose_search import Peak, search_spectra
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
 from sglpr_jax.loops.relocated import Relocated, with_shared_probability
 from sglpr_jax.loops.rivals import MAP_RIVALS, distance_share, rival_places, rival_share
 from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.shortlist import shortlist
+from sglpr_jax.loops.shortlist import coarse_correlations
+from sglpr_jax.loops.spectra import match_spectra, query_spectra
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
@@ -206,7 +208,7 @@ class PlaceMap:
             return []
         model = default_model(self.index.weights_hash) if model is None else model
         spectra, scaled_map = query_spectra(image), self._scaled()
-        chosen, peaks = self._compared(image, spectra, rows, candidates)
+        chosen, peaks = self._compared(spectra, rows, candidates)
         answers = [
             scaled_map._answer(seen, spectra, int(rows[k]), float(distances[k]), peaks.one(i), model)
             for i, k in enumerate(chosen.tolist())
@@ -269,21 +271,21 @@ class PlaceMap:
             yield descriptor.tobytes(), pose.tobytes()
 
     def _compared(
-        self, image: UInt8[np.ndarray, "h w"], spectra: Complex[Array, "s t f"], rows: Int[np.ndarray, " n"], count: int
+        self, spectra: Complex[Array, "2 s t f"], rows: Int[np.ndarray, " n"], count: int
     ) -> tuple[Int[np.ndarray, " k"], Peak]:
         """Indices of the compared places in `rows`, the nearest first, and their peaks. If none of the first `count`
         fits well, as many others are chosen by a coarse comparison."""
         first, others = np.arange(len(rows))[:count], np.arange(len(rows))[count:]
-        peaks = jax.device_get(search_spectra(spectra, self.images[rows[first]]))
+        matches = match_spectra(self.images[rows])
+        peaks = jax.device_get(search_spectra(spectra, matches[:count]))
         if not len(others) or peaks.correlation.max() >= CandidateConfig().good_correlation:
             return first, peaks
-        images = list(self.images[rows[others]])
-        more = others[shortlist(image, images, count, size=len(others))]
-        found = jax.device_get(search_spectra(spectra, self.images[rows[more]]))
+        more = others[np.argsort(-np.asarray(coarse_correlations(spectra, matches[count:])), kind="stable")[:count]]
+        found = jax.device_get(search_spectra(spectra, matches[more]))
         return np.concatenate([first, more]), Peak(*map(np.concatenate, zip(peaks, found, strict=True)))
 
     def _answer(
-        self, seen: Seen, spectra: Complex[Array, "s t f"], row: int, distance: float, peak: Peak, model: LoopModel
+        self, seen: Seen, spectra: Complex[Array, "2 s t f"], row: int, distance: float, peak: Peak, model: LoopModel
     ) -> Relocated:
         """Pose of a query by the place `row`."""
         alignment = jax.device_get(refined(seen.image, self.images[row], peak))
@@ -298,7 +300,7 @@ class PlaceMap:
     def _rival_shares(
         self,
         descriptor: Float[np.ndarray, " d"],
-        spectra: Complex[Array, "s t f"],
+        spectra: Complex[Array, "2 s t f"],
         match: int,
         distance: float,
         peak: Peak,
@@ -308,7 +310,8 @@ class PlaceMap:
         rows = rival_places(apart, self.world_from_place[:, :3, 3], match)
         if peak.correlation < CandidateConfig().min_rival_correlation or not len(rows):
             return np.nan, np.nan
-        found = jax.device_get(search_spectra(spectra, self.images[np.resize(rows, MAP_RIVALS)])).some(slice(len(rows)))
+        rivals = match_spectra(self.images[np.resize(rows, MAP_RIVALS)])
+        found = jax.device_get(search_spectra(spectra, rivals)).some(slice(len(rows)))
         of_place = np.array([upright_from_lidar(self.mounting(row)) for row in (match, *rows.tolist())])
         upright = self.world_from_place[[match, *rows.tolist()]] @ inverse(of_place)
         query = upright[0] @ transform(float(peak.x), float(peak.y), float(peak.yaw))

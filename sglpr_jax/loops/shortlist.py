@@ -1,48 +1,42 @@
-"""Shortlist of the scans that may show the place of a query, by a coarse comparison of their images.
+"""Coarse comparison of images, which tells at little cost which scans may show the place of a query.
 
-The coarse comparison has half as many rotations as the search and cells twice as large, so it takes a fifth of the
+It has half as many rotations as the search, cells twice as large and blurs twice as wide, and takes a sixth of the
 time. It replaces the descriptors where these do not tell places apart, for instance among trunks.
 """
 
-import dataclasses
-from collections.abc import Sequence
+import functools
 
 import jax
-import numpy as np
-from jaxtyping import Int, UInt8
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float, Int
 
+from sglpr_jax.loops.compared_image import DEFAULT, AnyArray, cells
 from sglpr_jax.loops.config import VerificationConfig
-from sglpr_jax.loops.pose_search import search
+from sglpr_jax.loops.correlations import correlations, quarters
+from sglpr_jax.loops.spectra import lower_half
 
 
-def coarser(config: VerificationConfig) -> VerificationConfig:
-    """Settings of the coarse comparison."""
-    blurs = {"blur_m": 2 * config.blur_m, "wide_blur_m": 2 * config.wide_blur_m}
-    return dataclasses.replace(config, coarse=2 * config.coarse, turns=config.turns // 2, **blurs)
-
-
-def shortlist(
-    query: UInt8[np.ndarray, "h w"],
-    images: Sequence[UInt8[np.ndarray, "n n"]],
-    count: int,
+@functools.partial(jax.jit, static_argnames="config")
+def coarse_correlations(
+    query: Complex[AnyArray, "2 s t f"],
+    matches: Complex[AnyArray, "k s f"],
+    count: Int[AnyArray, ""] | int | None = None,
     *,
-    size: int,
-    config: VerificationConfig = VerificationConfig(),
-) -> Int[np.ndarray, " k"]:
-    """Choose the images with the highest coarse correlation.
+    config: VerificationConfig = DEFAULT,
+) -> Float[Array, " k"]:
+    """Highest correlation of a query with each of k matches at any pose, by the coarse comparison.
 
     Arguments:
-      query: Density image of the query.
-      images: Images of the scans, at most `size`.
-      count: Number of chosen images.
-      size: Number of images of a batch. All batches are padded to it, so that the search compiles once.
+      query: Result of `spectra.query_spectra`.
+      matches: Result of `spectra.match_spectra`.
+      count: Number of compared matches, by default all. The others get -1.
       config: Settings of the exact comparison.
-
-    Returns:
-      Indices of up to `count` images, the best first.
     """
-    if not images:
-        return np.zeros(0, np.int64)
-    padded = np.stack([images[k] for k in (np.arange(size) % len(images)).tolist()])
-    peaks = jax.device_get(search(query, padded, config=coarser(config)))
-    return np.argsort(-peaks.correlation[: len(images)], kind="stable")[:count]
+    turned = quarters(lower_half(jnp.asarray(query)[:, :, ::2].swapaxes(1, 2), config).swapaxes(1, 2))
+    matches = lower_half(jnp.asarray(matches), config)
+    reach = cells(config.max_shift_m, 2 * config.resolution_m * config.coarse)
+
+    def compare(k: Int[Array, ""], found: Float[Array, " k"]) -> Float[Array, " k"]:
+        return found.at[k].set(correlations(turned, matches[k], reach).max((0, 2)).max())
+
+    return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, jnp.full(len(matches), -1.0))

@@ -1,18 +1,23 @@
 """Descriptors and images of the earlier scans that a query is compared with."""
 
 import zlib
+from collections import OrderedDict
 
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Complex64, Float32, Int, UInt8
 
 from sglpr_jax.growing import GrowingArray
+from sglpr_jax.loops.config import VerificationConfig
 from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.spectra import match_spectra
 from sglpr_jax.retrieval.index import Index
 
 LEVEL = 1
 """Level of zlib, the fastest one. Most cells of an image are empty, so higher levels save little."""
 KEYFRAME_DEG = 20.0
 """Rotation from the last stored scan from which a scan is stored, whatever the distance, in degrees."""
+SPECTRA = 512
+"""Number of spectra that are kept for the next queries. Consecutive queries are compared with the same scans."""
 PARTS = 16
 """The stored scans are forgotten in this many parts, because each removal moves all rows that follow."""
 
@@ -20,14 +25,23 @@ PARTS = 16
 class StoredScans:
     """Scans in the order they were added: row i of the index is scan i. Images are compressed without loss."""
 
-    def __init__(self, index: Index, *, keyframe_m: float = 0.0, max_places: int | None = None):
+    def __init__(
+        self,
+        index: Index,
+        *,
+        verification: VerificationConfig = VerificationConfig(),
+        keyframe_m: float = 0.0,
+        max_places: int | None = None,
+    ):
         """Start with an index without places. The limits are those of `DetectorConfig`."""
-        self.index, self.keyframe_m, self.max_places = index, keyframe_m, max_places
+        self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
         self._frames = GrowingArray(np.empty(0, np.int64))
         self._repeated = GrowingArray(np.empty(0, bool))
         """Whether each scan has a loop to a newer stored scan."""
         self._packed: list[bytes] = []
         self._shape = 0, 0
+        self._spectra: OrderedDict[int, Complex64[np.ndarray, "s f"]] = OrderedDict()
+        """Spectra by frame, the last used one at the end."""
 
     def __len__(self) -> int:
         return len(self._packed)
@@ -88,3 +102,22 @@ class StoredScans:
     def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
         """Image of a scan."""
         return np.frombuffer(zlib.decompress(self._packed[row]), np.uint8).reshape(self._shape)
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        """Spectrum of each scan's image (`match_spectra`)."""
+        found = [self._spectrum(row) for row in rows.tolist()]
+        while len(self._spectra) > SPECTRA:
+            self._spectra.popitem(last=False)
+        return found
+
+    def _spectrum(self, row: int) -> Complex64[np.ndarray, "s f"]:
+        frame = int(self.frames[row])
+        if frame not in self._spectra:
+            self._spectra[frame] = image_spectrum(self.image(row), self.verification)
+        self._spectra.move_to_end(frame)
+        return self._spectra[frame]
+
+
+def image_spectrum(image: UInt8[np.ndarray, "m m"], config: VerificationConfig) -> Complex64[np.ndarray, "s f"]:
+    """Spectrum of one image (`match_spectra`)."""
+    return np.asarray(match_spectra(image[None], config=config))[0]

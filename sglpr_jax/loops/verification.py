@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Num
 
+from sglpr_jax.loops.compared_image import DEFAULT, prepared
 from sglpr_jax.loops.config import VerificationConfig
 from sglpr_jax.loops.peak_covariance import peak_covariance, ridge_covariance
-from sglpr_jax.loops.pose_search import DEFAULT, Peak, prepared, rotations, search, spectrum, twice
+from sglpr_jax.loops.pose_search import Peak, search
+from sglpr_jax.loops.spectra import rotations, spectrum, twice
 
 
 class Alignment(NamedTuple):

@@ -5,7 +5,6 @@ import sys
 import numpy as np
 import pytest
 
-from sglpr_jax.cli import loops
 from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command

@@ -8,12 +8,12 @@ import pytest
 import sglpr_jax
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.compared_image import within_reach
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, RivalConfig, SequenceConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import LITTLE_OVERLAP
-from sglpr_jax.loops.pose_search import within_reach
 from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
 from sglpr_jax.loops.seen import Seen, square_image
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of

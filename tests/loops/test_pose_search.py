@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sglpr_jax.loops.compared_image import cells, merged, prepared
 from sglpr_jax.loops.config import VerificationConfig
-from sglpr_jax.loops.pose_search import cells, merged, prepared, rotations, search, spectrum
+from sglpr_jax.loops.pose_search import search, search_near, search_spectra
+from sglpr_jax.loops.spectra import lower_half, match_spectra, query_spectra, rotations, spectrum
 
 from .scenes import place, relative, seen_from
 
@@ -53,3 +55,52 @@ def test_the_pose_lies_between_the_cells():
         expected = relative(match, pose)
         errors.append(np.hypot(found.x - expected[0], found.y - expected[1]))
     assert np.mean(errors) < 0.2  # of cells of .8 m, whose middles would be .3 m off
+
+
+def test_rotations_by_quarter_turns_follow_from_the_first_quarter():
+    query = seen_from(place(3), (0.4, -0.2, 1.0))
+    angles = np.arange(SMALL.turns, dtype=np.float32) * np.float32(2 * np.pi / SMALL.turns)
+    rotated = rotations(merged(prepared(query, SMALL), SMALL.coarse), jnp.asarray(angles))
+    whole = np.asarray(spectrum(rotated, SMALL.resolution_m * SMALL.coarse, SMALL))
+    whole, (size, width) = whole.reshape(4, -1, *whole.shape[1:]), whole.shape[1:]
+    found = np.asarray(query_spectra(query, config=SMALL)).swapaxes(1, 2)
+    inside = np.s_[..., np.arange(size) != size // 2, : width - 1]  # the highest frequency stands for its opposite, too
+    np.testing.assert_allclose(found[inside], whole[:2][inside], atol=1e-3)
+    np.testing.assert_allclose(found.conj()[inside], whole[2:][inside], atol=1e-3)
+    np.testing.assert_allclose(abs(found), abs(whole[:2]), atol=1e-3)
+
+
+def test_the_lower_half_of_a_spectrum_is_that_of_larger_cells():
+    """Of an image without high frequencies, up to a factor: the power is 1 for both."""
+    size, cell_m = 40, SMALL.resolution_m * SMALL.coarse
+    down, right = (np.arange(size) - (size - 1) / 2) * cell_m, (np.arange(size // 2) - (size // 2 - 1) / 2) * 2 * cell_m
+
+    def waves(at: np.ndarray) -> jnp.ndarray:
+        angle = 2 * np.pi / (size * cell_m) * at
+        return jnp.asarray(np.cos(3 * angle[:, None] + 0.4) + np.sin(2 * angle[None] + 5 * angle[:, None]))
+
+    here = VerificationConfig(reach_m=12.8, max_shift_m=0.0)
+    wide = VerificationConfig(reach_m=12.8, max_shift_m=0.0, blur_m=2 * here.blur_m, wide_blur_m=2 * here.wide_blur_m)
+    expected = spectrum(waves(right)[None], 2 * cell_m, wide)
+    np.testing.assert_allclose(lower_half(spectrum(waves(down)[None], cell_m, here), here), expected, atol=1e-4)
+
+
+def test_a_pose_near_an_expected_one_is_found_beside_the_best_one():
+    query, match = seen_from(place(1), (0.7, -0.5, 2.0)), seen_from(place(1), (0.0, 0.0, 0.0))
+    spectra, there = query_spectra(query, config=SMALL), match_spectra(match[None], config=SMALL)
+    best = search(query, match[None], config=SMALL).one(0)
+    unknown = search_near(spectra, there[0], np.full(3, np.nan), config=SMALL)
+    right = search_near(spectra, there[0], np.stack([best.x + 1, best.y - 1, best.yaw]), config=SMALL)
+    np.testing.assert_allclose(np.stack(unknown), np.stack(best)[:, None].repeat(2, 1), atol=1e-5)
+    np.testing.assert_allclose(np.stack(right), np.stack(best)[:, None].repeat(2, 1), atol=1e-5)
+    wrong = search_near(spectra, there[0], np.array([-2.0, 2.0, best.yaw + np.pi], np.float32), config=SMALL)
+    assert wrong.correlation[0] == pytest.approx(float(best.correlation), abs=1e-5)
+    assert wrong.correlation[1] < wrong.correlation[0] and np.hypot(wrong.x[1] + 2, wrong.y[1] - 2) < 3.5
+
+
+def test_matches_beyond_the_count_are_not_searched():
+    query = query_spectra(seen_from(place(1), (0.7, -0.5, 2.0)), config=SMALL)
+    matches = match_spectra(np.stack([seen_from(place(k), (0.0, 0.0, 0.0)) for k in (1, 2, 3)]), config=SMALL)
+    whole, part = (jax.device_get(search_spectra(query, matches, count, config=SMALL)) for count in (None, 2))
+    for values, some in zip(whole, part, strict=True):
+        np.testing.assert_allclose(some, [*values[:2], 0.0], atol=1e-6)

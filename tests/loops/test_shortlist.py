@@ -1,13 +1,17 @@
 """The coarse comparison finds a place where descriptors do not."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.config import CandidateConfig, VerificationConfig
+from sglpr_jax.loops.pose_search import search
 from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.shortlist import shortlist
+from sglpr_jax.loops.shortlist import coarse_correlations
+from sglpr_jax.loops.spectra import match_spectra, query_spectra
 
 from .scenes import place, seen_from
 
@@ -26,11 +30,25 @@ def query():
     return seen_from(place(TRUE), (1.2, -0.8, 2.5)).astype(np.uint8)
 
 
-def test_the_true_place_comes_first_whatever_the_size_of_the_batch(images, query):
-    assert shortlist(query, images, 3, size=PLACES)[0] == TRUE
-    assert np.array_equal(shortlist(query, images, 3, size=PLACES), shortlist(query, images, 3, size=20))
-    assert len(shortlist(query, images[:2], 3, size=PLACES)) == 2
-    assert not len(shortlist(query, [], 3, size=PLACES))
+def test_the_true_place_has_the_highest_correlation_and_the_others_are_ruled_out(images, query):
+    spectra, matches = query_spectra(query), match_spectra(np.stack(images))
+    found = np.asarray(coarse_correlations(spectra, matches))
+    least = CandidateConfig().min_coarse_correlation
+    assert found.argmax() == TRUE and found[TRUE] > least and np.mean(found < least) > 0.5
+    some = np.asarray(coarse_correlations(spectra, matches, TRUE))
+    np.testing.assert_allclose(some[:TRUE], found[:TRUE], atol=1e-6)
+    assert (some[TRUE:] == -1).all()
+
+
+def test_the_correlation_is_that_of_larger_cells_and_wider_blurs(images, query):
+    """Up to the aliasing of cells that are averaged, and the highest frequencies."""
+    fine = VerificationConfig()
+    wide = dataclasses.replace(
+        fine, coarse=2 * fine.coarse, turns=fine.turns // 2, blur_m=2 * fine.blur_m, wide_blur_m=2 * fine.wide_blur_m
+    )
+    found = coarse_correlations(query_spectra(query), match_spectra(np.stack(images)))
+    expected = search(query, np.stack(images), config=wide).correlation
+    assert np.corrcoef(found, expected)[0, 1] > 0.9 and np.abs(found - expected).max() < 0.15
 
 
 @pytest.mark.parametrize(("further", "found"), [(0, False), (PLACES, True)])

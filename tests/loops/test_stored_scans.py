@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from sglpr_jax.loops import stored_scans
+from sglpr_jax.loops.spectra import match_spectra
 from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.retrieval.index import Index
 
@@ -32,3 +34,16 @@ def test_an_image_of_another_size_is_one_clear_error():
     with pytest.raises(ValueError, match=r"frame 3: expected an image of \(64, 64\) cells, found \(8, 8\)"):
         stored.add(3, np.zeros(4, np.float32), np.zeros((8, 8), np.uint8))
     assert len(stored) == 1 == len(stored.index)
+
+
+def test_spectra_are_those_of_the_images_and_only_the_last_used_are_kept(monkeypatch):
+    monkeypatch.setattr(stored_scans, "SPECTRA", 3)
+    stored, given = StoredScans(Index.empty(4)), images(5)
+    for k, image in enumerate(given):
+        stored.add(10 * k, np.full(4, k, np.float32), image)
+    expected = np.asarray(match_spectra(np.stack(given)))
+    for rows in ([0, 1, 2, 3, 4], [4, 0], [1]):
+        np.testing.assert_allclose(np.stack(stored.spectra(np.array(rows))), expected[rows], atol=1e-5)
+        assert len(stored._spectra) == 3
+    stored.forget(2)
+    np.testing.assert_allclose(np.stack(stored.spectra(np.array([0, 2]))), expected[[2, 4]], atol=1e-5)
