@@ -27,7 +27,6 @@ from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
 from sglpr_jax.loops.candidates import Compared
-from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import settled
@@ -40,6 +39,7 @@ from sglpr_jax.loops.spectra import query_spectra
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
+from sglpr_jax.same_place import EXCLUDED_FRAMES
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
 
@@ -47,6 +47,8 @@ LOOP_M, OTHER_M, REVISIT_M = 10.0, 20.0, 5.0
 """A loop is right up to the first and wrong beyond the second; a revisit that counts is within the third."""
 SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
 SURE = 0.99
+NO_LOOP = -100.0
+"""Log odds of pairs that the detector does not consider."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,13 +113,16 @@ class Images:
             rejected = [*detector.rejected, *rejected]
             sure[name] = report(name, recording, poses, detector, kept, rejected, seconds)
             log_odds = detector.model.log_odds(Evidence.stack([one.evidence for one in detector.candidates]))
+            rest = nearest_of_the_rest(detector)
+            log_odds = np.concatenate([log_odds, np.full(len(rest), NO_LOOP)])
+            pairs = [(one.query, one.match) for one in detector.candidates] + rest
             agreed = {(loop.query, loop.match) for loop in kept}
-            bonus = [1000.0 * ((one.query, one.match) in agreed) for one in detector.candidates]
+            bonus = [1000.0 * (pair in agreed) for pair in pairs]
             for title, scores in (
                 ("most probable of three", log_odds),
                 ("most probable, loops that were kept first", log_odds + bonus),
             ):
-                score_top1(title, recording, detector.candidates, np.asarray(scores))
+                score_top1(title, recording, pairs, np.asarray(scores))
         Console().print(sure_table(sure))
 
 
@@ -142,14 +147,14 @@ class Speed:
             finder.add_seen(Seen(row, image, records[0].mounting), time=frame / 10, compared=Compared([], None))
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
         rules = finder.config.rivals
-        rivals, rows = rules.of_query + rules.of_match, np.arange(finder.config.further)
+        rivals, further = rules.of_query + rules.of_match, np.arange(finder.config.further)
         spectra, there = query_spectra(image), finder.stored.spectra(np.zeros(1, int))
         peak = finder.comparer.search(spectra, there).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
             ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None, continues=True))),
             ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
-            ("coarse comparison", lambda i: finder.comparer.possible(spectra, rows)),
+            ("coarse comparison", lambda i: finder.comparer.possible(spectra, further)),
             ("comparison", lambda i: finder.comparer.search(spectra, there * finder.config.candidates)),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),
             ("rivals", lambda i: finder.comparer.search(spectra, there * rivals)),
@@ -269,13 +274,26 @@ def sure_table(sure: Mapping[str, Bin | None]) -> Table:
     return table
 
 
+def nearest_of_the_rest(detector: LoopDetector) -> list[tuple[int, int]]:
+    """Frames without a candidate, and of each the frame of the nearest descriptor that is old enough."""
+    finder, known = detector.finder, {one.query for one in detector.candidates}
+    frames, descriptors = finder.stored.frames, finder.index.descriptors
+    found = []
+    for row in np.flatnonzero(~np.isin(frames, list(known))):
+        old = frames <= frames[row] - EXCLUDED_FRAMES
+        if old.any():
+            apart = np.linalg.norm(descriptors[old] - descriptors[row], axis=1)
+            found.append((int(frames[row]), int(frames[old][apart.argmin()])))
+    return found
+
+
 def score_top1(
-    title: str, recording: Recording, candidates: Sequence[Candidate], scores: Float[np.ndarray, " n"]
+    title: str, recording: Recording, pairs: Sequence[tuple[int, int]], scores: Float[np.ndarray, " n"]
 ) -> None:
-    """Print top-1 F1max and recall@1 where each query is answered by its candidate of the highest score."""
+    """Print top-1 F1max and recall@1 where each query is answered by its pair of the highest score."""
     best: dict[int, int] = {}
     for i in np.argsort(scores, kind="stable"):
-        best[candidates[i].query] = int(i)
+        best[pairs[i][0]] = int(i)
     queries = np.array(sorted(best))
     chosen = np.array([best[query] for query in queries])
     source = TopK(
@@ -284,7 +302,7 @@ def score_top1(
         times=recording.times,
         pose_source=recording.pose_source,
         queries=queries,
-        nearest=np.array([candidates[i].match for i in chosen])[:, None],
+        nearest=np.array([pairs[i][1] for i in chosen])[:, None],
         scores=scores[chosen][:, None],
     )
     result = protocol_named("top1-f1max").score(source)

@@ -16,9 +16,10 @@ def warm_up(params: Params, config: DetectorConfig, *, odometry: bool) -> None:
     """Search random scans with the sizes of `config`, with odometry or without it, and forget them."""
     rules = config.candidates
     rivals = dataclasses.replace(rules.rivals, age=(0.0, 1e9))
-    anywhere = {"exclude_s": 1e-9, "exclude_frames": 0, "min_travelled_m": 0.0, "min_rival_correlation": -1.0}
-    anything = dataclasses.replace(rules, **anywhere, good_correlation=2.0, rivals=rivals)
-    detector = LoopDetector(params, config=dataclasses.replace(config, candidates=anything, max_places=None))
+    anywhere = {"exclude_s": 1e-9, "exclude_frames": 0, "min_travelled_m": 0.0, "good_correlation": 2.0}
+    anything = {"min_coarse_correlation": -1.0, "min_correlation": -1.0, "rivals": rivals}
+    rules = dataclasses.replace(rules, **anywhere, **anything)
+    detector = LoopDetector(params, config=dataclasses.replace(config, candidates=rules, max_places=None))
     draw = np.random.default_rng(0)
     for i in range(SCANS):
         points = draw.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)

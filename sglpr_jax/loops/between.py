@@ -71,7 +71,7 @@ def _candidates(queries: CandidateFinder, matches: CandidateFinder, row: int) ->
     seen = Seen(queries.index.descriptors[row], queries.stored.image(row), None)
     spectra, none = query_spectra(seen.image, config=matches.verification), np.zeros(len(stored), bool)
     compared, peaks = matches.comparer.compared(seen.descriptor, spectra, none, fit=matches.comparer.fit)
-    if not len(compared):
+    if not len(compared) or peaks.correlation.max() < config.min_correlation:
         return []
     best = int(np.argmax(peaks.correlation))
     peak, match_row = peaks.one(best), int(compared[best])
@@ -80,25 +80,22 @@ def _candidates(queries: CandidateFinder, matches: CandidateFinder, row: int) ->
     alignment = jax.device_get(refined(seen.image, image, peak, config=matches.verification))
     distance = float(np.linalg.norm(matches.index.descriptors[match_row] - seen.descriptor))
     shares = np.nan, np.nan
-    if peak.correlation >= config.min_rival_correlation:
-        rules, correlation = config.rivals, float(peak.correlation)
-        known = (
-            (matches, match, rules.of_match, transform(float(peak.x), float(peak.y), float(peak.yaw))),
-            (queries, query, rules.of_query, np.eye(4)),
-        )
-        for finder, frame, count, frame_from_query in known:
-            frames, descriptors = finder.stored.frames, finder.index.descriptors
-            about = {"count": count, "exclude_s": config.exclude_s, "config": rules}
-            rows = rivals_around(seen.descriptor, descriptors, frames, frame, finder.motion, **about)
-            found = matches.comparer.search(spectra, finder.stored.spectra(rows))
-            expected = [expected_poses(finder.motion, frame, frames[rows], frame_from_query, config=rules)]
-            apart = np.linalg.norm(descriptors[rows] - seen.descriptor, axis=1)
-            here = distance_share(distance, apart, expected, config=rules)
-            shares = np.fmax(shares, (here, rival_share(found, correlation, expected, config=rules)))
-        far = ~matches.comparer.about(match_row)[compared] & matches.motion.same(match, stored.frames[compared])
-        shares = np.fmax(
-            shares, matches.comparer.shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
-        )
+    rules, correlation = config.rivals, float(peak.correlation)
+    known = (
+        (matches, match, rules.of_match, transform(float(peak.x), float(peak.y), float(peak.yaw))),
+        (queries, query, rules.of_query, np.eye(4)),
+    )
+    for finder, frame, count, frame_from_query in known:
+        frames, descriptors = finder.stored.frames, finder.index.descriptors
+        about = {"count": count, "exclude_s": config.exclude_s, "config": rules}
+        rows = rivals_around(seen.descriptor, descriptors, frames, frame, finder.motion, **about)
+        found = matches.comparer.search(spectra, finder.stored.spectra(rows))
+        expected = [expected_poses(finder.motion, frame, frames[rows], frame_from_query, config=rules)]
+        apart = np.linalg.norm(descriptors[rows] - seen.descriptor, axis=1)
+        here = distance_share(distance, apart, expected, config=rules)
+        shares = np.fmax(shares, (here, rival_share(found, correlation, expected, config=rules)))
+    far = ~matches.comparer.about(match_row)[compared] & matches.motion.same(match, stored.frames[compared])
+    shares = np.fmax(shares, matches.comparer.shares(seen, match, distance, peak, compared[far], peaks.some(far), []))
     cells = min(occupied(one, matches.verification) for one in (seen.image, image))
     evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
     return [Candidate(query, match, alignment, evidence)]

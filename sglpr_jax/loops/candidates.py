@@ -211,6 +211,8 @@ class CandidateFinder:
         if not len(rows):
             return Compared([], link)
         best = int(np.argmax(fit(rows, found)))
+        if found.correlation[best] < self.config.min_correlation:
+            return Compared([], link)
         return Compared([self.comparer.candidate(len(self), seen, spectra, rows, found, best)], link)
 
     def _link(self, spectra: Complex[Array, "2 s t f"], clock: float) -> Peak | None:

@@ -126,17 +126,15 @@ class Comparer:
         match = int(frames[row])
         distance = float(np.linalg.norm(self.stored.index.descriptors[row] - seen.descriptor))
         alignment = jax.device_get(refined(seen.image, image, peak, config=self.verification))
-        shares = np.nan, np.nan
-        if peak.correlation >= self.config.min_rival_correlation:
-            rules, known = self.config.rivals, self.stored.index.descriptors
-            exclude_s = self.config.exclude_s
-            rows = rivals(seen.descriptor, known, frames, match, self.motion, exclude_s=exclude_s, config=rules)
-            found = self.search(spectra, stored.spectra(rows))
-            by_motion = expected_poses(self.motion, query, frames[rows], np.eye(4), config=rules)
-            shares = self.shares(seen, match, distance, peak, rows, found, [by_motion])
-            far = ~self.about(row)[compared] & self.motion.same(match, frames[compared])
-            elsewhere = self.shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
-            shares = np.fmax(shares, elsewhere)
+        rules, known = self.config.rivals, self.stored.index.descriptors
+        exclude_s = self.config.exclude_s
+        rows = rivals(seen.descriptor, known, frames, match, self.motion, exclude_s=exclude_s, config=rules)
+        found = self.search(spectra, stored.spectra(rows))
+        by_motion = expected_poses(self.motion, query, frames[rows], np.eye(4), config=rules)
+        shares = self.shares(seen, match, distance, peak, rows, found, [by_motion])
+        far = ~self.about(row)[compared] & self.motion.same(match, frames[compared])
+        elsewhere = self.shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
+        shares = np.fmax(shares, elsewhere)
         cells = min(occupied(one, self.verification) for one in (seen.image, image))
         evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
         return Candidate(query, match, alignment, evidence)

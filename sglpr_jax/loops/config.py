@@ -128,8 +128,8 @@ class CandidateConfig:
     """Number of keyframes in the average image, which is subtracted before comparisons (`loops.background`)."""
     min_background_frames: int = 4
     """Minimum number of keyframes before the average is subtracted."""
-    min_rival_correlation: float = 0.25
-    """Minimum correlation of a candidate that is compared with rivals. Candidates below it are not loops."""
+    min_correlation: float = 0.25
+    """Minimum correlation of a candidate. Pairs below it are not loops."""
     rivals: RivalConfig = RivalConfig()
     motion: MotionConfig = MotionConfig()
 

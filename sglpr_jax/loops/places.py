@@ -308,7 +308,7 @@ class PlaceMap:
         """`distance_share` and `rival_share` of a match, with other places of the map as rivals."""
         apart = np.linalg.norm(self.index.descriptors - descriptor, axis=1)
         rows = rival_places(apart, self.world_from_place[:, :3, 3], match)
-        if peak.correlation < CandidateConfig().min_rival_correlation or not len(rows):
+        if peak.correlation < CandidateConfig().min_correlation or not len(rows):
             return np.nan, np.nan
         rivals = match_spectra(self.images[np.resize(rows, MAP_RIVALS)])
         found = jax.device_get(search_spectra(spectra, rivals)).some(slice(len(rows)))
