@@ -1,5 +1,5 @@
-"""How long programs take to start: the help of each command, random weights of each preset, and the descriptor of one
-scan, cold (nothing compiled yet, timed once) and warm.
+"""How long programs take to start: the help of each command, random weights of each preset, loading of shipped weights,
+and the descriptor of one scan, cold (nothing compiled yet, timed once) and warm.
 
     taskset -c 1 python -m benchmarks.speed.start_up
 
@@ -27,6 +27,8 @@ from sglpr_jax.sim.sensor import SENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
 INIT = "import jax, sglpr_jax; jax.block_until_ready(sglpr_jax.init(jax.random.key(0), preset={!r}).weights)"
+LOAD = "import sglpr_jax; params = sglpr_jax.load({!r})"
+DESCRIBE = f"{LOAD}; import numpy; numpy.asarray(sglpr_jax.describe(params, numpy.ones((128, 128), 'float32')))"
 COMMANDS = tuple(
     sorted(path.stem for path in (ROOT / "sglpr_jax" / "cli").glob("*.py") if (ROOT / "bin" / path.stem).exists())
 )
@@ -44,11 +46,12 @@ def main(
     Args:
         commands: whose help is timed.
         presets: whose random weights are timed.
-        weights: what bin/embed describes by.
+        weights: shipped weights that are loaded and describe.
         repeats: how often each is timed.
     """
     lines = {f"{command} --help": _command(command, "--help") for command in commands}
     lines |= {f"init, {preset}": ("-c", INIT.format(preset)) for preset in presets}
+    lines |= {"import jax": ("-c", "import jax"), f"load, {weights}": ("-c", LOAD.format(weights))}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scan = simulate_recording("08", scans=1, sensor=dataclasses.replace(SENSORS["hdl64e"], azimuth_steps=900))
@@ -59,9 +62,13 @@ def main(
         environment = {**os.environ, "XDG_CACHE_HOME": name}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         table = Table("", "seconds, least", "median", "processor seconds, least", "median")
-        wall, processor = seconds(embed, environment)
-        table.add_row(f"embed one scan, {weights}, cold", f"{wall:.2f}", "", f"{processor:.2f}", "")
-        lines[f"embed one scan, {weights}, warm"] = embed
+        for title, line in (  # the second describes a batch of one, another program
+            (f"load and describe one image, {weights}", ("-c", DESCRIBE.format(weights))),
+            (f"embed one scan, {weights}", embed),
+        ):
+            wall, processor = seconds(line, environment)
+            table.add_row(f"{title}, cold", f"{wall:.2f}", "", f"{processor:.2f}", "")
+            lines[f"{title}, warm"] = line
         for title, line in lines.items():
             wall, processor = zip(*(seconds(line, environment) for _ in range(repeats)), strict=True)
             found = (min(wall), statistics.median(wall), min(processor), statistics.median(processor))

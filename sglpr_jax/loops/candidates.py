@@ -57,7 +57,7 @@ class CandidateFinder:
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
-        self.params, self.config, self.verification, self.drift = jax.device_put(params), config, verification, drift
+        self.params, self.config, self.verification, self.drift = params, config, verification, drift
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.stored = StoredScans(index, verification=verification, keyframe_m=keyframe_m, max_places=max_places)
         """Descriptors, and centres of the images without the background, for comparison."""

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import safetensors
 
@@ -89,7 +90,8 @@ def load(weights: Path | str) -> Params:
     config = config_from_dict(stored, source=folder / CONFIG_FILE)
     known = {_hash_of(stored), _hash_of(dataclasses.asdict(config))}  # fields added later are not in older files
     values = _read_tensors(folder / WEIGHTS_FILE, config, known)
-    return Params(as_tree({name: np.asarray(leaf, np.float32) for name, leaf in values.items()}), config)
+    values = {name: np.asarray(leaf, np.float32) for name, leaf in values.items()}
+    return Params(jax.device_put(as_tree(values)), config)  # JAX would copy arrays of NumPy in every call
 
 
 def _read_tensors(path: Path, config: ModelConfig, known: Collection[str]) -> dict[str, np.ndarray]:
