@@ -1,7 +1,5 @@
 """An index of the places of a fleet: a LanceDB table in a folder or in object storage (extra `fleet`)."""
 
-import contextlib
-from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,17 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sglpr_jax.files import in_short
 from sglpr_jax.retrieval.index_rows import check_asked, checked_rows
-from sglpr_jax.retrieval.place_rows import KEY, about_of, check_made_alike
+from sglpr_jax.retrieval.place_rows import KEY, about_of, check_made_alike, usable
 
 if TYPE_CHECKING:
     import pyarrow
 
 TABLE = "places"
 """Name of the table."""
-RETRIES_S = 60
-"""Maximum time for which `add` retries while other processes add places, in seconds."""
 
 
 class FleetIndex:
@@ -37,17 +32,15 @@ class FleetIndex:
 
         Arguments:
           place: Folder, or address in object storage.
-          weights_hash: Hash of the weights that the table must have. None accepts any weights.
+          weights_hash: Hash of the weights that the table must have, otherwise ValueError. None accepts any.
           options: Options of `lancedb.connect`, such as `storage_options` with keys of the object storage.
-
-        Raises ValueError if the table is no index, cannot be read, or has places of other weights.
         """
         try:
             import lancedb
         except ImportError as error:
             raise ImportError(f"{place}: expected the extra `fleet` (pip install 'sglpr-jax[fleet]')") from error
         self.place, self.weights_hash = str(place), weights_hash
-        with self._naming():
+        with usable(self.place):
             self._connection = lancedb.connect(self.place, read_consistency_interval=timedelta(0), **options)
             there = TABLE in self._connection.list_tables().tables
             self.table: Any = self._connection.open_table(TABLE) if there else None
@@ -56,7 +49,7 @@ class FleetIndex:
             self._check(self.about)
 
     def __len__(self) -> int:
-        with self._naming():
+        with usable(self.place):
             return 0 if self.table is None else self.table.count_rows()
 
     @property
@@ -70,11 +63,11 @@ class FleetIndex:
         Raises ValueError if the rows are no places or have other weights, or if the table cannot be written.
         """
         self._check(about_of(rows.schema, "rows"))
-        with self._naming():
+        with usable(self.place):
             if self.table is None:
                 self.table = self._connection.create_table(TABLE, schema=rows.schema, exist_ok=True)
             adding = self.table.merge_insert(KEY).when_not_matched_insert_all()
-            return adding.execute(rows, timeout=timedelta(seconds=RETRIES_S)).num_inserted_rows
+            return adding.execute(rows, timeout=timedelta(seconds=60)).num_inserted_rows
 
     def query(
         self, descriptors: ArrayLike, k: int = 1, *, where: str = "", probes: int | None = 64, refine: int = 20
@@ -96,7 +89,7 @@ class FleetIndex:
         asked = checked_rows(descriptors, self.about["width"])
         check_asked(k, None, queries=len(asked), places=k)
         names = [name for name in self.table.schema.names if name != "descriptor"]
-        with self._naming():
+        with usable(self.place):
             search = self.table.search(list(asked) if len(asked) > 1 else asked[0], vector_column_name="descriptor")
             search = search.distance_type("l2").select([*names, "_distance"]).limit(k)
             search = search.where(where, prefilter=True) if where else search
@@ -108,29 +101,20 @@ class FleetIndex:
         return found.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def build(self, config: Any = None) -> None:
-        """Train an approximate index of LanceDB, by default `IvfRq`, on all places, and index columns for conditions."""
+        """Train an approximate index of LanceDB, by default `IvfRq`, and index columns that conditions use."""
         from lancedb.index import Bitmap, BTree, IvfRq
 
-        with self._naming():
+        with usable(self.place):
             for name, one in ((KEY, BTree()), ("recording", BTree()), ("time", BTree()), ("site", Bitmap())):
                 self.table.create_index(name, config=one)
             self.table.create_index("descriptor", config=config or IvfRq(distance_type="l2"))
 
     def optimize(self) -> None:
         """Merge small files, add new places to the approximate index, and delete versions older than a week."""
-        with self._naming():
+        with usable(self.place):
             self.table.optimize()
 
     def _check(self, found: dict[str, Any]) -> None:
         """Raise ValueError if places are not comparable with those of the table, or have other weights than asked."""
         asked = {} if self.weights_hash is None else {"weights_hash": self.weights_hash}
         check_made_alike(found | asked if self.table is None else self.about | asked, found, self.place)
-
-    @contextlib.contextmanager
-    def _naming(self) -> Iterator[None]:
-        """Convert exceptions of LanceDB, which have many types, to a ValueError that names the index."""
-        try:
-            yield
-        except Exception as error:
-            found = in_short(error, most=200)
-            raise ValueError(f"{self.place}: expected an index that LanceDB can use, found: {found}") from error

@@ -1,6 +1,8 @@
 """Rows of the places of a fleet, as Arrow tables. Parquet files and the index have the same columns."""
 
+import contextlib
 import json
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.fields import Size
-from sglpr_jax.files import naming, parse_json
+from sglpr_jax.files import in_short, naming, parse_json
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.schema import check_about
 
@@ -107,3 +109,15 @@ def check_made_alike(expected: dict[str, Any], found: dict[str, Any], source: st
             raise ValueError(
                 f"{source}: expected places with {name} {here}, found {there}: their descriptors are not comparable"
             )
+
+
+@contextlib.contextmanager
+def usable(address: str) -> Iterator[None]:
+    """Convert the exceptions of storage libraries, of many types, to a ValueError that names the address."""
+    try:
+        yield
+    except ImportError:  # a missing package, such as s3fs
+        raise
+    except Exception as error:
+        found = in_short(error, most=200)
+        raise ValueError(f"{address}: expected a store that can be read and written, found: {found}") from error

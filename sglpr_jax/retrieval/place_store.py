@@ -4,11 +4,9 @@ The name of a file contains a hash of the recording, and its folder a hash of th
 exists, the descriptors are not computed again. A file appears when it is complete.
 """
 
-import contextlib
 import hashlib
 import io
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,14 +15,14 @@ from jaxtyping import Float
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scaled import scale_of
-from sglpr_jax.files import in_short, replacing
+from sglpr_jax.files import replacing
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.params import Params
 from sglpr_jax.names import file_name
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.embed import embed
-from sglpr_jax.retrieval.place_rows import about_of, place_rows
+from sglpr_jax.retrieval.place_rows import about_of, place_rows, usable
 from sglpr_jax.retrieval.reuse import fingerprint
 
 if TYPE_CHECKING:
@@ -56,8 +54,7 @@ def embed_to_store(
       options: Options of `embed`.
 
     Raises:
-      ValueError: If another distance compares the descriptors, and the errors of `embed`.
-      OSError: If the store cannot be read or written.
+      ValueError: If another distance compares the descriptors, or the store cannot be read or written.
 
     Example:
       embed_to_store("s3://bucket/places", sglpr_jax.load("sglpr"), recording, site="berlin")
@@ -77,19 +74,19 @@ def embed_to_store(
 
 
 def stored_places(store: str) -> list[str]:
-    """Return the addresses of all Parquet files of a store. Raises OSError if it cannot be read."""
-    with _naming(store):
+    """Return the addresses of all Parquet files of a store. Raises ValueError if it cannot be read."""
+    with usable(store):
         filesystem, path = _open(store)
         return [filesystem.unstrip_protocol(found) for found in sorted(filesystem.find(path)) if _is_places(found)]
 
 
 def read_places(address: str) -> "pyarrow.Table":
-    """Read the rows of one Parquet file. Raises ValueError if it contains other columns, or OSError."""
+    """Read the rows of one Parquet file. Raises ValueError if it contains other columns."""
     import pyarrow.parquet
 
-    with _naming(address):
+    with usable(address):
         filesystem, path = _open(address)
-        rows = pyarrow.parquet.read_table(io.BytesIO(filesystem.cat_file(path)), partitioning=None)
+        rows = pyarrow.parquet.read_table(io.BytesIO(filesystem.cat_file(path)))
     about_of(rows.schema, address)
     return rows
 
@@ -99,7 +96,7 @@ def _is_places(path: str) -> bool:
 
 
 def _exists(address: str) -> bool:
-    with _naming(address):
+    with usable(address):
         filesystem, path = _open(address)
         return filesystem.exists(path)
 
@@ -111,7 +108,7 @@ def _put(address: str, rows: "pyarrow.Table") -> None:
 
     content = io.BytesIO()
     pyarrow.parquet.write_table(rows, content)
-    with _naming(address):
+    with usable(address):
         filesystem, path = _open(address)
         if isinstance(filesystem, LocalFileSystem):
             with replacing(Path(path)) as temporary:
@@ -128,17 +125,6 @@ def _open(address: str) -> tuple[Any, str]:
     except ImportError as error:
         raise ImportError(f"{address}: expected the extra `fleet` (pip install 'sglpr-jax[fleet]')") from error
     return fsspec.core.url_to_fs(address)
-
-
-@contextlib.contextmanager
-def _naming(address: str) -> Iterator[None]:
-    """Convert exceptions of file systems, which have many types, to an OSError that names the address."""
-    try:
-        yield
-    except ImportError:  # a missing extra
-        raise
-    except Exception as error:
-        raise OSError(f"{address}: cannot be read or written: {in_short(error, most=200)}") from error
 
 
 def _rotations(file: DescriptorFile, recording: Recording) -> Float[np.ndarray, "n 3 3"] | None:
