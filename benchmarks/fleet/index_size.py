@@ -7,6 +7,7 @@ Half of the places are random directions, and half resemble those of simulated d
 Queries are revisits of places of both halves, moved by half the noise between successive scans.
 """
 
+import itertools
 import tempfile
 import time
 from collections.abc import Iterator
@@ -41,8 +42,8 @@ def main(
     places: int = 100_000,
     index: Kind = "rq",
     partitions: int | None = None,
-    probes: int = 64,
-    refine: int = 20,
+    probes: tuple[int, ...] = (64,),
+    refine: tuple[int, ...] = (20,),
     queries: int = 100,
     folder: Path | None = None,
 ) -> None:
@@ -53,25 +54,30 @@ def main(
         places: number of places.
         index: kind of LanceDB's index.
         partitions: number of partitions. None: the square root of the number of places.
-        probes: number of partitions that a query searches.
-        refine: number of places that are compared exactly for each of the 10 answers.
+        probes: numbers of partitions that a query searches.
+        refine: numbers of places that are compared exactly for each of the 10 answers.
         queries: number of queries in each half.
-        folder: folder of the table, which stays. None: a temporary folder.
+        folder: folder of the table, which stays and is not filled twice. None: a temporary folder.
     """
     drawn = Drives(drives)
     with tempfile.TemporaryDirectory() as temporary:
         fleet = FleetIndex(folder or temporary, weights_hash="drawn")
-        start = time.perf_counter()
-        for number, block in enumerate(blocks(drawn, places)):
-            add(fleet, number, block)
-        written = time.perf_counter()
-        fleet.build(_config(index, partitions or round(places**0.5)))
-        built = time.perf_counter()
+        if fleet.table is None:
+            _fill(fleet, drawn, places, _config(index, partitions or round(places**0.5)))
         size = sum(path.stat().st_size for path in Path(fleet.place).rglob("*") if path.is_file())
-        print(f"{len(fleet):,} places: written in {written - start:.1f} s, indexed in {built - written:.1f} s")
         print(f"{size / 1e9:.2f} GB, {size / places:.0f} bytes a place", flush=True)
-        for asked in exact(drawn, places, queries):
-            _report(fleet, asked, probes=probes, refine=refine)
+        for asked, *how in itertools.product(exact(drawn, places, queries), probes, refine):
+            _report(fleet, asked, *how)
+
+
+def _fill(fleet: FleetIndex, drives: Drives, places: int, config: Any) -> None:
+    start = time.perf_counter()
+    for number, block in enumerate(blocks(drives, places)):
+        add(fleet, number, block)
+    written = time.perf_counter()
+    fleet.build(config)
+    built = time.perf_counter()
+    print(f"{len(fleet):,} places: written in {written - start:.1f} s, indexed in {built - written:.1f} s", flush=True)
 
 
 def blocks(drives: Drives, places: int) -> Iterator[Float32[np.ndarray, "n d"]]:
@@ -106,7 +112,7 @@ def exact(drives: Drives, places: int, n: int) -> list[Asked]:
     return [Asked("random", queries[:n], answers[:n]), Asked("drives", queries[n:], answers[n:])]
 
 
-def _report(fleet: FleetIndex, asked: Asked, *, probes: int, refine: int) -> None:
+def _report(fleet: FleetIndex, asked: Asked, probes: int, refine: int) -> None:
     """Print the recall and the time of single queries."""
     for query in asked.queries[:10]:  # reads files for the first time
         fleet.query(query, 10, probes=probes, refine=refine)

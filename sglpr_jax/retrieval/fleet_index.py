@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     import pyarrow
 
 TABLE = "places"
-"""Name of the table."""
 
 
 class FleetIndex:
