@@ -75,7 +75,7 @@ def _fill(fleet: FleetIndex, drives: Drives, places: int, config: Any) -> None:
     for number, block in enumerate(blocks(drives, places)):
         add(fleet, number, block)
     written = time.perf_counter()
-    fleet.build(config)
+    fleet.optimize(config)
     built = time.perf_counter()
     print(f"{len(fleet):,} places: written in {written - start:.1f} s, indexed in {built - written:.1f} s", flush=True)
 

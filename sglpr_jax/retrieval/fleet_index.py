@@ -1,5 +1,6 @@
 """An index of the places of a fleet: a LanceDB table in a folder or in object storage (extra `fleet`)."""
 
+from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +18,7 @@ TABLE = "places"
 
 
 class FleetIndex:
-    """Index of place descriptors, compared by L2, that any number of processes fill and query. New places are compared
-    exactly until `build` or `optimize` has indexed them.
+    """Index of place descriptors, compared by L2, that any number of processes fill and query.
 
     Example:
       index = FleetIndex("s3://bucket/index", weights_hash=params.weights_hash)   # or a folder
@@ -34,17 +34,15 @@ class FleetIndex:
           weights_hash: Hash of the weights that the table must have, otherwise ValueError. None accepts any.
           options: Options of `lancedb.connect`, such as `storage_options` with keys of the object storage.
         """
-        try:
-            import lancedb
-        except ImportError as error:
-            raise ImportError(f"{place}: expected the extra `fleet` (pip install 'sglpr-jax[fleet]')") from error
         self.place, self.weights_hash = str(place), weights_hash
         with usable(self.place):
+            import lancedb
+
             self._connection = lancedb.connect(self.place, read_consistency_interval=timedelta(0), **options)
-            there = TABLE in self._connection.list_tables().tables
-            self.table: Any = self._connection.open_table(TABLE) if there else None
-            """LanceDB's table, for its other functions. None until the first `add`."""
-        if there:
+            self.table: Any = None  # until the first `add`
+            if TABLE in self._connection.list_tables().tables:
+                self.table = self._connection.open_table(TABLE)
+        if self.table is not None:
             self._check(self.about)
 
     def __len__(self) -> int:
@@ -57,10 +55,7 @@ class FleetIndex:
         return about_of(self.table.schema, self.place)
 
     def add(self, rows: "pyarrow.Table") -> int:
-        """Add the rows of `place_rows` or of a Parquet file, all or none. Returns how many are new.
-
-        Raises ValueError if the rows are no places or have other weights, or if the table cannot be written.
-        """
+        """Add the rows of `place_rows` or of a Parquet file, all or none. Returns how many are new."""
         self._check(about_of(rows.schema, "rows"))
         with usable(self.place):
             if self.table is None:
@@ -69,7 +64,14 @@ class FleetIndex:
             return adding.execute(rows, timeout=timedelta(seconds=60)).num_inserted_rows
 
     def query(
-        self, descriptors: ArrayLike, k: int = 1, *, where: str = "", probes: int | None = 64, refine: int = 20
+        self,
+        descriptors: ArrayLike,
+        k: int = 1,
+        *,
+        where: str = "",
+        columns: Sequence[str] = (),
+        probes: int | None = 64,
+        refine: int = 20,
     ) -> "pyarrow.Table":
         """Find the nearest `k` places of one descriptor (d,) or of several (q, d).
 
@@ -77,40 +79,40 @@ class FleetIndex:
           descriptors: Descriptors of the weights of the index.
           k: Number of places.
           where: Condition in SQL on the columns of the table. Only places that fulfil it are searched.
+          columns: Further columns of the answer, such as "time" and "x".
           probes: Number of partitions of the index that are searched. None compares all places exactly.
           refine: Number of places, for each of the k, that are compared by their full descriptors.
 
         Returns:
-          The columns of the table without descriptors, the number of the query, and the distance, nearest first.
+          Columns `place` (recording/scan), `query` (row of the query) and `distance`, nearest first.
         """
         if self.table is None:
             raise ValueError(f"{self.place}: expected an index with places, found none")
-        asked = checked_rows(descriptors, self.about["width"])
+        asked = checked_rows(descriptors, self.table.schema.field("descriptor").type.list_size)
         check_asked(k, None, queries=len(asked), places=k)
-        names = [name for name in self.table.schema.names if name != "descriptor"]
         with usable(self.place):
             search = self.table.search(list(asked) if len(asked) > 1 else asked[0], vector_column_name="descriptor")
-            search = search.distance_type("l2").select([*names, "_distance"]).limit(k)
+            search = search.distance_type("l2").select([KEY, *columns, "_distance"]).limit(k)
             search = search.where(where, prefilter=True) if where else search
             search = search.bypass_vector_index() if probes is None else search.nprobes(probes).refine_factor(refine)
             found = search.to_arrow()
         query = found["query_index"].to_numpy() if len(asked) > 1 else np.zeros(len(found), np.int32)
         distance = np.sqrt(np.maximum(found["_distance"].to_numpy(), 0))
-        found = found.select(names).append_column("query", [query]).append_column("distance", [distance])
+        found = found.select([KEY, *columns]).append_column("query", [query]).append_column("distance", [distance])
         return found.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
-    def build(self, config: Any = None) -> None:
-        """Train an approximate index of LanceDB, by default `IvfRq`, and index columns that conditions use."""
+    def optimize(self, config: Any = None) -> None:
+        """Merge small files, index new places, which are compared exactly until then, and delete old versions.
+
+        If there are no indexes, or if `config` states one of LanceDB's, it trains them first, by default `IvfRq`.
+        """
         from lancedb.index import Bitmap, BTree, IvfRq
 
+        columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
         with usable(self.place):
-            for name, one in ((KEY, BTree()), ("recording", BTree()), ("time", BTree()), ("site", Bitmap())):
-                self.table.create_index(name, config=one)
-            self.table.create_index("descriptor", config=config or IvfRq(distance_type="l2"))
-
-    def optimize(self) -> None:
-        """Merge small files, add new places to the approximate index, and delete versions older than a week."""
-        with usable(self.place):
+            if config is not None or not self.table.list_indices():
+                for name, one in (columns | {"descriptor": config or IvfRq(distance_type="l2")}).items():
+                    self.table.create_index(name, config=one)
             self.table.optimize()
 
     def _check(self, found: dict[str, Any]) -> None:

@@ -97,7 +97,9 @@ def about_of(found: "pyarrow.Schema", source: str) -> dict[str, Any]:
         for field in schema(about):
             kind = columns.get(field.name, "none").replace("item:", "element:")
             if kind != str(field.type).replace("item:", "element:"):
-                raise ValueError(f"expected a column {field.name} of {field.type}, found {columns.get(field.name)}")
+                raise ValueError(
+                    f"expected a column {field.name} of {field.type}, found {columns.get(field.name, 'none')}"
+                )
     return about
 
 
@@ -116,8 +118,9 @@ def usable(address: str) -> Iterator[None]:
     """Convert the exceptions of storage libraries, of many types, to a ValueError that names the address."""
     try:
         yield
-    except ImportError:  # a missing package, such as s3fs
-        raise
+    except ImportError as error:
+        more = "pip install 'sglpr-jax[fleet]', and s3fs for s3://, gcsfs for gs://"
+        raise ImportError(f"{address}: expected the extra `fleet` ({more}), found: {in_short(error)}") from error
     except Exception as error:
         found = in_short(error, most=200)
         raise ValueError(f"{address}: expected a store that can be read and written, found: {found}") from error

@@ -82,9 +82,9 @@ def stored_places(store: str) -> list[str]:
 
 def read_places(address: str) -> "pyarrow.Table":
     """Read the rows of one Parquet file. Raises ValueError if it contains other columns."""
-    import pyarrow.parquet
-
     with usable(address):
+        import pyarrow.parquet
+
         filesystem, path = _open(address)
         rows = pyarrow.parquet.read_table(io.BytesIO(filesystem.cat_file(path)))
     about_of(rows.schema, address)
@@ -103,12 +103,12 @@ def _exists(address: str) -> bool:
 
 def _put(address: str, rows: "pyarrow.Table") -> None:
     """Write a Parquet file. In object storage, an object appears when it is complete."""
-    import pyarrow.parquet
-    from fsspec.implementations.local import LocalFileSystem
-
     content = io.BytesIO()
-    pyarrow.parquet.write_table(rows, content)
     with usable(address):
+        import pyarrow.parquet
+        from fsspec.implementations.local import LocalFileSystem
+
+        pyarrow.parquet.write_table(rows, content)
         filesystem, path = _open(address)
         if isinstance(filesystem, LocalFileSystem):
             with replacing(Path(path)) as temporary:
@@ -119,11 +119,8 @@ def _put(address: str, rows: "pyarrow.Table") -> None:
 
 def _open(address: str) -> tuple[Any, str]:
     """Return the file system of an address, and the path in it."""
-    try:
-        import fsspec
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"{address}: expected the extra `fleet` (pip install 'sglpr-jax[fleet]')") from error
+    import fsspec
+
     return fsspec.core.url_to_fs(address)
 
 
