@@ -102,10 +102,7 @@ class FleetIndex:
         return found.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def optimize(self, config: Any = None) -> None:
-        """Merge small files, index new places, which are compared exactly until then, and delete old versions.
-
-        If there are no indexes, or if `config` states one of LanceDB's, it trains them first, by default `IvfRq`.
-        """
+        """Merge small files and index new places. Trains the indexes if there are none, or by LanceDB's `config`."""
         from lancedb.index import Bitmap, BTree, IvfRq
 
         columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
