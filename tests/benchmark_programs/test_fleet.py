@@ -1,0 +1,40 @@
+"""The recipes for a fleet, and what is measured of its index, on a few places."""
+
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.models.params import Params
+
+from .programs import printed
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def weights(tiny: Params, tmp_path):
+    """A network of next to no arithmetic, in a folder."""
+    sglpr_jax.save(tmp_path / "tiny", tiny)
+    return tmp_path / "tiny"
+
+
+def test_the_files_of_two_ray_workers_are_those_of_one_process_although_one_is_killed(weights):
+    output = printed("fleet.ray_killed", "--recordings", 6, "--scans", 2, "--weights", weights)
+    assert "killed a worker after" in output
+    assert "6 recordings, 12 places, 0 errors" in output
+    assert "6 of 6 files are those of one process, byte by byte; 6 files in the store" in output
+    assert "again: 0 places added" in output
+
+
+def test_nothing_is_lost_when_a_writer_is_killed():
+    output = printed("fleet.writers", "--readers", 1, "--recordings", 8, "--scans", 3)
+    assert "16 recordings reported as added, 0 of them lost; 0 of 16 incomplete" in output
+    assert "48 places after compaction" in output and "0 processes failed" in output
+
+
+def test_an_index_tells_its_recall(tmp_path):
+    rng = np.random.default_rng(0)
+    np.savez(tmp_path / "drives.npz", a=rng.normal(size=(40, 16)).astype(np.float32))
+    output = printed("fleet.index_size", "--drives", tmp_path / "drives.npz", "--places", 2000, "--queries", 3)
+    assert "2,000 places: written in" in output and "bytes a place" in output
+    assert "random, probes 64, refine 20: recall@1 1.0000" in output and "drives, probes 64" in output
