@@ -11,8 +11,6 @@ from jaxtyping import Float32
 
 import sglpr_jax
 from sglpr_jax.numpy_files import read_arrays
-from sglpr_jax.sim.recording import simulate_recording
-from sglpr_jax.sim.sensor import HDL64E
 
 ROUTES = ("00", "02", "05", "06", "08")
 """Routes that are driven in every town."""
@@ -27,6 +25,9 @@ def main(*, out: Path, towns: int = 2, scans: int = 300, weights: str = "sglpr")
         scans: scans of a drive.
         weights: shipped weights.
     """
+    from sglpr_jax.sim.recording import simulate_recording  # slow imports that processes with drawn places do not need
+    from sglpr_jax.sim.sensor import HDL64E
+
     params = sglpr_jax.load(weights)
     drives = {}
     for seed in range(700, 700 + towns):

@@ -28,7 +28,7 @@ def overlaps(
     rows: "pyarrow.Table",
     *,
     where: str = "",
-    max_distance: float = 0.7,
+    max_distance: float = 0.8,
     min_scans: int = 5,
     k: int = 10,
 ) -> list[Overlap]:
