@@ -47,12 +47,16 @@ def main(
         print(f"{row['source']}: {row['error']}")
 
 
-def described(sources: Sequence[str], *, workers: int, **about: Any) -> list[dict[str, Any]]:
+def described(
+    sources: Sequence[str], *, workers: int, worker: type["Describer"] | None = None, **about: Any
+) -> list[dict[str, Any]]:
     """Describe recordings with Ray Data. If a worker dies, Ray starts another, which repeats only its recording."""
     import ray.data
 
     rows = ray.data.from_items([{"source": source} for source in sources], override_num_blocks=len(sources))
-    return rows.map(Describer, fn_constructor_kwargs=about, compute=ray.data.ActorPoolStrategy(size=workers)).take_all()
+    return rows.map(
+        worker or Describer, fn_constructor_kwargs=about, compute=ray.data.ActorPoolStrategy(size=workers)
+    ).take_all()
 
 
 class Describer:

@@ -7,9 +7,8 @@ import os
 import shutil
 import signal
 import tempfile
-import threading
-import time
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
@@ -21,9 +20,6 @@ import sglpr_jax
 from benchmarks.fleet.embed import Describer, described
 from sglpr_jax.retrieval.place_store import read_places, stored_places
 
-POLL_S = 0.1
-"""Time between looks at the store, in seconds."""
-
 
 def main(
     *, recordings: int = 64, scans: int = 10, weights: str = "sglpr", workers: int = 2, folder: Path | None = None
@@ -34,7 +30,7 @@ def main(
         recordings: number of recordings, parts of one simulated drive.
         scans: scans of a recording.
         weights: shipped weights, or a folder.
-        workers: Ray workers. One is killed after a third of the recordings.
+        workers: Ray workers. One is killed at a third of the recordings.
         folder: folder for everything. None: a temporary folder.
     """
     import ray
@@ -57,13 +53,16 @@ def main(
             **options,
         )
         try:
-            killer = threading.Thread(target=_kill_one, args=(f"{root}/places/", recordings // 3))
-            killer.start()
-            found = described(sources, out=f"{root}/places/", weights=weights, workers=workers)
-            killer.join()
-            again = described(sources, out=f"{root}/places/", weights=weights, workers=workers)
+            about = {
+                "out": f"{root}/places/",
+                "weights": weights,
+                "victim": sources[recordings // 3],
+                "mark": f"{root}/killed",
+            }
+            found = described(sources, worker=KilledOnce, workers=workers, **about)
         finally:
             ray.shutdown()
+        again = [Describer(out=f"{root}/places/", weights=weights)({"source": source}) for source in sources[:3]]
         _report(root, found, again)
 
 
@@ -78,15 +77,19 @@ def _simulated(root: Path, recordings: int, scans: int) -> list[str]:
     return [str(path) for path in sorted((root / "recordings").iterdir())]
 
 
-def _kill_one(store: str, after: int) -> None:
-    """Kill the process of an actor after some recordings."""
-    from ray.util.state import list_actors
+class KilledOnce(Describer):
+    """A worker that is killed (kill -9) at one recording, the first time."""
 
-    while len(stored_places(store)) < after:
-        time.sleep(POLL_S)
-    alive = [actor.pid for actor in list_actors() if actor.state == "ALIVE" and actor.pid]
-    os.kill(alive[0], signal.SIGKILL)
-    print(f"killed a worker after {len(stored_places(store))} recordings", flush=True)
+    def __init__(self, *, victim: str, mark: str, **about: str):
+        super().__init__(**about)
+        self.victim, self.mark = victim, Path(mark)
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        """Describe a recording, or die."""
+        if row["source"] == self.victim and not self.mark.exists():
+            self.mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(row)
 
 
 def _report(root: Path, found: list[dict], again: list[dict]) -> None:
@@ -94,10 +97,11 @@ def _report(root: Path, found: list[dict], again: list[dict]) -> None:
         {Path(address).name: address for address in stored_places(f"{root}/{name}/")} for name in ("places", "alone")
     )
     same = [_content(ours[name]) == _content(theirs[name]) for name in theirs if name in ours]
+    print(f"killed a worker: {(root / 'killed').exists()}")
     rows = sum(len(read_places(address)) for address in ours.values())
     print(f"{len(found)} recordings, {rows} places, {sum(bool(row['error']) for row in found)} errors")
     print(f"{sum(same)} of {len(theirs)} files are those of one process, byte by byte; {len(ours)} files in the store")
-    print(f"again: {sum(row['added'] for row in again)} places added")
+    print(f"three of them again: {sum(row['added'] for row in again)} places added")
 
 
 def _content(address: str) -> bytes:
