@@ -102,7 +102,7 @@ class FleetIndex:
         return found.sort_by([("query", "ascending"), ("distance", "ascending"), (KEY, "ascending")])
 
     def optimize(self, config: Any = None) -> None:
-        """Merge small files and index new places. Trains the indexes if there are none, or by LanceDB's `config`."""
+        """Merge small files and index new places. Trains missing indexes first, or one by LanceDB's `config`."""
         from lancedb.index import Bitmap, BTree, IvfRq
 
         columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}

@@ -54,4 +54,4 @@ def overlaps(
         queries, others = found["query"].to_numpy()[near] + start, found["recording"].to_numpy()[near]
         pairs |= set(zip(queries.tolist(), others.tolist(), strict=True))
     counted = Counter(other for _, other in pairs)
-    return [Overlap(*sorted((own, other)), n) for other, n in counted.most_common() if n >= min_scans]
+    return [Overlap(min(own, other), max(own, other), n) for other, n in counted.most_common() if n >= min_scans]
