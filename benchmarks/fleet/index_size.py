@@ -40,7 +40,7 @@ def main(
     *,
     drives: Path,
     places: int = 100_000,
-    index: Kind = "rq",
+    index: Kind = "sq",
     partitions: int | None = None,
     probes: tuple[int, ...] = (64,),
     refine: tuple[int, ...] = (20,),

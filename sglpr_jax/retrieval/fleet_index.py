@@ -103,12 +103,12 @@ class FleetIndex:
 
     def optimize(self, config: Any = None) -> None:
         """Merge small files and index new places. Trains missing indexes first, or one by LanceDB's `config`."""
-        from lancedb.index import Bitmap, BTree, IvfRq
+        from lancedb.index import Bitmap, BTree, IvfSq
 
         columns = {KEY: BTree(), "recording": BTree(), "time": BTree(), "site": Bitmap()}
         with usable(self.place):
             if config is not None or not self.table.list_indices():
-                for name, one in (columns | {"descriptor": config or IvfRq(distance_type="l2")}).items():
+                for name, one in (columns | {"descriptor": config or IvfSq(distance_type="l2")}).items():
                     self.table.create_index(name, config=one)
             self.table.optimize()
 
