@@ -17,8 +17,10 @@ import tyro
 from jaxtyping import Float
 
 from benchmarks.speed.ratio import Contender, Job, alternate, report
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.retrieval.place_rows import place_rows
 
 BLOCK = 100_000
 """Places that are drawn and added at a time: nobody holds all of them twice."""
@@ -91,10 +93,16 @@ def _faiss(rows: int, width: int, folder: Path) -> Ask:
 
 
 def _fleet(rows: int, width: int, folder: Path) -> Ask:
-    index = FleetIndex(folder, width=width)
+    index = FleetIndex(folder)
     for start in range(0, rows, BLOCK):
-        index.add(_places(start, min(BLOCK, rows - start), width))
-    return lambda asked, k: index.query(asked, k).rows
+        places = _places(start, min(BLOCK, rows - start), width)
+        ids = tuple(str(row) for row in range(start, start + len(places)))
+        index.add(place_rows(DescriptorFile("", ids, None, None, places, None, {}, ""), "drawn"))
+    return lambda asked, k: _rows(index.query(asked, k, probes=None)["place"].to_pylist()).reshape(len(asked), k)
+
+
+def _rows(places: list[str]) -> np.ndarray:
+    return np.array([int(place.rpartition("/")[2]) for place in places])
 
 
 def _places(start: int, count: int, width: int) -> Float[np.ndarray, "n d"]:

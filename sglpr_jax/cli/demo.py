@@ -52,7 +52,7 @@ def demo(command: DemoCommand) -> Path:
     loops_of_recording(LoopsCommand(town, source=source, weights=WEIGHTS, out=out / "loops"))
     _title("its descriptors and their score: bin/embed, bin/evaluate")
     file = out / f"{TESTED}.npz"
-    embed_recording(EmbedCommand(data=town, source=source, weights=WEIGHTS, out=file))
+    embed_recording(EmbedCommand(data=town, source=source, weights=WEIGHTS, out=str(file)))
     evaluate_file(EvaluateCommand(file, data=town, source=source, weights=WEIGHTS))
     if command.steps:
         _title(f"{command.steps} steps of training, to show the command; thousands would be needed: bin/train")

@@ -22,12 +22,14 @@ class EmbedCommand:
       bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --data my_scans/ --submap-m 10 --odometry odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
+      bin/embed --data my_scans/ --site berlin --out s3://bucket/places
     """
 
     data: Path
     """A dataset, a bag or a folder of scans or ready-made images, in any supported layout."""
-    out: Path
-    """Descriptor file to write (.npz)."""
+    out: str
+    """Descriptor file to write (.npz), or a store of places (extra `fleet`): an address such as s3://bucket/places, or
+    a folder with a / at the end. A store gets a Parquet file for each recording, unless it is there already."""
     weights: str | None = None
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors. None: the
     shipped weights sglpr."""
@@ -44,42 +46,62 @@ class EmbedCommand:
     """Seed of the angles of --rotate."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
+    site: str = ""
+    """Where the recording was made: column `site` of a store."""
     batch: Size = 8
     """Maximum number of images that are described at a time."""
 
 
-def embed_recording(command: EmbedCommand) -> Path:
-    """Run the command. Returns the path of the descriptor file."""
-    from sglpr_jax.data.scaled import scaled
-    from sglpr_jax.files import check_writable  # slow imports, not needed for --help
+def embed_recording(command: EmbedCommand) -> str:
+    """Run the command. Returns the path of the descriptor file, or the address of the file in the store."""
+    from sglpr_jax.data.scaled import scaled  # slow imports, not needed for --help
     from sglpr_jax.methods.registry import method_named
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.embed import embed
+    from sglpr_jax.retrieval.place_store import embed_to_store
 
     if command.weights is not None and command.method != NETWORK:
         raise ValueError(f"{command.weights}: expected --method {NETWORK} with --weights, found {command.method}")
-    if command.out.suffix != ".npz":
-        raise ValueError(f"expected --out to end in .npz, found {command.out}")
-    if not command.out.parent.is_dir():
-        raise FileNotFoundError(f"{command.out}: its folder {command.out.parent} does not exist")
-    check_writable(command.out)
+    in_store = "://" in command.out or command.out.endswith("/")
+    if not in_store:
+        _check_file(command)
     params = None if command.weights is None else load(command.weights)
     recording = command.submap.open(command.source, command.data)
     recording = scaled(recording, resolved_scale(command.scale, recording))
     method = method_named(command.method, params, recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
-        file = embed(
-            method,
-            recording,
-            rotation_seed=command.seed if command.rotate else None,
-            batch=command.batch,
-            on_bad_scan=report_bad_scan if command.skip_bad else None,
-            on_progress=show,
-        )
-    file.save(command.out)
+        options = {
+            "rotation_seed": command.seed if command.rotate else None,
+            "batch": command.batch,
+            "on_bad_scan": report_bad_scan if command.skip_bad else None,
+            "on_progress": show,
+        }
+        if in_store:
+            about = {"site": command.site, "source": str(command.data.absolute())}
+            stored = embed_to_store(command.out, method, recording, **about, **options)
+        else:
+            file = embed(method, recording, **options)
+    if in_store:
+        print(f"{stored.address}: {'already there' if stored.added is None else f'{stored.added} places'}")
+        return stored.address
+    file.save(Path(command.out))
     skipped = len(recording) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
     return command.out
+
+
+def _check_file(command: EmbedCommand) -> None:
+    """Raise an error before long work if the descriptor file cannot be written."""
+    from sglpr_jax.files import check_writable
+
+    out = Path(command.out)
+    if out.suffix != ".npz":
+        raise ValueError(f"expected --out to end in .npz or /, or an address such as s3://bucket/places, found {out}")
+    if command.site:
+        raise ValueError(f"{out}: expected --site only with a store, found a descriptor file")
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"{out}: its folder {out.parent} does not exist")
+    check_writable(out)
 
 
 def main() -> None:

@@ -60,14 +60,15 @@ def embed_or_reuse(
     return file
 
 
-def fingerprint(recording: Recording) -> str:
-    """Hash a recording without reading its scans.
+def fingerprint(recording: Recording, *, contents: bool = False) -> str:
+    """Hash a recording, by default without reading its scans.
 
     The hash covers ids, files, read options, mounting, positions and times. Files of scans and labels, or those of a
-    bag, count by their size and modification time.
+    bag, count by their size and modification time, or with `contents` by their bytes. Copies then have equal hashes.
     """
+    state = _content if contents else _state
     files = (recording.containers or recording.paths, recording.label_paths)
-    scans, labels = ([_state(path) for path in paths] for paths in files)
+    scans, labels = ([state(path) for path in paths] for paths in files)
     mounting = None if recording.mounting is None else recording.mounting.fields
     digest = hashlib.sha256(json.dumps([recording.ids, scans, labels, recording.read_options, mounting]).encode())
     for values in (recording.positions, recording.times, each_mounting(recording)):
@@ -89,6 +90,14 @@ def _state(path: Path | None) -> tuple[int, int] | None:
         return None
     found = path.stat()
     return found.st_size, found.st_mtime_ns
+
+
+def _content(path: Path | None) -> str | None:
+    """Hash of the bytes of a file, or None if it does not exist."""
+    if path is None or not path.is_file():
+        return None
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _settings(method: Method, recording: Recording, corruption: Corruption, seed: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the index in memory and the one on LanceDB have in common: one answers as the other, and refuses the same."""
+"""Answers of the index in memory, and places that it refuses."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,18 +6,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sglpr_jax import FleetIndex, Index
+from sglpr_jax import Index
 
 from .places import WIDTH, add_places, draw, file_of
 
-New = Callable[..., Index | FleetIndex]
+New = Callable[..., Index]
 
 
-@pytest.fixture(params=["in memory", "fleet"])
-def new(request, tmp_path) -> New:
-    """`new(weights_hash=...)` is an empty index of either kind."""
-    if request.param == "fleet":
-        return lambda **about: FleetIndex(tmp_path, width=WIDTH, **about)
+@pytest.fixture
+def new() -> New:
+    """`new(weights_hash=...)` is an empty index."""
     return lambda **about: Index.empty(WIDTH, **about)
 
 
