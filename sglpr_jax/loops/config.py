@@ -149,7 +149,7 @@ class VerificationConfig:
     max_shift_m: float = 12.0
     """Maximum distance between two scans of one place along x and along y, in metres."""
     turns: int = 72
-    """Number of rotations over the whole circle."""
+    """Number of rotations over the whole circle, a multiple of four."""
     coarse: int = 2
     """Number of cells per side that the exhaustive search merges into one."""
     blur_m: float = 0.4
@@ -165,6 +165,11 @@ class VerificationConfig:
     prior_m: float = 2.0
     prior_deg: float = 10.0
     """Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""
+
+    def __post_init__(self):
+        """Raises ValueError if the number of rotations is not a multiple of four."""
+        if self.turns < 4 or self.turns % 4:
+            raise ValueError(f"expected turns to be a multiple of 4, found {self.turns}")
 
 
 @dataclasses.dataclass(frozen=True)

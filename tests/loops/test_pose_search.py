@@ -104,3 +104,8 @@ def test_matches_beyond_the_count_are_not_searched():
     whole, part = (jax.device_get(search_spectra(query, matches, count, config=SMALL)) for count in (None, 2))
     for values, some in zip(whole, part, strict=True):
         np.testing.assert_allclose(some, [*values[:2], 0.0], atol=1e-6)
+
+
+def test_rotations_are_whole_quarter_turns():
+    with pytest.raises(ValueError, match="expected turns to be a multiple of 4, found 70"):
+        VerificationConfig(turns=70)
