@@ -123,13 +123,16 @@ def test_the_start_of_commands_is_timed():
     options = ("--commands", "embed", "--presets", "tiny", "--weights", "circular", "--repeats", 1)
     rows = table(printed("speed.start_up", *options))
     assert [row[0] for row in rows] == [
+        "load and describe one image, circular, cold",
         "embed one scan, circular, cold",
         "embed --help",
         "init, tiny",
+        "import jax",
+        "load, circular",
+        "load and describe one image, circular, warm",
         "embed one scan, circular, warm",
     ]
-    cold, help, _, warm = (float(row[3]) for row in rows)
-    assert min(cold, help, warm) > 0
+    assert min(float(row[3]) for row in rows) > 0
 
 
 def test_index_is_timed_beside_others():

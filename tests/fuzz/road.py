@@ -114,7 +114,7 @@ def plain(value: Any) -> Any:
         return {name: plain(one) for name, one in value.items()}
     if isinstance(value, list | tuple):
         return [plain(one) for one in value]
-    return [str(value.dtype), value.shape, value.tobytes()] if isinstance(value, np.ndarray) else value
+    return [str(value.dtype), value.shape, np.asarray(value).tobytes()] if hasattr(value, "dtype") else value
 
 
 def as_whole(read: Callable[[Path], Any], expected: Any) -> dict[str, Any]:

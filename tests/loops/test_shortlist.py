@@ -30,11 +30,10 @@ def query():
     return seen_from(place(TRUE), (1.2, -0.8, 2.5)).astype(np.uint8)
 
 
-def test_the_true_place_has_the_highest_correlation_and_the_others_are_ruled_out(images, query):
+def test_the_true_place_has_the_highest_correlation_and_matches_beyond_the_count_none(images, query):
     spectra, matches = query_spectra(query), match_spectra(np.stack(images))
     found = np.asarray(coarse_correlations(spectra, matches))
-    least = CandidateConfig().min_coarse_correlation
-    assert found.argmax() == TRUE and found[TRUE] > least and np.mean(found < least) > 0.5
+    assert found.argmax() == TRUE and np.delete(found, TRUE).max() < 0.5 < found[TRUE]
     some = np.asarray(coarse_correlations(spectra, matches, TRUE))
     np.testing.assert_allclose(some[:TRUE], found[:TRUE], atol=1e-6)
     assert (some[TRUE:] == -1).all()
@@ -59,8 +58,8 @@ def test_places_with_distant_descriptors_are_found_by_further_comparisons(images
     for image, descriptor in zip(images, descriptors, strict=False):
         finder.add_seen(Seen(descriptor, image, None))
     wrong = (descriptors[0] + 0.1 * descriptors[-1]).astype(np.float32)
-    [candidate] = finder.add_seen(Seen(wrong / np.linalg.norm(wrong), query, None))
-    assert (candidate.match == TRUE) == found
+    candidates = finder.add_seen(Seen(wrong / np.linalg.norm(wrong), query, None))
+    assert [one.match for one in candidates] == ([TRUE] if found else [])
 
 
 @pytest.mark.slow
