@@ -53,7 +53,7 @@ class StoredScans:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of descriptors and compressed images."""
+        """Number of bytes of descriptors and compressed images, without the kept spectra (`SPECTRA`)."""
         return self.index.nbytes + self._frames.nbytes + self._repeated.nbytes + sum(map(len, self._packed))
 
     def is_new_place(self, frame: int, motion: Motion) -> bool:
