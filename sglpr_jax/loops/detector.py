@@ -93,8 +93,8 @@ class LoopDetector:
 
     @property
     def nbytes(self) -> int:
-        """Number of bytes of all frames. The results (`loops`, `supported`, `rejected`, `candidates`) and the spectra of
-        the last compared scans (13 MB at most) are not counted.
+        """Number of bytes of all frames. The results (`loops`, `supported`, `rejected`, `candidates`) are not counted,
+        nor are the spectra of the last compared scans (13 MB at most).
 
         With `max_places`, only poses and times still grow: 305 bytes a frame, and up to as much in spare capacity.
         """
