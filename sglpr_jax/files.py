@@ -263,8 +263,12 @@ def check_writable(path: Path) -> None:
 
 
 def half_written(folder: Path) -> list[Path]:
-    """Return the unfinished files and folders of `replacing` in `folder` and below, left by killed processes."""
-    return list(folder.rglob(".*.tmp"))
+    """Return the unfinished files and folders of `replacing` in `folder` and below, left by killed processes.
+
+    Folders that another process removes meanwhile are passed over. `Path.rglob` would raise FileNotFoundError.
+    """
+    found = (Path(place, name) for place, folders, files in os.walk(folder) for name in (*folders, *files))
+    return [path for path in found if path.match(".*.tmp")]
 
 
 def remove_half_written(folder: Path) -> None:

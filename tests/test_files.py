@@ -155,6 +155,20 @@ def test_what_a_killed_process_left_is_found_and_removed(tmp_path):
     assert names(tmp_path / "run") == ["test"] and names(tmp_path / "run" / "test") == ["a.png"]
 
 
+def test_half_written_files_are_found_while_another_process_removes_folders(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    (tmp_path / ".a.png.3.tmp").touch()
+    scandir = os.scandir
+
+    def scan(place):
+        if Path(place).name == "gone":
+            raise FileNotFoundError(place)
+        return scandir(place)
+
+    monkeypatch.setattr(os, "scandir", scan)
+    assert half_written(tmp_path) == [tmp_path / ".a.png.3.tmp"]
+
+
 @pytest.mark.parametrize("name", [".x.tmp", f".x.{32 * 'a'}.tmp"])
 def test_a_link_to_itself_does_not_stop_the_writing_in_its_folder(tmp_path, name):
     (tmp_path / name).symlink_to(name)
