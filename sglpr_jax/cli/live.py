@@ -40,7 +40,7 @@ class LiveCommand:
     output), `json:FILE`, `dds`, `zenoh`, `ros1`.
 
     The output folder holds the map. A command with the same --out continues it, also after a crash. Ctrl-C or SIGTERM
-    ends the command and writes loops.g2o, loops.csv, rejected.jsonl and trajectory.tum.
+    ends the command and writes loops.g2o, loops.csv, rejected.jsonl, trajectory.tum and trajectory-optimized.tum.
 
     Example:
       bin/live dds --topic /points --odometry-topic /odom --sinks dds json:loops.txt --out map
@@ -122,14 +122,15 @@ def live(command: LiveCommand) -> int:
 
 def _check(command: LiveCommand) -> None:
     """Raises ValueError before any work for an unknown source or sink, or if an input would be overwritten."""
-    from sglpr_jax.live.results import TRAJECTORY
+    from sglpr_jax.live.results import CORRECTED, TRAJECTORY
     from sglpr_jax.live.sinks import SINKS
     from sglpr_jax.live.sources import SOURCES, check_name
 
     check_name(command.source, SOURCES, kind="sources")
     for text in command.sinks:
         check_name(text, SINKS, kind="sinks")
-    if command.poses is not None and command.poses.resolve() == (command.out / TRAJECTORY).resolve():
+    written = [(command.out / name).resolve() for name in (TRAJECTORY, CORRECTED)]
+    if command.poses is not None and command.poses.resolve() in written:
         raise ValueError(
             f"{command.poses}: expected odometry that this run does not overwrite, found an output file; "
             "choose another --out"
@@ -137,6 +138,7 @@ def _check(command: LiveCommand) -> None:
 
 
 def _run(command: LiveCommand) -> int:
+    from sglpr_jax.live.corrected import corrected_trajectory
     from sglpr_jax.live.node import Node
     from sglpr_jax.live.report import Reports
     from sglpr_jax.live.results import write_results
@@ -146,19 +148,20 @@ def _run(command: LiveCommand) -> int:
         found = _map(command, report)
         opened.callback(found.close)
         missed = found.recall()
+        corrected = corrected_trajectory(found, odometry=command.expects_odometry, report=report)
         sinks = [_sink(text, command, report) for text in command.sinks]
         for sink in sinks:
             opened.callback(_closed, sink, report)
         source = _source(command, found, report)
         opened.callback(source.close)
-        node = Node(found, sinks, report=report, say=_say)
+        node = Node(found, sinks, report=report, say=_say, corrected=corrected)
         node.publish(missed)
         _say(f"ready: {command.source}, sinks {', '.join(command.sinks)}, map in {command.out}")
         try:
             node.run(source, should_stop=stop)
         finally:
             _say(str(node))
-            paths = [*write_results(found, command.out), record_command(command, command.out)]
+            paths = [*write_results(found, command.out, corrected=corrected), record_command(command, command.out)]
             _say(f"{command.out}: {', '.join(path.name for path in paths)}")
     return stop.exit_status
 

@@ -39,6 +39,9 @@ class FrameStatus(NamedTuple):
     """Number of stored scans."""
     nbytes: int
     """Memory of the stored scans, in bytes."""
+    map_from_world: Float[np.ndarray, "4 4"] | None = None
+    """Correction of the odometry by all loops so far. None without odometry or gtsam, and while no loop connects the
+    odometry with that before a restart."""
 
 
 class LoopEdge(NamedTuple):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.files import in_short
+from sglpr_jax.live.corrected import CorrectedTrajectory
 from sglpr_jax.live.frame import FrameStatus, LiveFrame, LoopEdge
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.report import Report
@@ -23,7 +24,15 @@ LATEST = 100
 class Node:
     """Takes scans from a source until it ends or `should_stop` is true, and hands the results to the sinks."""
 
-    def __init__(self, live: LiveMap, sinks: Sequence[Sink], *, report: Report, say: Callable[[str], None]):
+    def __init__(
+        self,
+        live: LiveMap,
+        sinks: Sequence[Sink],
+        *,
+        report: Report,
+        say: Callable[[str], None],
+        corrected: CorrectedTrajectory | None = None,
+    ):
         """Connect a map to sinks.
 
         Arguments:
@@ -31,7 +40,9 @@ class Node:
           sinks: Receivers of results.
           report: Function for trouble.
           say: Function for lines about the progress.
+          corrected: Trajectory that is corrected after each scan.
         """
+        self._corrected = corrected
         self._live, self._sinks, self._report, self._say = live, list(sinks), report, say
         self._seconds: deque[float] = deque(maxlen=LATEST)
         self._latest = 0.0
@@ -76,10 +87,12 @@ class Node:
         if edges is None:
             self.left_out += 1
             return
+        self.publish(edges)
+        if self._corrected is not None:
+            self._corrected.update()
         end = time.monotonic()
         self.scans += 1
         self._seconds.append(end - begin)
-        self.publish(edges)
         finder = self._live.detector.finder
         status = FrameStatus(
             frame=len(self._live) - 1,
@@ -89,6 +102,7 @@ class Node:
             dropped=self.dropped,
             places=len(finder.stored),
             nbytes=self._live.detector.nbytes,
+            map_from_world=None if self._corrected is None else self._corrected.map_from_world,
         )
         self._to_sinks("frame", status)
 

@@ -5,14 +5,18 @@ from pathlib import Path
 import numpy as np
 
 from sglpr_jax.files import write_all
+from sglpr_jax.live.corrected import CorrectedTrajectory
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.loops.loop_files import write_joint_g2o, write_loops_csv, write_rejected_jsonl, write_tum
 
-GRAPH, TABLE, REJECTED, TRAJECTORY = "loops.g2o", "loops.csv", "rejected.jsonl", "trajectory.tum"
+GRAPH, TABLE, REJECTED = "loops.g2o", "loops.csv", "rejected.jsonl"
+TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"
 
 
-def write_results(live: LiveMap, folder: Path) -> list[Path]:
+def write_results(live: LiveMap, folder: Path, *, corrected: CorrectedTrajectory | None = None) -> list[Path]:
     """Write the loops as g2o and csv, the rejected pairs, and the odometry as tum, if there is any.
+
+    With `corrected`, write its trajectory, too, without parts that no loop connects with the first one.
 
     The graph has no edge between scans whose motion is unknown, as before and after a restart. Returns the paths.
     Raises WriteError if a file cannot be written.
@@ -29,4 +33,7 @@ def write_results(live: LiveMap, folder: Path) -> list[Path]:
     }
     if len(odometry):
         files[TRAJECTORY] = lambda path: write_tum(path, odometry, live.stamps)
+    if len(odometry) and corrected is not None:
+        known = np.isfinite(poses := corrected.poses).all(axis=(1, 2))
+        files[CORRECTED] = lambda path: write_tum(path, poses[known], live.stamps[known])
     return write_all(folder, files)

@@ -112,7 +112,7 @@ def optimized(
     Raises:
       ImportError: If the extra `gtsam` is not installed.
     """
-    gtsam, rules = _library(), {"drift": drift, "mounting": mounting, "starts": starts}
+    gtsam, rules = gtsam_library(), {"drift": drift, "mounting": mounting, "starts": starts}
     used = _contradictions(loops, odometry, **rules) <= drift.max_deviation
     for _ in range(ROUNDS):
         if not used.any():
@@ -151,7 +151,7 @@ def _solved(
         graph.add(gtsam.BetweenFactorPose3(frame, frame + 1, gtsam.Pose3(pose), noise))
     certain = graph.size()
     for loop in loops:
-        noise = gtsam.noiseModel.Gaussian.Covariance(_rotation_first(loop.covariance))
+        noise = gtsam.noiseModel.Gaussian.Covariance(rotation_first(loop.covariance))
         graph.add(gtsam.BetweenFactorPose3(loop.match, loop.query, gtsam.Pose3(loop.match_from_query), noise))
     options = gtsam.GncLMParams()
     options.setKnownInliers(list(range(certain)))
@@ -206,18 +206,19 @@ def trajectory_error(poses: Float[np.ndarray, "n 4 4"], positions: Float[np.ndar
     return float(np.sqrt(np.square(found @ (left @ flip @ right) - true).sum(axis=1).mean()))
 
 
-def _rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Covariance with rotation before translation, as in gtsam."""
+def rotation_first(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance with rotation before translation, as in gtsam."""
     order = np.array([3, 4, 5, 0, 1, 2])
     return covariance[np.ix_(order, order)]
 
 
 def check_installed() -> None:
     """Raises ImportError if the extra `gtsam` is not installed."""
-    _library()
+    gtsam_library()
 
 
-def _library() -> ModuleType:
+def gtsam_library() -> ModuleType:
+    """Import gtsam. Raises ImportError if the extra `gtsam` is not installed."""
     try:
         return importlib.import_module("gtsam")
     except ImportError as error:

@@ -8,6 +8,8 @@ import json
 import sys
 import time
 
+import numpy as np
+
 from sglpr_jax.live.frame import FrameStatus
 from sglpr_jax.live.sinks import SinkOptions, open_sink
 from sglpr_jax.live.sources import SourceOptions, open_source
@@ -36,7 +38,7 @@ def sink() -> dict:
     for query in range(3):
         found.loop(edge()._replace(query=query))
     for frame in itertools.count():
-        found.frame(FrameStatus(frame, 50.0, 0.01, 0.02, 0, 5, 100))
+        found.frame(FrameStatus(frame, 50.0, 0.01, 0.02, 0, 5, 100, np.eye(4)))
         time.sleep(0.05)
     raise AssertionError
 

@@ -6,6 +6,8 @@ import os
 import numpy as np
 import pytest
 
+from sglpr_jax.data.formats.pose_files import read_tum
+from sglpr_jax.live.corrected import CorrectedTrajectory
 from sglpr_jax.live.live_map import JOURNAL, LOOPS, LiveMap
 from sglpr_jax.live.results import write_results
 from sglpr_jax.loops.config import DetectorConfig
@@ -76,16 +78,24 @@ def test_loops_to_scans_before_a_restart_are_found_though_the_odometry_began_aga
     live = opened(params, tmp_path, said)
     assert live.recall() == [] and len(live) == HALF
     edges, again = [], inverse(poses[HALF]) @ poses[HALF:]
+    corrected = CorrectedTrajectory(live)
+    assert corrected.map_from_world is None
     for i, pose in enumerate(again, HALF):
         edges += live.add(live_frame(drive, i, pose=pose, received=float(drive.times[i]) + 1e9))
+        corrected.update()
     assert ("restart", "the odometry is taken as unknown, and begins in a frame of its own after the restart") in said
     across = [edge for edge in edges if edge.match < HALF]
     assert len(across) > 3
     for edge in across:
         assert np.linalg.norm(drive.positions[edge.query] - drive.positions[edge.match]) < 12
         assert edge.world_from_match is None and np.array_equal(edge.world_from_query, again[edge.query - HALF])
-    paths = {path.name for path in write_results(live, tmp_path)}
-    assert paths == {"loops.g2o", "loops.csv", "rejected.jsonl", "trajectory.tum"}
+    apart = np.linalg.norm(corrected.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
+    assert apart[:HALF].max() < 1 and apart[HALF:].max() < 5
+    np.testing.assert_allclose(corrected.map_from_world @ again[-1], corrected.poses[-1], atol=1e-9)
+    paths = {path.name for path in write_results(live, tmp_path, corrected=corrected)}
+    tables = {"loops.g2o", "loops.csv", "rejected.jsonl"}
+    assert paths == {*tables, "trajectory.tum", "trajectory-optimized.tum"}
+    assert len(read_tum(tmp_path / "trajectory-optimized.tum")[0]) == len(live)
     steps = [line.split()[1:3] for line in (tmp_path / "loops.g2o").read_text().splitlines() if line.startswith("EDGE")]
     assert [str(HALF - 1), str(HALF)] not in steps and [str(HALF), str(HALF + 1)] in steps
     live.close()

@@ -150,11 +150,14 @@ def test_the_node_runs_until_ros_ends(package, said, tmp_path, monkeypatch):
     def should_stop() -> bool:
         sent = len(wire.sent)
         if sent < 2:
+            for seconds in (12.4 + sent, 12.6 + sent):
+                wire.receive["/odom"](received(ODOMETRY, odometry(seconds, (seconds, 0, 0), child="lidar")))
             wire.receive["/points"](received(CLOUD, cloud(12.5 + sent, np.tile(POINTS, (9, 1)))))
         assert time.monotonic() - begun < 60
         return sent == 2
 
-    values = {**package.parameters.defaults(), "out": str(tmp_path / "map"), "weights": "circular"}
+    given = {"out": str(tmp_path / "map"), "weights": "circular", "odometry_topic": "/odom"}
+    values = {**package.parameters.defaults(), **given}
     command = package.parameters.command_of(values)
     package.node.run(command, lambda: wire, said, say=lines.append, should_stop=should_stop)
     assert [topic for topic, *_ in wire.sent] == ["/tf", "/tf"]

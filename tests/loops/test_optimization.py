@@ -15,94 +15,60 @@ from sglpr_jax.loops.loop_files import read_g2o, write_g2o
 from sglpr_jax.loops.optimization import MOST_RISEN_M, optimize_trajectory, optimized, trajectory_error
 from sglpr_jax.loops.transforms import from_quaternions, inverse, transform
 
-FRAMES = 120
-COVARIANCE = np.diag([0.1, 0.1, 0.5, *np.radians([2, 2, 0.3])]) ** 2
+from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
 
 
-@pytest.fixture(scope="module")
-def twice_around() -> np.ndarray:
-    """True poses on an ellipse that is driven around twice, up and down a hill."""
-    angle = np.linspace(0, 4 * np.pi, FRAMES)
-    yaw = np.arctan2(60 * np.cos(angle), -90 * np.sin(angle))
-    poses = np.stack([transform(90 * np.cos(a), 60 * np.sin(a), y) for a, y in zip(angle, yaw, strict=True)])
-    poses[:, 2, 3] = 3 * np.sin(angle)
-    return poses
-
-
-@pytest.fixture(scope="module")
-def odometry(twice_around) -> np.ndarray:
-    """1 % too long, turned by half a degree a frame, with noise."""
-    rng = np.random.default_rng(0)
-    steps = inverse(twice_around[:-1]) @ twice_around[1:]
-    found = [twice_around[0]]
-    for step in steps:
-        noise = np.eye(4)
-        noise[:3, :3] = Rotation.from_rotvec(np.radians([0, 0, 0.05]) + rng.normal(scale=1e-3, size=3)).as_matrix()
-        noise[:3, 3] = 0.01 * step[:3, 3]
-        found.append(found[-1] @ step @ noise)
-    return np.stack(found)
-
-
-@pytest.fixture(scope="module")
-def loops(twice_around) -> tuple[Loop, ...]:
-    """The second time around sees the first, to a decimetre."""
-    rng = np.random.default_rng(1)
-    found = []
-    for query in range(64, FRAMES, 4):
-        match = int(np.linalg.norm(twice_around[:50, :3, 3] - twice_around[query, :3, 3], axis=1).argmin())
-        pose = inverse(twice_around[match]) @ twice_around[query] @ transform(*rng.normal(scale=0.05, size=2), 0.002)
-        found.append(Loop(query, match, pose, COVARIANCE, 0.99))
-    return tuple(found)
-
-
-def test_the_error_of_a_drifted_drive_falls(twice_around, odometry, loops):
-    true = twice_around[:, :3, 3]
-    before = trajectory_error(odometry, true)
-    found = optimized(odometry, loops)
-    assert found.inliers.all() and len(found.inliers) == len(loops)
+def test_the_error_of_a_drifted_drive_falls(two_laps, two_laps_odometry, second_lap_loops):
+    true = two_laps[:, :3, 3]
+    before = trajectory_error(two_laps_odometry, true)
+    found = optimized(two_laps_odometry, second_lap_loops)
+    assert found.inliers.all() and len(found.inliers) == len(second_lap_loops)
     assert before > 2 and trajectory_error(found.poses, true) < 0.4 * before
-    np.testing.assert_allclose(found.poses[0], odometry[0], atol=1e-6)
-    for loop in loops:
+    np.testing.assert_allclose(found.poses[0], two_laps_odometry[0], atol=1e-6)
+    for loop in second_lap_loops:
         error = inverse(inverse(found.poses[loop.match]) @ found.poses[loop.query]) @ loop.match_from_query
         assert np.linalg.norm(error[:3, 3]) < 1
 
 
-def test_wrong_loops_do_not_bend_it(twice_around, odometry, loops):
-    true = twice_around[:, :3, 3]
-    wrong = tuple(Loop(100 + k, 20 + k, transform(1.0, 0.0, 0.1), COVARIANCE, 1.0) for k in range(3))
-    found = optimized(odometry, (*wrong, *loops))
+def test_wrong_loops_do_not_bend_it(two_laps, two_laps_odometry, second_lap_loops):
+    true = two_laps[:, :3, 3]
+    wrong = tuple(Loop(100 + k, 20 + k, transform(1.0, 0.0, 0.1), LOOP_COVARIANCE, 1.0) for k in range(3))
+    found = optimized(two_laps_odometry, (*wrong, *second_lap_loops))
     assert not found.inliers[:3].any() and found.inliers[3:].all()
     assert trajectory_error(found.poses, true) == pytest.approx(
-        trajectory_error(optimized(odometry, loops).poses, true), abs=0.05
+        trajectory_error(optimized(two_laps_odometry, second_lap_loops).poses, true), abs=0.05
     )
 
 
-def test_of_a_recording_the_frames_that_were_looked_at(odometry, loops, tmp_path, monkeypatch):
-    images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(FRAMES)}
-    early = tuple(loop for loop in loops if loop.query < 90)
-    found = FoundLoops(of_images(images), 90, early, (), odometry)
+def test_of_a_recording_the_frames_that_were_looked_at(two_laps_odometry, second_lap_loops, tmp_path, monkeypatch):
+    images = {tmp_path / f"{i:06d}.png": np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
+    early = tuple(loop for loop in second_lap_loops if loop.query < 90)
+    found = FoundLoops(of_images(images), 90, early, (), two_laps_odometry)
     corrected = optimize_trajectory(found)
     assert corrected.poses.shape == (90, 4, 4)
-    np.testing.assert_array_equal(corrected.poses, optimized(odometry[:90], early).poses)
-    with pytest.raises(ValueError, match="08: expected loops found with odometry, found loops without it"):
+    np.testing.assert_array_equal(corrected.poses, optimized(two_laps_odometry[:90], early).poses)
+    with pytest.raises(
+        ValueError,
+        match="08: expected loops found with odometry, found loops without it",
+    ):
         optimize_trajectory(FoundLoops(of_images(images), 90, early, (), None))
-    none = optimize_trajectory(FoundLoops(of_images(images), 90, (), (), odometry))
-    np.testing.assert_array_equal(none.poses, odometry[:90])
+    none = optimize_trajectory(FoundLoops(of_images(images), 90, (), (), two_laps_odometry))
+    np.testing.assert_array_equal(none.poses, two_laps_odometry[:90])
     assert none.inliers.shape == (0,)
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(ImportError, match=r"gtsam: pip install 'sglpr-jax\[gtsam\]'"):
         optimize_trajectory(found)
 
 
-def test_gtsam_reads_the_graph_that_we_write(odometry, loops, tmp_path):
+def test_gtsam_reads_the_graph_that_we_write(two_laps_odometry, second_lap_loops, tmp_path):
     import gtsam
 
     path = tmp_path / "loops.g2o"
-    write_g2o(path, loops, odometry)
+    write_g2o(path, second_lap_loops, two_laps_odometry)
     graph, start = gtsam.readG2o(str(path), True)
-    assert start.size() == FRAMES and graph.size() == FRAMES - 1 + len(loops)
-    read = np.stack([start.atPose3(frame).matrix() for frame in range(FRAMES)])
-    np.testing.assert_allclose(read, odometry, atol=1e-5)
+    assert start.size() == LAPS_FRAMES and graph.size() == LAPS_FRAMES - 1 + len(second_lap_loops)
+    read = np.stack([start.atPose3(frame).matrix() for frame in range(LAPS_FRAMES)])
+    np.testing.assert_allclose(read, two_laps_odometry, atol=1e-5)
     ours = read_g2o(path)
     for k, (first, second, pose, information) in enumerate(ours.edges):
         factor = graph.at(k)
@@ -124,11 +90,11 @@ def test_the_error_does_not_mind_where_a_trajectory_lies():
     assert trajectory_error(from_quaternions(true + noise, rotations), true) == pytest.approx(np.sqrt(3), rel=0.15)
 
 
-def test_heights_that_move_by_metres_are_told(twice_around, odometry, loops):
-    images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(FRAMES)}
-    low = odometry.copy()
-    low[:, 2, 3] -= 0.06 * np.arange(FRAMES)  # odometry that sinks, which loops of known heights correct
-    moved = FoundLoops(of_images(images), FRAMES, loops, (), low)
+def test_heights_that_move_by_metres_are_told(two_laps, two_laps_odometry, second_lap_loops):
+    images = {Path(f"{i:06d}.png"): np.zeros((4, 4), np.float32) for i in range(LAPS_FRAMES)}
+    low = two_laps_odometry.copy()
+    low[:, 2, 3] -= 0.06 * np.arange(LAPS_FRAMES)  # odometry that sinks, which loops of known heights correct
+    moved = FoundLoops(of_images(images), LAPS_FRAMES, second_lap_loops, (), low)
     with pytest.warns(DataWarning, match="08: expected heights near those of the odometry, found them moved by"):
         corrected = optimize_trajectory(moved)
     assert np.abs(corrected.poses[:, 2, 3] - low[:, 2, 3]).max() > MOST_RISEN_M

@@ -9,6 +9,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 
 from sglpr_jax.cli.live import LiveCommand
+from sglpr_jax.live.corrected import corrected_trajectory
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.node import Node
 from sglpr_jax.live.report import Report, Reports
@@ -57,14 +58,15 @@ def run(
         missed = found.recall()
         source = RosSource(connect(), options, report)
         opened.callback(source.close)
-        node = Node(found, [sink], report=report, say=say)
+        corrected = corrected_trajectory(found, odometry=command.expects_odometry, report=report)
+        node = Node(found, [sink], report=report, say=say, corrected=corrected)
         node.publish(missed)
         say(f"ready: {source.topic}, map in {command.out}")
         try:
             node.run(source, should_stop=should_stop)
         finally:
             say(str(node))
-            write_results(found, command.out)
+            write_results(found, command.out, corrected=corrected)
 
 
 def _map(command: LiveCommand, report: Report) -> LiveMap:
