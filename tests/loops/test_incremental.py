@@ -77,13 +77,16 @@ def test_loops_of_an_unconnected_part_are_used_once_it_is_connected(two_laps_odo
     assert np.abs(with_loops.poses - without.poses).max() > 1e-4
 
 
-def test_loops_close_to_each_other_are_thinned():
-    step = 0.5 * LOOP_EVERY_M / 2
-    odometry = np.stack([transform(step * i, 0.0, 0.0) for i in range(40)])
-    found = [Loop(i, i - 20, transform(20 * step + 0.3, 0.0, 0.0), LOOP_COVARIANCE, 0.99) for i in range(20, 40)]
-    few = [loop for loop in found if (loop.query - 20) % 4 == 0]
-    np.testing.assert_allclose(driven(odometry, found).poses, driven(odometry, few).poses, atol=1e-9)
-    assert len(driven(odometry, found)) == 40
+def test_a_route_driven_again_and_again_needs_few_loops():
+    laps, steps = 4, 40
+    angle = np.linspace(0, 2 * np.pi * laps, laps * steps, endpoint=False)
+    poses = np.stack([transform(40 * np.sin(a), 40 - 40 * np.cos(a), a) for a in angle])
+    found = [Loop(i, i - steps, np.eye(4), LOOP_COVARIANCE, 0.99) for i in range(steps, len(poses))]
+    trajectory = driven(poses, found)
+    np.testing.assert_allclose(trajectory.poses, poses, atol=1e-4)
+    loops = trajectory._solver.getFactorsUnsafe().size() - len(trajectory._nodes)
+    travelled = 3 * 2 * np.pi * 40
+    assert travelled / LOOP_EVERY_M - 2 <= loops <= travelled / LOOP_EVERY_M + 1
 
 
 def test_without_gtsam_the_extra_is_named(monkeypatch):
