@@ -48,9 +48,9 @@ from .labels import to_classes as to_classes
 from .loops.detector import LoopDetector as LoopDetector
 from .loops.find import find_loops as find_loops
 from .loops.find_between import find_loops_between as find_loops_between
+from .loops.incremental import IncrementalTrajectory as IncrementalTrajectory
 from .loops.loop import Loop as Loop
 from .loops.odometry import read_odometry as read_odometry
-from .loops.incremental import IncrementalTrajectory as IncrementalTrajectory
 from .loops.optimization import optimize_trajectory as optimize_trajectory
 from .loops.places import PlaceMap as PlaceMap
 from .loops.scan_odometry import scan_odometry as scan_odometry

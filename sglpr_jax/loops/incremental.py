@@ -26,7 +26,7 @@ LOOP_EVERY_M = 50.0
 """Minimum travelled distance between two loops in the graph that agree with it, in metres. It limits the growth of time
 and memory on routes that are driven again and again."""
 AGREES = 4.0
-"""Maximum residual of a loop that agrees with the graph, in standard deviations. With right covariances, 99 % have less."""
+"""Maximum residual of a loop that agrees with the graph, in standard deviations. Of right loops, 99 % have less."""
 RELINEARIZE = 0.1
 """Change of a pose after which its factors are linearised again, in metres and radians."""
 
