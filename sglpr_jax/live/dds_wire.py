@@ -135,7 +135,10 @@ class DdsWire:
     def _run(self) -> None:
         looked = time.monotonic()
         while not self._closed.is_set():
-            self._waiting.wait(duration(milliseconds=100))
+            if self._readers:
+                self._waiting.wait(duration(milliseconds=100))
+            else:  # the wait of cyclonedds returns at once if nothing is attached, and this loop would use a core
+                self._closed.wait(0.1)
             for one in tuple(self._readers):
                 self._take(one)
             if time.monotonic() - looked > LOOK_S:

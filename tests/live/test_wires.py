@@ -153,6 +153,16 @@ def test_edges_reach_a_subscriber_that_comes_later_over_dds(domain, said):
     assert len(found) == 1 and not said
 
 
+def test_a_connection_that_only_publishes_does_not_use_a_core(domain, said):
+    wire = DdsWire(int(domain), said)
+    waits = []
+    wire._waiting.wait = lambda timeout: waits.append(timeout) or 0  # pyright: ignore
+    wire.advertise("/points", CLOUD, depth=1, latched=False)
+    time.sleep(0.3)
+    wire.close()
+    assert waits == []  # cyclonedds returns from it at once, so that the thread would call it all the time
+
+
 def test_a_subscriber_with_another_qos_is_reported(domain, said):
     sink = open_sink(f"dds:{domain}", SinkOptions(), said)
     other = DdsWire(int(domain), Said())
