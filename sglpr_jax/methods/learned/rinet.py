@@ -3,9 +3,9 @@
 Published recipe: Adam at 0.02 with weight decay 1e-6, 1024 pairs a step, 20 epochs, one negative for each positive of a
 soft label above 0.1, scans with themselves included. Half of the pairs lose up to 60 neighbouring columns of each scan.
 
-Recipe here: the same optimiser and loss, and 512 tuples of one positive and one negative a step, that is 1024 pairs. Half
-of the positives come from another visit, and each scan has its own draw of the lost columns. Scans are not paired with
-themselves. Trained from scratch, as published.
+Recipe here: the same optimiser and loss, and 512 tuples of one positive and one negative a step, that is 1024 pairs.
+Half of the positives come from another visit, and each scan has its own draw of the lost columns. Scans are not paired
+with themselves. Trained from scratch, as published.
 """
 
 import jax
