@@ -1,13 +1,10 @@
 """Checks that a recording contains what a method needs."""
 
-from typing import Literal
-
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.methods.method import Takes
 
 
-def require_content(
-    name: str, takes: Literal["images", "points", "labelled points"], recording: Recording, *, every_label: bool = False
-) -> None:
+def require_content(name: str, takes: Takes, recording: Recording, *, every_label: bool = False) -> None:
     """Raise ValueError, in one line, if a recording lacks the points or labels of the method called `name`.
 
     Arguments:
