@@ -63,7 +63,7 @@ def distance_function(name: str) -> DistanceFn:
 
     Raises:
       FileNotFoundError: If the weights of a learned distance do not exist.
-      ValueError: If the name is unknown, with all names and the nearest one, or if the weights are not those of the name.
+      ValueError: If the name is unknown, with all names and the nearest one, or if the weights have changed.
     """
     if name.partition(":")[0] in LEARNED_NAMES:
         return _learned(name)

@@ -1,7 +1,7 @@
 """Distances of the descriptors of learned methods, for arrays of any size.
 
-A descriptor file states a learned distance as `METHOD:WEIGHTS#HASH`: the folder of the weights, or `random:SEED`, and the
-beginning of their hash. The distance can be computed as long as this folder holds these weights.
+A descriptor file states a learned distance as `METHOD:WEIGHTS#HASH`: the folder of the weights, or `random:SEED`, and
+the beginning of their hash. The distance can be computed as long as this folder holds these weights.
 """
 
 import functools
@@ -44,7 +44,7 @@ def learned_distance(method: LearnedMethod, variables: Variables) -> DistanceFn:
 
 
 def stated_distance(method: str, weights: str, hashed: str) -> str:
-    """Return the name of a learned distance. Folders become absolute, so that the name holds everywhere on a machine."""
+    """Return the name of a learned distance. Folders become absolute, for other working folders."""
     where = weights if weights.startswith(RANDOM) else str(Path(weights).absolute())
     return f"{method}:{where}#{hashed[:HASHED]}"
 
