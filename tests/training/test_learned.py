@@ -241,14 +241,14 @@ def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, sampling):
 
 
 def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(data, tmp_path):
-    train_learned(TINY, data, settings(images=30), tmp_path)
+    train_learned(TINY, data, settings(images=40), tmp_path)
     with pytest.raises(FileExistsError, match="there is a run already"):
-        train_learned(TINY, data, settings(images=30), tmp_path)
+        train_learned(TINY, data, settings(images=40), tmp_path)
     with pytest.raises(ValueError, match=r"found others: settings\.seed"):
         train_learned(TINY, data, settings(seed=1), tmp_path, resume=True)
     with pytest.raises(FileNotFoundError, match="expected a run to resume"):
         train_learned(TINY, data, settings(), tmp_path / "none", resume=True)
-    assert train_learned(TINY, data, settings(images=60), tmp_path, resume=True).images == 60
+    assert train_learned(TINY, data, settings(images=80), tmp_path, resume=True).images == 80
 
 
 def test_the_time_ends_a_run(data, tmp_path):
