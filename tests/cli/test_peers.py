@@ -113,6 +113,22 @@ def test_unfitting_data_are_errors(images, town, tmp_path):
     assert_one_line_error(run_command("peers", "train"), "expected bin/peers train METHOD DATA... --out RUN")
 
 
+@pytest.mark.slow
+def test_rates_and_snapshots_are_scored_on_a_held_out_recording(town, tmp_path):
+    data, held_out, out = (tmp_path / name for name in ("data", "held-out", "run"))
+    for root, name in ((data, "00"), (data, "05"), (held_out, "08")):
+        shutil.copytree(town / "sequences" / name, root / "sequences" / name)
+    options = ("--out", out, "--images", 2000, "--search-seconds", 0.1, "--held-out", held_out)
+    ended = run_command("peers", "train", "rinet", data, *options)
+    assert ended.status == 0, ended.error
+    rates = json.loads((out / "rates" / "rates.json").read_text())
+    assert set(rates["recall_at_1"]) == {"0.002", "0.02", "0.06"}
+    assert json.loads((out / "config.json").read_text())["settings"]["learning_rate"] == rates["best"]
+    scores = read_metrics(out / "scores.jsonl")
+    assert [line["images"] for line in scores] == [1536, 3072]
+    assert all(0 <= line["recall_at_1 08"] == line["recall_at_1"] <= 1 for line in scores)
+
+
 def test_the_list_has_every_method(command):
     ended = command("peers", "list")
     assert ended.status == 0 and "98,765" in ended.out

@@ -113,6 +113,8 @@ def _identity(method: LearnedMethod, recording: Recording) -> str:
     files = [(str(path.absolute()), _stamp(path)) for path in paths]
     mountings = [str(recording.mounting_of(row)) for row in range(len(recording))]
     source = [method.name, _code(method), recording.name, recording.read_options, files, mountings]
+    if not recording.on_disk and recording.positions is not None:  # a simulated recording has no files
+        source.append(recording.positions.tolist())
     return hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
 
 
