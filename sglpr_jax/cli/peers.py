@@ -53,7 +53,7 @@ class PeersCommand:
     learning_rate: Positive | None = None
     """Learning rate. None: the best of three short trainings with --held-out, otherwise the published rate."""
     held_out: Path | None = None
-    """Dataset with revisits, none of which is trained on. The learning rates and the snapshots are scored on it."""
+    """Dataset with revisits that is not trained on. The learning rates and the snapshots are scored on it."""
     search_seconds: Positive = 300.0
     """Training time of each learning rate of the search, in seconds."""
     cache: Path | None = None
