@@ -90,10 +90,10 @@ def leave_one_out(
     return recordings, test
 
 
-def all_recordings(root: Path, **options: Any) -> list[Recording]:
-    """Return all recordings of a second training dataset, and describe them on stderr."""
+def all_recordings(root: Path, *, title: str = "also training on", **options: Any) -> list[Recording]:
+    """Return all recordings of a dataset, and describe them on stderr after `title`."""
     recordings = split.all_recordings(root, **options)
-    print(f"also training on {', '.join(recording.name for recording in recordings)} of {root}", file=sys.stderr)
+    print(f"{title} {', '.join(recording.name for recording in recordings)} of {root}", file=sys.stderr)
     _describe(recordings)
     return recordings
 

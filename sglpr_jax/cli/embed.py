@@ -1,7 +1,9 @@
 """bin/embed: write the descriptors of a sequence or of a folder of scans."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -9,7 +11,11 @@ from sglpr_jax.cli.recording import OdometrySubmapOptions, PosedRecordingOptions
 from sglpr_jax.cli.runtime import parse_command, progress_bar, run
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import CountOrNone, Size
-from sglpr_jax.methods.names import NETWORK, MethodName
+from sglpr_jax.methods.names import LEARNED_NAMES, NETWORK, AnyMethodName
+
+if TYPE_CHECKING:
+    from sglpr_jax.data import Recording
+    from sglpr_jax.methods.method import Method
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +28,7 @@ class EmbedCommand:
       bin/embed --data my_scans/ --poses odometry.tum --out mine.npz
       bin/embed --data my_scans/ --submap-m 10 --odometry odometry.tum --out mine.npz
       bin/embed --method scan-context --data KITTI --seq 08 --out scan-context.npz
+      bin/embed --method rinet --weights runs/rinet/weights-8000 --data KITTI --seq 08 --out rinet.npz
       bin/embed --data my_scans/ --site berlin --out s3://bucket/places
     """
 
@@ -32,9 +39,10 @@ class EmbedCommand:
     a folder with a / at the end. A store gets a Parquet file for each recording, unless it is there already."""
     weights: str | None = None
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors. None: the
-    shipped weights sglpr."""
-    method: MethodName = "sglpr"
-    """The network, or a handcrafted method, which needs no weights. Some methods need points; ssc also needs labels."""
+    shipped weights sglpr. Learned methods need a folder of bin/peers, or random:SEED for an untrained network."""
+    method: AnyMethodName = "sglpr"
+    """The network, a handcrafted method, which needs no weights, or a learned method of another publication. Some
+    methods need points; ssc and rinet also need labels."""
     source: tyro.conf.OmitArgPrefixes[PosedRecordingOptions] = PosedRecordingOptions()
     submap: tyro.conf.OmitArgPrefixes[OdometrySubmapOptions] = OdometrySubmapOptions()
     scale: ScaleChoice = 1
@@ -55,20 +63,17 @@ class EmbedCommand:
 def embed_recording(command: EmbedCommand) -> str:
     """Run the command. Returns the path of the descriptor file, or the address of the file in the store."""
     from sglpr_jax.data.scaled import scaled  # slow imports, not needed for --help
-    from sglpr_jax.methods.registry import method_named
-    from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.embed import embed
     from sglpr_jax.retrieval.place_store import embed_to_store
 
-    if command.weights is not None and command.method != NETWORK:
-        raise ValueError(f"{command.weights}: expected --method {NETWORK} with --weights, found {command.method}")
+    _check_weights(command)
     in_store = "://" in command.out or command.out.endswith("/")
     if not in_store:
         _check_file(command)
-    params = None if command.weights is None else load(command.weights)
+    make = _method(command)
     recording = command.submap.open(command.source, command.data)
     recording = scaled(recording, resolved_scale(command.scale, recording))
-    method = method_named(command.method, params, recording)
+    method = make(recording)
     with progress_bar(f"embed {recording.name}", len(recording)) as show:
         options = {
             "rotation_seed": command.seed if command.rotate else None,
@@ -88,6 +93,33 @@ def embed_recording(command: EmbedCommand) -> str:
     skipped = len(recording) - len(file)
     print(f"{command.out}: {len(file)} descriptors of {file.descriptors.shape[1]} numbers, {skipped} scans skipped")
     return command.out
+
+
+def _check_weights(command: EmbedCommand) -> None:
+    """Raise ValueError if a handcrafted method has weights, or a learned method has none."""
+    if command.method in LEARNED_NAMES and command.weights is None:
+        raise ValueError(
+            f"{command.method}: expected --weights with a folder of bin/peers train, or random:0 for an untrained "
+            "network, found none"
+        )
+    if command.weights is not None and command.method not in (NETWORK, *LEARNED_NAMES):
+        raise ValueError(
+            f"{command.weights}: expected --method {' or '.join((NETWORK, *LEARNED_NAMES))} with --weights, "
+            f"found {command.method}"
+        )
+
+
+def _method(command: EmbedCommand) -> "Callable[[Recording], Method]":
+    """Load the weights. Returns a function that makes the method for a recording."""
+    from sglpr_jax.methods.learned import LEARNED
+    from sglpr_jax.methods.registry import method_named, trained_method
+    from sglpr_jax.models.weights_file import load
+
+    if command.weights is not None and command.method in LEARNED:
+        trained = trained_method(LEARNED[command.method], command.weights)
+        return lambda recording: trained
+    params = None if command.weights is None else load(command.weights)
+    return lambda recording: method_named(command.method, params, recording)
 
 
 def _check_file(command: EmbedCommand) -> None:

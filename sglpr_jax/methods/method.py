@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
+from sglpr_jax.data.record import Record
 from sglpr_jax.grid import Grid, ImageKind
 
+Takes = Literal["images", "points", "labelled points"]
+"""Input of a method."""
 DescribeFn = Callable[..., Float[Any, "b d"]]
 """Maps images of point counts (b, h, w), and maps of classes (b, h, w) if requested, to one descriptor each."""
 DescribeScanFn = Callable[[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"] | None], Float32[np.ndarray, " d"]]
@@ -25,7 +28,7 @@ class HandcraftedMethod:
     """Name on the command line."""
     source: str
     """Publication of the method."""
-    takes: Literal["images", "points", "labelled points"]
+    takes: Takes
     """Input: images (n, h, w), described as (n, d), or the points (n, 3) of one scan, described as (d,). Labelled
     points have classes (n,)."""
     describe: Callable[..., Float32[np.ndarray, "..."]]
@@ -71,5 +74,20 @@ class ScanMethod:
     weights_hash: str = ""
 
 
-Method = ImageMethod | ScanMethod
+@dataclass(frozen=True)
+class RecordMethod:
+    """A learned method of another publication: it prepares the input of each record and describes inputs in batches."""
+
+    prepare: Callable[[Record], Shaped[np.ndarray, "..."]]
+    describe: Callable[[Shaped[np.ndarray, "b ..."]], Float[Any, "b d"]]
+    takes: Takes
+    """Content that `prepare` needs. Methods that take images accept ready-made images and scans."""
+    distance: str
+    """Name of a distance in `retrieval.distances`. A learned distance also names its weights."""
+    about: dict[str, Any]
+    """Description of the method, as JSON values."""
+    weights_hash: str
+
+
+Method = ImageMethod | ScanMethod | RecordMethod
 """A method that `retrieval.embed` accepts."""

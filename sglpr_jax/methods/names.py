@@ -15,7 +15,9 @@ HANDCRAFTED_NAMES = (
     "random",
 )
 METHODS = (NETWORK, *HANDCRAFTED_NAMES)
-"""Names of all methods."""
+"""Names of the methods that need no trained weights of their own, or have shipped ones."""
+LEARNED_NAMES = ("rinet",)
+"""Names of the networks of other publications. Their weights are trained by the user."""
 UNTRAINED, SHIPPED = "untrained", "shipped"
 """Methods for comparison with a newly trained network: the same network with random weights, and the default
 weights."""
@@ -23,8 +25,10 @@ BESIDE = (UNTRAINED, "thumbnail", "polar-fft")
 """Default methods for comparison with a newly trained network."""
 
 if TYPE_CHECKING:
-    MethodName = BesideName = str
+    MethodName = BesideName = LearnedName = AnyMethodName = str
 else:
     MethodName = Literal[METHODS]
     BesideName = Literal[(UNTRAINED, SHIPPED, *HANDCRAFTED_NAMES)]
+    LearnedName = Literal[LEARNED_NAMES]
+    AnyMethodName = Literal[(*METHODS, *LEARNED_NAMES)]
 """One of these names. Command lines list them in the help and reject others."""

@@ -10,7 +10,11 @@ import numpy as np
 from sglpr_jax.data import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, ScanMethod
+from sglpr_jax.methods.learned.describe import apply_network
+from sglpr_jax.methods.learned.distance import stated_distance
+from sglpr_jax.methods.learned.method import LearnedMethod
+from sglpr_jax.methods.learned.weights_file import load_variables, variables_hash
+from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, RecordMethod, ScanMethod
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
@@ -49,6 +53,27 @@ def method_beside(trained: Params, name: str, recording: Recording, *, seed: int
     if name == SHIPPED:
         return network(load(DEFAULT_WEIGHTS))
     return handcrafted(name, recording, trained.config.grid)
+
+
+def trained_method(method: LearnedMethod, weights: str) -> RecordMethod:
+    """Return a learned method with weights of `bin/peers train`.
+
+    Arguments:
+      method: Method, from `LEARNED`.
+      weights: Folder of weights or of a run, or `random:SEED` for an untrained network.
+
+    Raises the errors of `load_variables`.
+    """
+    variables = load_variables(weights, method)
+    hashed = variables_hash(variables)
+    return RecordMethod(
+        prepare=method.prepare,
+        describe=functools.partial(apply_network, variables, method=method),
+        takes=method.takes,
+        distance="l2" if method.compare is None else stated_distance(method.name, weights, hashed),
+        about={"method": method.name, "weights": weights},
+        weights_hash=hashed,
+    )
 
 
 def network(params: Params) -> ImageMethod:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32, Int
 
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import DistanceFn
+from sglpr_jax.methods.names import LEARNED_NAMES
 from sglpr_jax.methods.pairwise import in_blocks
 
 BLOCK = 1024
@@ -58,9 +59,23 @@ DISTANCES: dict[str, DistanceFn] = {
 
 
 def distance_function(name: str) -> DistanceFn:
-    """Return the distance called `name`. For an unknown name, ValueError contains all names and the nearest one."""
+    """Return the distance called `name`, or the learned distance of the weights that `name` states.
+
+    Raises:
+      FileNotFoundError: If the weights of a learned distance do not exist.
+      ValueError: If the name is unknown, with all names and the nearest one, or if the weights have changed.
+    """
+    if name.partition(":")[0] in LEARNED_NAMES:
+        return _learned(name)
     if name not in DISTANCES:
         near = difflib.get_close_matches(name, DISTANCES, n=1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise ValueError(f"expected a distance among {', '.join(DISTANCES)}, found {name!r:.60}{hint}")
     return DISTANCES[name]
+
+
+def _learned(name: str) -> DistanceFn:
+    from sglpr_jax.methods.learned import LEARNED  # slow import: the networks
+    from sglpr_jax.methods.learned.distance import distance_of_weights
+
+    return distance_of_weights(LEARNED[name.partition(":")[0]], name)

@@ -17,12 +17,14 @@ from sglpr_jax.data.submap import SUBMAPS
 from sglpr_jax.data.views import View, classes_of, rotated, view
 from sglpr_jax.fields import Size, check_value
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.methods.method import DescribeFn, ImageMethod, Method, ScanMethod
+from sglpr_jax.methods.learned.content import require_content
+from sglpr_jax.methods.method import DescribeFn, ImageMethod, Method, RecordMethod, ScanMethod
 from sglpr_jax.methods.registry import network
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.input_image import FEWEST_CELLS, field_of_view
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.descriptor_file import SKIPPED, DescriptorFile
+from sglpr_jax.retrieval.record_descriptors import record_descriptors
 
 SCANS_AHEAD = 8
 """Number of scans that are read ahead."""
@@ -62,6 +64,8 @@ def embed(
     options = {"rotation_seed": rotation_seed, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
     if isinstance(method, ScanMethod):
         return embed_scans(method, recording, **options)
+    if isinstance(method, RecordMethod):
+        return embed_records(method, recording, batch=batch, **options)
     return embed_images(method, recording, batch=batch, **options)
 
 
@@ -147,6 +151,28 @@ def embed_scans(
     return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
 
 
+def embed_records(
+    method: RecordMethod,
+    recording: Recording,
+    *,
+    rotation_seed: int | None = None,
+    batch: int = 8,
+    on_bad_scan: OnBadScan | None = None,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> DescriptorFile:
+    """Describe every scan or image of a recording with a learned method of another publication.
+
+    The arguments are those of `embed`. Raises ValueError, with the method and the scan, if inputs or descriptors differ
+    in shape, or if a descriptor is not finite or contains only zeros.
+    """
+    check_value(batch, Size, "batch")
+    angles = _angles(len(recording), rotation_seed)
+    options = {"ahead": SCANS_AHEAD, "on_bad_scan": on_bad_scan, "on_progress": on_progress}
+    found = list(record_descriptors(method, recording, angles, batch=_batch_for(len(recording), batch), **options))
+    rows, descriptors = [row for row, _ in found], [one[None] for _, one in found]
+    return _file(method, recording, rows, descriptors, rotation_seed=rotation_seed)
+
+
 def scan_image(
     points: Float32[np.ndarray, "n 3"], config: ModelConfig, *, mounting: Mounting | None = None
 ) -> Float[Array, "h w"]:
@@ -185,6 +211,9 @@ def _check(method: Method, recording: Recording) -> None:
         if method.categories and not recording.has_labels:
             raise ValueError(f"this model also needs labels (model.head.input): expected {beside}")
         return
+    if isinstance(method, RecordMethod):
+        require_content(name, method.takes, recording)
+        return
     if recording.has_images:
         others = ", ".join(other.name for other in HANDCRAFTED.values() if other.takes == "images")
         raise ValueError(f"{name} needs points, found only images in sequence {recording.name}; use {others}")
@@ -218,7 +247,7 @@ def _file(
         pose_source=recording.pose_source,
         config={**config, SKIPPED: skipped} if skipped else config,
         weights_hash=method.weights_hash,
-        distance=method.distance if isinstance(method, ScanMethod) else "l2",
+        distance="l2" if isinstance(method, ImageMethod) else method.distance,
     )
 
 

@@ -11,8 +11,9 @@ import pytest
 import safetensors.numpy
 
 import sglpr_jax
-from sglpr_jax.cli.embed import MethodName
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.learned import LEARNED
+from sglpr_jax.methods.names import AnyMethodName
 from sglpr_jax.retrieval.distances import distance_function
 
 from .conftest import assert_one_line_error
@@ -220,7 +221,7 @@ def test_images_smaller_than_the_models_window_are_refused(embed, images, traine
 
 
 def test_every_baseline_can_be_chosen():
-    assert get_args(MethodName) == ("sglpr", *HANDCRAFTED)
+    assert get_args(AnyMethodName) == ("sglpr", *HANDCRAFTED, *LEARNED)
 
 
 @pytest.mark.slow

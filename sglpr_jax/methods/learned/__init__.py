@@ -1,6 +1,7 @@
 """Networks of other publications, trained here from random weights. Each file declares one or two methods."""
 
 from sglpr_jax.methods.learned.method import LearnedMethod
+from sglpr_jax.methods.learned.rinet import RINET
 
-LEARNED: dict[str, LearnedMethod] = {}
+LEARNED: dict[str, LearnedMethod] = {method.name: method for method in (RINET,)}
 """All learned methods by their names on the command line."""

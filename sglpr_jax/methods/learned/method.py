@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from flax import linen as nn
@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Shaped
 
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.methods.method import Takes
 
 Variables = Mapping[str, Any]
 """Variables of a network: `params`, and `batch_stats` if it has batch normalisation."""
@@ -25,6 +26,7 @@ class Tuples(NamedTuple):
     """Number of positives of each anchor."""
 
 
+@runtime_checkable
 class Compare(Protocol):
     """Distance of descriptors that needs the weights of the network."""
 
@@ -64,7 +66,7 @@ class LearnedMethod:
     """Publication of the method."""
     licence: str
     """Licence of the authors' code, for example "MIT", or "GPL-3.0, not read"."""
-    takes: Literal["images", "points", "labelled points"]
+    takes: Takes
     """Content that `prepare` needs in a record. Methods that take images accept ready-made images and scans."""
     weights: int
     """Number of trained weights."""

@@ -1,0 +1,178 @@
+"""bin/peers: train the networks of other publications on your own data, and list them."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from sglpr_jax.cli.config_file import record_command
+from sglpr_jax.cli.runtime import StopRequest, cache_folder, console, parse_command, progress_bar, run, stop_on_signal
+from sglpr_jax.fields import CountOrNone, NotNegative, Positive
+from sglpr_jax.methods.names import LearnedName
+
+if TYPE_CHECKING:
+    from sglpr_jax.methods.learned.method import LearnedMethod
+    from sglpr_jax.training.learned.inputs import Prepared
+    from sglpr_jax.training.learned.score import ScoreFn
+
+
+RATES = "rates"
+"""Folder of the search of the learning rate, in the folder of the run."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PeersCommand:
+    """Train the network of another publication from random weights, or list these networks.
+
+    A run can be interrupted with Ctrl-C or SIGTERM and continued with --resume. bin/embed describes recordings with the
+    weights in its folder.
+
+    Example:
+      bin/peers list
+      bin/peers train rinet KITTI --out runs/rinet --seconds 3600
+      bin/peers train rinet TOWNS KITTI --out runs/rinet --held-out HELD_OUT
+      bin/peers train rinet KITTI --out runs/rinet --resume
+    """
+
+    action: tyro.conf.Positional[Literal["train", "list"]]
+    """`train` trains METHOD on all recordings of DATA. `list` prints the methods."""
+    method: tyro.conf.Positional[LearnedName | None] = None
+    """Method to train."""
+    data: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Datasets in any supported layout. All their recordings are trained on."""
+    out: Path | None = None
+    """Folder of the run."""
+    seconds: NotNegative = 3600.0
+    """Training time in seconds. Scores and the compilation of the step do not count."""
+    images: CountOrNone = 0
+    """Number of images after which the training stops, if the time is not over before; 0: no limit."""
+    seed: CountOrNone = 0
+    """Seed of the weights, the tuples and the rotations."""
+    learning_rate: Positive | None = None
+    """Learning rate. None: the best of three short trainings with --held-out, otherwise the published rate."""
+    held_out: Path | None = None
+    """Dataset with revisits that is not trained on. The learning rates and the snapshots are scored on it."""
+    search_seconds: Positive = 300.0
+    """Training time of each learning rate of the search, in seconds."""
+    cache: Path | None = None
+    """Folder for the prepared inputs. None: the user's cache."""
+    resume: bool = False
+    """Continue the run in --out."""
+
+
+def run_peers(command: PeersCommand) -> None:
+    """Run the command."""
+    if command.action == "list":
+        _print_methods()
+    else:
+        print(f"run: {train_peer(command)}")
+
+
+def train_peer(command: PeersCommand) -> Path:
+    """Train a method. Returns the folder of the run. If the training is asked to stop, saves its state and exits."""
+    from sglpr_jax.methods.learned import LEARNED  # slow imports, not needed for --help
+    from sglpr_jax.training.learned.run import train_learned
+    from sglpr_jax.training.learned.run_files import RunSettings
+
+    if command.method is None or not command.data or command.out is None:
+        raise ValueError("expected bin/peers train METHOD DATA... --out RUN, found no METHOD, DATA or --out")
+    method, out = LEARNED[command.method], command.out
+    resume = _has_run(out, resume=command.resume)
+    data, score = _inputs(command, method)
+    with stop_on_signal() as stopped:
+        rate = _learning_rate(command, method, data, score, out, stopped)
+        settings = RunSettings(rate, seed=command.seed, seconds=command.seconds, images=command.images)
+        record_command(dataclasses.replace(command, learning_rate=rate), out)
+        options = {"stopped": stopped, "report": _report, "progress": progress_bar, "resume": resume}
+        found = train_learned(method, data, settings, out, score=score, **options)
+    print(f"{out}: {found.images} images in {found.seconds:.0f} s", file=sys.stderr)
+    _exit_if_stopped(stopped)
+    return out
+
+
+def _has_run(out: Path, *, resume: bool) -> bool:
+    """Return whether a training in the folder is to be continued. A stopped search of the learning rate is not a
+    training yet.
+
+    Raises FileExistsError or FileNotFoundError if the folder does not fit `resume`.
+    """
+    has_run = (out / "config.json").exists()
+    if has_run and not resume:
+        raise FileExistsError(f"{out}: there is a run already; resume it (--resume) or choose another --out")
+    if resume and not has_run and not (out / RATES).is_dir():
+        raise FileNotFoundError(f"{out}: expected a run to resume, found none")
+    return has_run
+
+
+def _inputs(command: PeersCommand, method: "LearnedMethod") -> "tuple[Prepared, ScoreFn | None]":
+    """Prepare the training recordings and the held-out ones. Raises ValueError if one of them does not fit."""
+    from sglpr_jax.cli.datasets import all_recordings
+    from sglpr_jax.training.learned.inputs import prepared
+    from sglpr_jax.training.learned.score import held_out_score, require_revisits
+
+    cache = command.cache or cache_folder() / "peers"
+    if command.held_out is not None and command.held_out.resolve() in {path.resolve() for path in command.data}:
+        raise ValueError(f"--held-out {command.held_out}: expected a dataset other than DATA, found one of them")
+    recordings = [one for root in command.data for one in all_recordings(root, title="training on")]
+    if command.held_out is None:
+        return prepared(method, recordings, cache, progress=progress_bar), None
+    held_out = all_recordings(command.held_out, title="held out")
+    require_revisits(held_out)
+    tested = prepared(method, held_out, cache, progress=progress_bar)
+    return prepared(method, recordings, cache, progress=progress_bar), held_out_score(method, tested)
+
+
+def _learning_rate(
+    command: PeersCommand,
+    method: "LearnedMethod",
+    data: "Prepared",
+    score: "ScoreFn | None",
+    out: Path,
+    stopped: StopRequest,
+) -> float:
+    """Return the stated learning rate, the best of a search, or the published one."""
+    from sglpr_jax.training.learned.rate_search import Stopped, best_rate
+
+    if command.learning_rate is not None:
+        return command.learning_rate
+    if score is None:
+        return method.recipe.learning_rates[1]
+    options = {"stopped": stopped, "report": _report, "progress": progress_bar}
+    try:
+        return best_rate(method, data, score, out / RATES, seconds=command.search_seconds, seed=command.seed, **options)
+    except Stopped:
+        _exit_if_stopped(stopped)
+        raise
+
+
+def _exit_if_stopped(stopped: StopRequest) -> None:
+    """Exit if the training was asked to stop: with status 0 after SIGTERM, with 130 after Ctrl-C."""
+    if stopped():
+        print("stopped; continue with --resume", file=sys.stderr)
+        sys.exit(stopped.exit_status)
+
+
+def _report(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _print_methods() -> None:
+    from rich.table import Table
+
+    from sglpr_jax.methods.learned import LEARNED
+
+    table = Table("method", "publication", "licence", "input", "weights")
+    for method in LEARNED.values():
+        table.add_row(method.name, method.source, method.licence, method.takes, f"{method.weights:,}")
+    console().print(table)
+
+
+def main() -> None:
+    """The entry point."""
+    run(lambda: parse_command(PeersCommand, "peers"), run_peers)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+"""RINet (Li et al., 2022): rings of 360 degrees, one for each of 12 classes, and a learned distance. Variant attention.
+
+Published recipe: Adam at 0.02 with weight decay 1e-6, 1024 pairs a step, 20 epochs, one negative for each positive of a
+soft label above 0.1, scans with themselves included. Half of the pairs lose up to 60 neighbouring columns of each scan.
+
+Recipe here: the same optimiser and loss, and 512 tuples of one positive and one negative a step, that is 1024 pairs.
+Half of the positives come from another visit, and each scan has its own draw of the lost columns. Scans are not paired
+with themselves. Trained from scratch, as published.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from jaxtyping import Array, Float, Float32, Int32
+
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.views import classes_of
+from sglpr_jax.losses import descriptor_distance
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+
+COLUMNS = 360
+RANGE_M = 50.0
+CLASSES = (1, *range(9, 20))
+"""Classes of the rows: car, road, parking, sidewalk, other ground, building, fence, vegetation, trunk, terrain, pole,
+sign."""
+ROAD = 1
+"""Row of the road, which holds the farthest point. The other rows hold the nearest one."""
+STAGES = ((3, 16), (3, 32), (2, 32), (2, 64), (2, 128))
+"""Factor of the reduction and number of channels of each stage after the first one."""
+NUMBERS = 288
+SLOPE = 0.1
+"""Slope of the leaky ReLU for negative numbers."""
+SAME_M, HALF_M, WIDTH_M = 3.0, 10.0, 1.5
+"""The label of a pair is 1 below 3 m. Beyond, it is a sigmoid that is 0.5 at 10 m, with a width of 1.5 m."""
+LIMIT_M = 13.3
+"""Distance at which the label is 0.1, in metres: the limit between positives and negatives."""
+MARGIN = 0.2
+LOST_COLUMNS = 60
+
+
+def ring_image(points: Float32[np.ndarray, "n 3"], classes: Int32[np.ndarray, " n"]) -> Float32[np.ndarray, "12 360"]:
+    """Return the horizontal range of one point of each class in each degree, divided by 50 m.
+
+    Arguments:
+      points: Points in metres. Points that are not finite or farther than 50 m are ignored.
+      classes: Class of each point, from 0 to 19.
+
+    Returns:
+      Rows of the `CLASSES`, columns from -180 degrees counter-clockwise. 0 where a class has no point.
+    """
+    row_of = np.full(20, -1)
+    row_of[list(CLASSES)] = np.arange(len(CLASSES))
+    x, y, _ = np.where(np.isfinite(points).all(axis=1, keepdims=True), points, np.inf).astype(np.float64).T
+    reach, row = np.hypot(x, y), row_of[classes]
+    kept = (reach <= RANGE_M) & (row >= 0)
+    x, y, reach, row = x[kept], y[kept], reach[kept], row[kept]
+    # Exactly 180 degrees would be column 360. The authors drop such points; here they are those of -180 degrees.
+    column = np.floor((np.arctan2(y, x) + np.pi) * (COLUMNS / (2 * np.pi))).astype(np.int64) % COLUMNS
+    nearest = np.full((len(CLASSES), COLUMNS), np.inf)
+    farthest = np.zeros_like(nearest)
+    np.minimum.at(nearest, (row, column), reach)
+    np.maximum.at(farthest, (row, column), reach)
+    image = np.where(np.isfinite(nearest), nearest, 0)
+    image[ROAD] = farthest[ROAD]
+    return (image / RANGE_M).astype(np.float32)
+
+
+def prepare(record: Record) -> Float32[np.ndarray, "12 360"]:
+    """Return the ring image of a scan with labels. Raises ValueError without labels."""
+    return ring_image(record.upright_points, classes_of(record, 20))
+
+
+def turned(key: Array, inputs: Float[Array, "b 12 360"]) -> Float[Array, "b 12 360"]:
+    """Turn each input by its own whole number of degrees. Half of them lose up to 60 neighbouring columns first."""
+    keys = jax.random.split(key, len(inputs))
+
+    def turn(key, image):
+        chance, size, place, angle = jax.random.split(key, 4)
+        lost = jax.random.randint(size, (), 0, LOST_COLUMNS + 1) * jax.random.bernoulli(chance)
+        start = jax.random.randint(place, (), 0, COLUMNS + 1 - lost)
+        column = jnp.arange(COLUMNS)
+        kept = (column < start) | (column >= start + lost)
+        return jnp.roll(image * kept[None], jax.random.randint(angle, (), 0, COLUMNS), axis=1)
+
+    return jax.vmap(turn)(keys, inputs)
+
+
+class RINet(nn.Module):
+    """The network of one scan. It is exactly invariant to rotations by whole degrees: every layer is equivariant, and a
+    reduction keeps the strongest of the possible phases."""
+
+    @nn.compact
+    def __call__(self, inputs: Float[Array, "b 12 360"], *, train: bool) -> Float[Array, "b 288"]:
+        """Return the means over the ring after each of the six stages. They are not normalised."""
+        x = Attention()(inputs.swapaxes(1, 2))
+        x = Attention()(RingConvolution(12)(x, train=train))
+        x = Attention()(RingConvolution(16)(x, train=train))
+        means = [x.mean(1)]
+        for factor, channels in STAGES:
+            x = Attention()(RingConvolution(channels)(strongest_phase(x, factor), train=train))
+            means.append(x.mean(1))
+        descriptors = jnp.concatenate(means, axis=-1)
+        if self.is_initializing():
+            Score(name="score")(descriptors)  # its weights belong to those of the network
+        return descriptors
+
+
+class RingConvolution(nn.Module):
+    """Convolution over three neighbours on a ring, batch normalisation and leaky ReLU."""
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b l c"], *, train: bool) -> Float[Array, "b l {self.channels}"]:
+        """Apply the layer. Column i of the result depends on the columns i, i + 1 and i + 2."""
+        around = jnp.concatenate([x, x[:, :2]], axis=1)
+        x = nn.Conv(self.channels, (3,), padding="VALID")(around)
+        return nn.leaky_relu(nn.BatchNorm(use_running_average=not train, momentum=0.9)(x), SLOPE)
+
+
+class Attention(nn.Module):
+    """Scales each channel by a number from 0 to 1 that depends on the means of all channels."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b l c"]) -> Float[Array, "b l c"]:
+        """Return the scaled channels."""
+        return x * nn.sigmoid(nn.Dense(x.shape[-1])(x.mean(1)))[:, None]
+
+
+class Score(nn.Module):
+    """Score of the absolute difference of two descriptors. Its sigmoid is the probability of one place."""
+
+    @nn.compact
+    def __call__(self, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
+        """Return the logits."""
+        hidden = nn.leaky_relu(nn.Dense(128)(difference), SLOPE)
+        return nn.Dense(1)(hidden)[..., 0]
+
+
+def strongest_phase(x: Float[Array, "b l c"], factor: int) -> Float[Array, "b l/{factor} c"]:
+    """Keep every `factor`-th column, from the start that gives the largest sum of absolute values."""
+    batch, length, channels = x.shape
+    phases = x.reshape(batch, length // factor, factor, channels)
+    best = jnp.argmax(jnp.abs(phases).sum((1, 3)), axis=-1)
+    return jnp.take_along_axis(phases, best[:, None, None, None], axis=2)[:, :, 0]
+
+
+def same_place(apart_m: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the label of pairs at these distances in metres: 1 for one place, 0 for different places."""
+    return jnp.where(apart_m < SAME_M, 1.0, nn.sigmoid((HALF_M - apart_m) / WIDTH_M))
+
+
+def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
+    """Return the cross entropy of the scores plus the contrastive loss of the descriptors, over all pairs with an
+    anchor."""
+    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    label = same_place(tuples.apart_m[:, 1:])
+    entropy = optax.sigmoid_binary_cross_entropy(_logits(variables, jnp.abs(anchors - others)), label)
+    apart = descriptor_distance(jnp.broadcast_to(anchors, others.shape), others)
+    contrast = label * apart**2 + (1 - label) * nn.relu(MARGIN - apart) ** 2
+    return entropy.mean() + contrast.mean()
+
+
+def compare(
+    variables: Variables, queries: Float[Array, "q 288"], database: Float[Array, "n 288"]
+) -> Float[Array, "q n"]:
+    """Return one minus the probability that two descriptors show one place."""
+
+    def with_all(query):
+        return 1 - nn.sigmoid(_logits(variables, jnp.abs(query[None] - database)))
+
+    return jax.lax.map(with_all, queries)
+
+
+def _logits(variables: Variables, difference: Float[Array, "*b 288"]) -> Float[Array, "*b"]:
+    found = Score().apply({"params": variables["params"]["score"]}, difference)
+    assert isinstance(found, jax.Array)  # not the pair that a call with mutable variables returns
+    return found
+
+
+RINET = LearnedMethod(
+    name="rinet",
+    source='Li et al., "RINet: Efficient 3D Lidar-Based Place Recognition Using Rotation Invariant Neural Network", '
+    "RA-L 2022",
+    licence="MIT",
+    takes="labelled points",
+    weights=98_765,
+    network=RINet(),
+    prepare=prepare,
+    turned=turned,
+    loss=loss,
+    compare=compare,
+    recipe=Recipe(
+        published="Adam 0.02, weight decay 1e-6; cross entropy of a soft label and contrastive loss; 1024 pairs, "
+        "20 epochs",
+        sampling=TupleConfig(positives=1, negatives=1, positive_m=LIMIT_M, negative_m=LIMIT_M),
+        tuples=512,
+        learning_rates=(0.002, 0.02, 0.06),
+        weight_decay=1e-6,
+    ),
+)

@@ -1,0 +1,133 @@
+"""Inputs of the network for all scans of recordings. They are computed once and kept as memory-mapped files."""
+
+import functools
+import hashlib
+import inspect
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int, Shaped
+
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.sampling.tuples import TuplePool
+from sglpr_jax.data.scan_stream import check_readable, scan_stream
+from sglpr_jax.files import in_short, replacing
+from sglpr_jax.methods.learned.content import require_content
+from sglpr_jax.methods.learned.method import LearnedMethod
+from sglpr_jax.names import file_name
+from sglpr_jax.progress import Progress, no_progress
+
+SCANS_AHEAD = 8
+"""Number of scans that are read ahead."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Recordings and the inputs of their scans."""
+
+    recordings: tuple[Recording, ...]
+    inputs: tuple[Shaped[np.ndarray, "_n ..."], ...]
+    """Inputs of each recording, one for each scan."""
+
+    def of(self, pool: TuplePool, places: Int[np.ndarray, " n"]) -> Shaped[np.ndarray, "n ..."]:
+        """Return the inputs of places, given as frame numbers of a pool over these recordings."""
+        return np.stack([self.inputs[pool.recording[place]][pool.frame[place]] for place in places])
+
+
+def prepared(
+    method: LearnedMethod, recordings: Sequence[Recording], cache: Path, *, progress: Progress = no_progress
+) -> Prepared:
+    """Compute the inputs of all scans, or read them from the cache.
+
+    Each recording becomes one file, which is complete or does not exist. A repeated call continues with the missing
+    recordings.
+
+    Arguments:
+      method: Method whose `prepare` computes the inputs.
+      recordings: Recordings with poses.
+      cache: Folder of the files.
+      progress: Displays the number of finished scans.
+
+    Raises:
+      ValueError: If a recording has no poses or lacks what the method needs, if a scan is invalid, or if inputs differ
+        in shape or type.
+      OSError: If the cache cannot be written.
+    """
+    for recording in recordings:
+        require_content(method.name, method.takes, recording, every_label=True)
+        if recording.positions is None:
+            raise ValueError(f"sequence {recording.name} has no poses; training and scoring need them")
+    inputs = tuple(_inputs(method, recording, cache, progress) for recording in recordings)
+    for recording, array in zip(recordings, inputs, strict=True):
+        _require_alike(array[0], inputs[0][0], name=f"sequence {recording.name}")
+    return Prepared(tuple(recordings), inputs)
+
+
+def _inputs(method: LearnedMethod, recording: Recording, cache: Path, progress: Progress) -> np.ndarray:
+    path = cache / f"{method.name}-{file_name(recording.name)}-{_identity(method, recording)}.npy"
+    if not path.is_file():
+        with progress(f"prepare {recording.name}", len(recording)) as show:
+            _write(path, method, recording, show)
+    try:
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: expected inputs, found a damaged file ({in_short(error)}); delete it") from error
+    if len(found) != len(recording):
+        raise ValueError(f"{path}: expected {len(recording)} inputs, found {len(found)}; delete the file")
+    return found
+
+
+def _write(path: Path, method: LearnedMethod, recording: Recording, show) -> None:
+    """Write the inputs of a recording, completely or not at all."""
+    check_readable(recording, len(recording))
+    labels = method.takes == "labelled points"
+    made = scan_stream(
+        recording, lambda row, record: method.prepare(record), labels=labels, ahead=SCANS_AHEAD, on_progress=show
+    )
+    with replacing(path) as temporary:
+        file = None
+        for row, one in made:
+            assert one is not None  # without `on_bad_scan`, a bad scan is an error
+            if file is None:
+                shape = (len(recording), *one.shape)
+                file = np.lib.format.open_memmap(temporary, mode="w+", dtype=one.dtype, shape=shape)
+            _require_alike(one, file[0], name=f"scan {recording.ids[row]} of sequence {recording.name}")
+            file[row] = one
+        del file  # flushes it
+
+
+def _require_alike(found: np.ndarray, expected: np.ndarray, *, name: str) -> None:
+    if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+        raise ValueError(
+            f"{name}: expected an input {expected.dtype} {expected.shape} as for the other scans, found "
+            f"{found.dtype} {found.shape}"
+        )
+
+
+def _identity(method: LearnedMethod, recording: Recording) -> str:
+    """Identify the inputs: the files of a recording, their read options, and the code that prepares them."""
+    paths = [path for path in (*recording.paths, *recording.label_paths, *recording.containers) if path is not None]
+    files = [(str(path.absolute()), _stamp(path)) for path in paths]
+    mountings = [str(recording.mounting_of(row)) for row in range(len(recording))]
+    source = [method.name, _code(method), recording.name, recording.read_options, files, mountings]
+    if not recording.on_disk and recording.positions is not None:  # a simulated recording has no files
+        source.append(recording.positions.tolist())
+    return hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Size and time of a file, or None for a scan inside another file."""
+    stat = path.stat() if path.exists() else None
+    return None if stat is None else (stat.st_size, stat.st_mtime_ns)
+
+
+def _code(method: LearnedMethod) -> str:
+    """Hash of the file that declares `prepare`, so that a change of the method gives new inputs."""
+    prepare = method.prepare.func if isinstance(method.prepare, functools.partial) else method.prepare
+    try:
+        return hashlib.sha256(Path(inspect.getfile(prepare)).read_bytes()).hexdigest()
+    except (OSError, TypeError):  # a function without a file
+        return ""

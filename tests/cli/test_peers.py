@@ -1,0 +1,135 @@
+"""bin/peers trains networks of other publications, and bin/embed describes recordings with them."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from sglpr_jax.methods.learned import LEARNED
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.training.metrics_log import read_metrics
+
+from .conftest import assert_one_line_error, run_command
+
+
+@pytest.fixture(scope="module")
+def run(town, tmp_path_factory):
+    """A run of RINet of three steps, with a held-out dataset and a given learning rate."""
+    out = tmp_path_factory.mktemp("runs") / "rinet"
+    ended = run_command("peers", "train", "rinet", town, "--out", out, "--images", 4000, "--learning-rate", 0.002)
+    assert ended.status == 0, ended.error
+    return out
+
+
+def embed(out, *arguments):
+    return run_command("embed", "--out", out, *arguments)
+
+
+def test_a_run_writes_its_settings_its_measurements_and_snapshots(run):
+    assert {path.name for path in run.iterdir()} >= {"weights", "weights-1000", "weights-2000", "weights-4000"}
+    config = json.loads((run / "config.json").read_text())
+    assert config["method"] == "rinet" and [one["name"] for one in config["recordings"]] == ["00", "05", "08"]
+    assert config["settings"] == {"learning_rate": 0.002, "seed": 0, "seconds": 3600.0, "images": 4000}
+    assert json.loads((run / "command.json").read_text())["learning-rate"] == 0.002
+    lines = read_metrics(run / "metrics.jsonl")
+    assert [line["images"] for line in lines] == [1536, 3072, 4608]
+    assert lines[0]["seconds"] < lines[-1]["seconds"] and all(np.isfinite(line["loss"]) for line in lines)
+    about = json.loads((run / "weights-2000" / "config.json").read_text())
+    assert about["method"] == "rinet" and about["images"] == 3072
+
+
+def test_a_finished_run_resumes_to_nothing_and_a_new_one_is_refused(run, town):
+    before = read_metrics(run / "metrics.jsonl")
+    again = ("peers", "train", "rinet", town, "--out", run, "--images", 4000, "--learning-rate", 0.002)
+    assert_one_line_error(run_command(*again), run, "there is a run already")
+    assert run_command(*again, "--resume").status == 0
+    assert read_metrics(run / "metrics.jsonl") == before
+    assert_one_line_error(run_command(*again, "--resume", "--seed", 1), "settings.seed")
+
+
+def test_trained_weights_describe_a_recording_and_compare_it(run, town, tmp_path):
+    options = ("--method", "rinet", "--data", town, "--seq", "08")
+    ended = embed(tmp_path / "08.npz", "--weights", run / "weights-2000", *options)
+    assert ended.status == 0 and "40 descriptors of 288 numbers" in ended.out, ended.error
+    file = DescriptorFile.load(tmp_path / "08.npz")
+    assert file.config["method"] == "rinet" and file.weights_hash
+    apart = distance_function(file.distance)(file.descriptors, file.descriptors)
+    assert apart.shape == (40, 40) and (apart >= 0).all() and (apart <= 1).all() and np.ptp(apart) > 0
+    ended = run_command("evaluate", tmp_path / "08.npz", "--out", tmp_path / "found")
+    assert ended.status == 0, ended.error
+    for name, weights in (("last", run), ("random", "random:0")):
+        assert embed(tmp_path / f"{name}.npz", "--weights", weights, *options).status == 0
+        other = DescriptorFile.load(tmp_path / f"{name}.npz")
+        assert (other.descriptors != file.descriptors).any() and other.distance != file.distance
+
+
+def test_scans_can_be_rotated_first(town, tmp_path):
+    options = ("--method", "rinet", "--weights", "random:0", "--data", town, "--seq", "08")
+    raw, turned = (tmp_path / f"{name}.npz" for name in ("raw", "turned"))
+    assert embed(raw, *options).status == embed(turned, *options, "--rotate").status == 0
+    a, b = (DescriptorFile.load(path).descriptors for path in (raw, turned))
+    assert (a != b).any(axis=1).all()
+
+
+def test_a_distance_whose_weights_are_gone_is_an_error(run, town, tmp_path):
+    weights = tmp_path / "weights-1"
+    shutil.copytree(run / "weights-1000", weights)
+    options = ("--method", "rinet", "--data", town, "--seq", "08", "--weights", weights)
+    assert embed(tmp_path / "08.npz", *options).status == 0
+    shutil.rmtree(weights)
+    shutil.copytree(run / "weights-2000", weights)
+    assert_one_line_error(run_command("evaluate", tmp_path / "08.npz"), weights, "found others")
+    shutil.rmtree(weights)
+    assert_one_line_error(run_command("evaluate", tmp_path / "08.npz"), weights, "config.json is missing")
+
+
+def test_unfitting_weights_are_errors(run, trained, town, tmp_path):
+    options = ("--data", town, "--seq", "08")
+    out = tmp_path / "08.npz"
+    assert_one_line_error(embed(out, "--method", "rinet", *options), "rinet: expected --weights with a folder of")
+    foreign = embed(out, "--method", "rinet", "--weights", trained.folder, *options)
+    assert_one_line_error(foreign, "expected weights of the method 'rinet', found those of 'sglpr'")
+    assert_one_line_error(embed(out, "--weights", run, *options), "weights")
+    assert_one_line_error(embed(out, "--method", "ssc", "--weights", run, *options), "expected --method sglpr or")
+    assert not out.exists()
+
+
+def test_unfitting_data_are_errors(images, town, tmp_path):
+    train = ("peers", "train", "rinet")
+    out = ("--out", tmp_path / "run")
+    assert_one_line_error(run_command(*train, images, *out), "rinet needs points, found only images in sequence 00")
+    unlabelled = tmp_path / "unlabelled"
+    for name in ("00", "05"):
+        shutil.copytree(
+            town / "sequences" / name, unlabelled / "sequences" / name, ignore=shutil.ignore_patterns("labels")
+        )
+    assert_one_line_error(run_command(*train, unlabelled, *out), "rinet needs labels beside the scans, found none")
+    (unlabelled / "sequences/00/poses.txt").unlink()
+    assert_one_line_error(run_command(*train, unlabelled, *out), "sequence 00 has no poses")
+    assert_one_line_error(run_command(*train, town, *out, "--held-out", town), "expected a dataset other than DATA")
+    assert_one_line_error(run_command(*train, town, *out, "--resume"), "expected a run to resume, found none")
+    assert_one_line_error(run_command("peers", "train"), "expected bin/peers train METHOD DATA... --out RUN")
+
+
+@pytest.mark.slow
+def test_rates_and_snapshots_are_scored_on_a_held_out_recording(town, tmp_path):
+    data, held_out, out = (tmp_path / name for name in ("data", "held-out", "run"))
+    for root, name in ((data, "00"), (data, "05"), (held_out, "08")):
+        shutil.copytree(town / "sequences" / name, root / "sequences" / name)
+    options = ("--out", out, "--images", 2000, "--search-seconds", 0.1, "--held-out", held_out)
+    ended = run_command("peers", "train", "rinet", data, *options)
+    assert ended.status == 0, ended.error
+    rates = json.loads((out / "rates" / "rates.json").read_text())
+    assert set(rates["recall_at_1"]) == {"0.002", "0.02", "0.06"}
+    assert json.loads((out / "config.json").read_text())["settings"]["learning_rate"] == rates["best"]
+    scores = read_metrics(out / "scores.jsonl")
+    assert [line["images"] for line in scores] == [1536, 3072]
+    assert all(0 <= line["recall_at_1 08"] == line["recall_at_1"] <= 1 for line in scores)
+
+
+def test_the_list_has_every_method(command):
+    ended = command("peers", "list")
+    assert ended.status == 0 and "98,765" in ended.out
+    assert not [name for name in LEARNED if name not in ended.out]

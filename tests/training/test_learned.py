@@ -1,0 +1,327 @@
+"""The trainer of learned methods, with a method of a few weights that learns simulated places."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.losses import descriptor_distance
+from sglpr_jax.methods.learned.distance import learned_distance
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe
+from sglpr_jax.methods.learned.weights_file import load_variables, random_variables, save_variables
+from sglpr_jax.training.learned.inputs import prepared
+from sglpr_jax.training.learned.rate_search import best_rate
+from sglpr_jax.training.learned.run import train_learned
+from sglpr_jax.training.learned.run_files import RunSettings
+from sglpr_jax.training.learned.score import held_out_score, recall_at_1
+from sglpr_jax.training.learned.step import Batch, new_state, train_step
+from sglpr_jax.training.metrics_log import read_metrics
+
+SECTORS = 24
+MINED = TupleConfig(positives=1, negatives=2, revisit_gap=5, mining="hardest", hardest=4, refresh_steps=4)
+
+
+def ranges(record: Record) -> np.ndarray:
+    """The nearest point of each of 24 sectors, in units of 20 m."""
+    x, y, _ = record.upright_points.T
+    sector = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
+    found = np.full(SECTORS, 60, np.float32)
+    np.minimum.at(found, sector, np.hypot(x, y))
+    return found / 20
+
+
+class Rings(nn.Module):
+    normalised: bool = True
+
+    @nn.compact
+    def __call__(self, inputs, *, train):
+        x = nn.Dense(16)(inputs)
+        x = nn.BatchNorm(use_running_average=not train)(x) if self.normalised else x
+        return nn.Dense(8)(nn.relu(x))
+
+
+def rolled(key, inputs):
+    by = jax.random.randint(key, (len(inputs),), 0, 2)
+    return jax.vmap(jnp.roll)(inputs, by)
+
+
+def triplet(variables, tuples):
+    anchor, rest = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    apart = descriptor_distance(jnp.broadcast_to(anchor, rest.shape), rest)
+    return nn.relu(0.5 + apart[:, :1] - apart[:, 1:]).mean()
+
+
+TINY = LearnedMethod(
+    name="tiny",
+    source="this test",
+    licence="MIT",
+    takes="points",
+    weights=24 * 16 + 16 + 32 + 16 * 8 + 8,
+    network=Rings(),
+    prepare=ranges,
+    turned=rolled,
+    loss=triplet,
+    recipe=Recipe(
+        published="this test",
+        sampling=TupleConfig(positives=1, negatives=2, revisit_gap=5),
+        tuples=10,
+        learning_rates=(1e-6, 1e-2, 2e-2),
+        weight_decay=1e-3,
+    ),
+)
+
+
+def loop(name: str, seed: int, *, scans: int = 60) -> Recording:
+    """Two laps of a square; each place is a circle of points with the ranges of that place, and some noise."""
+    rng = np.random.default_rng(seed)
+    way = np.arange(scans) % (scans // 2)
+    along = way / (scans // 2) * 2 * np.pi
+    positions = np.stack([50 * np.cos(along), 50 * np.sin(along), 0 * along], axis=1)
+    reach = rng.uniform(5, 50, (scans // 2, SECTORS))[way] + rng.normal(0, 0.5, (scans, SECTORS))
+    angle = (np.arange(SECTORS) + 0.5) / SECTORS * 2 * np.pi - np.pi
+    clouds = np.stack([reach * np.cos(angle), reach * np.sin(angle), 0 * reach], axis=-1).astype(np.float32)
+
+    def read(path, labels, lasers):
+        return Record(points=np.repeat(clouds[int(path.stem)], 20, axis=0))
+
+    return Recording(
+        name=name,
+        ids=tuple(f"{i:06d}" for i in range(scans)),
+        positions=positions,
+        times=np.arange(scans) * 2.0,
+        pose_source="this test",
+        paths=tuple(Path(f"{i:06d}.bin") for i in range(scans)),
+        read=read,
+        on_disk=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return prepared(TINY, [loop("a", 0), loop("b", 1)], tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def held_out(tmp_path_factory):
+    return prepared(TINY, [loop("c", 2)], tmp_path_factory.mktemp("cache"))
+
+
+def settings(**more) -> RunSettings:
+    return RunSettings(**{"learning_rate": 1e-2, "seconds": 600.0, "images": 1200, **more})
+
+
+def assert_equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_inputs_are_prepared_once_and_by_method_and_recording(tmp_path):
+    recording = loop("a", 0)
+    counted = []
+
+    def counting(record):
+        counted.append(record.name)
+        return ranges(record)
+
+    method = dataclasses.replace(TINY, prepare=counting)
+    first = prepared(method, [recording], tmp_path)
+    again = prepared(method, [recording], tmp_path)
+    assert len(counted) == 60 and isinstance(again.inputs[0], np.memmap)
+    np.testing.assert_array_equal(first.inputs[0], np.stack([ranges(recording.record(i)) for i in range(60)]))
+    prepared(dataclasses.replace(method, name="other"), [recording], tmp_path)
+    prepared(method, [loop("b", 0)], tmp_path)
+    assert len(counted) == 180 and len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_interrupted_preparation_leaves_no_file_and_goes_on(tmp_path):
+    good, bad = loop("a", 0), dataclasses.replace(loop("b", 1), read=lambda *_: Record(points=np.zeros((0, 3), "f4")))
+    with pytest.raises(ValueError, match="scan 000000 of sequence b"):
+        prepared(TINY, [good, bad], tmp_path)
+    assert [path.name[:6] for path in tmp_path.iterdir()] == ["tiny-a"]
+
+
+def test_inputs_of_other_shapes_are_an_error(tmp_path):
+    method = dataclasses.replace(TINY, prepare=lambda record: ranges(record)[: 24 - (record.name[8:12] == "0001")])
+    odd = dataclasses.replace(TINY, prepare=lambda record: ranges(record)[: 23 if "000007" in record.name else 24])
+    with pytest.raises(ValueError, match=r"scan 000007 of sequence a: expected an input float32 \(24,\).*\(23,\)"):
+        prepared(odd, [loop("a", 0)], tmp_path)
+    assert prepared(method, [loop("a", 0)], tmp_path).inputs[0].shape == (60, 24)
+
+
+def test_missing_poses_and_labels_are_errors(tmp_path):
+    with pytest.raises(ValueError, match="sequence a has no poses"):
+        prepared(TINY, [dataclasses.replace(loop("a", 0), positions=None)], tmp_path)
+    with pytest.raises(ValueError, match="tiny needs labels beside the scans, found none in sequence a"):
+        prepared(dataclasses.replace(TINY, takes="labelled points"), [loop("a", 0)], tmp_path)
+    with pytest.raises(ValueError, match="tiny needs points, found only images in sequence a"):
+        prepared(TINY, [dataclasses.replace(loop("a", 0), resolution_m=0.4)], tmp_path)
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_a_step_is_that_of_adam_with_weight_decay(normalised):
+    """The first step of Adam moves every weight by the learning rate, against the sign of the decayed gradient."""
+    method = dataclasses.replace(TINY, network=Rings(normalised))
+    state = new_state(method, seed=0)
+    rng = np.random.default_rng(0)
+    batch = Batch(rng.normal(size=(12, SECTORS)).astype(np.float32), np.zeros((4, 3), np.float32))
+    key, rate = jax.random.key(5), np.float32(0.01)
+    after, loss = train_step(state, batch, key, rate, method=method)
+    assert int(after.step) == 1
+
+    def loss_of(params):
+        inputs = rolled(jax.random.fold_in(key, 0), jnp.asarray(batch.inputs))
+        hidden = inputs @ params["Dense_0"]["kernel"] + params["Dense_0"]["bias"][None]
+        if normalised:
+            hidden = (hidden - hidden.mean(0)[None]) / jnp.sqrt(hidden.var(0) + 1e-5)[None]
+            hidden = hidden * params["BatchNorm_0"]["scale"][None] + params["BatchNorm_0"]["bias"][None]
+        found = nn.relu(hidden) @ params["Dense_1"]["kernel"] + params["Dense_1"]["bias"][None]
+        found = found.reshape(4, 3, 8)
+        apart = jnp.sqrt(jnp.square(found[:, :1] - found[:, 1:]).sum(-1))
+        return nn.relu(0.5 + apart[:, :1] - apart[:, 1:]).mean()
+
+    before = state.variables["params"]
+    expected, gradient = jax.jit(jax.value_and_grad(loss_of))(before)
+    assert float(loss) == pytest.approx(float(expected), rel=1e-4)
+    decayed = jax.tree.map(lambda slope, value: slope + 1e-3 * value, gradient, before)
+    for path, slope in jax.tree_util.tree_leaves_with_path(decayed):
+        old, new = (np.asarray(_at(tree, path)) for tree in (before, after.variables["params"]))
+        clear = np.abs(slope) > 1e-4
+        np.testing.assert_allclose((new - old)[clear], -0.01 * np.sign(slope)[clear], rtol=2e-2)
+
+
+def _at(tree, path):
+    for key in path:
+        tree = tree[key.key]
+    return tree
+
+
+def test_the_loss_falls_and_places_are_found(data, held_out, tmp_path):
+    score = held_out_score(TINY, held_out)
+    found = train_learned(TINY, data, settings(images=9000), tmp_path / "run", score=score)
+    assert found.images == 9000 and int(found.state.step) == 225 and found.seconds > 0
+    losses = [line["loss"] for line in read_metrics(tmp_path / "run/metrics.jsonl")]
+    assert np.mean(losses[-5:]) < 0.2 * np.mean(losses[:2])
+    names = {path.name for path in (tmp_path / "run").glob("weights*")}
+    assert names == {"weights", "weights-1000", "weights-2000", "weights-4000", "weights-8000"}
+    scores = read_metrics(tmp_path / "run/scores.jsonl")
+    assert [line["images"] for line in scores] == [1000, 2000, 4000, 8000, 9000]
+    assert scores[-1]["recall_at_1"] == score(found.state.variables)["recall_at_1"] > 0.5
+    assert_equal(load_variables(tmp_path / "run", TINY), found.state.variables)
+    about = json.loads((tmp_path / "run/weights-4000/config.json").read_text())
+    assert about["method"] == "tiny" and about["images"] == 4000 and about["settings"]["learning_rate"] == 1e-2
+
+
+@pytest.mark.parametrize("sampling", [TINY.recipe.sampling, MINED], ids=["random", "mined"])
+def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, sampling):
+    method = dataclasses.replace(TINY, recipe=dataclasses.replace(TINY.recipe, sampling=sampling))
+    whole = train_learned(method, data, settings(), tmp_path / "whole")
+    done = 0
+
+    def after_few_steps():
+        nonlocal done
+        done += 1
+        return done % 15 == 0
+
+    part = train_learned(method, data, settings(), tmp_path / "parts", stopped=after_few_steps)
+    assert int(part.state.step) == 14
+    while part.images < 1200:
+        part = train_learned(method, data, settings(), tmp_path / "parts", resume=True, stopped=after_few_steps)
+    assert_equal(part.state, whole.state)
+    lines = [read_metrics(tmp_path / name / "metrics.jsonl") for name in ("whole", "parts")]
+    assert [(a["step"], a["loss"]) for a in lines[0]] == [(b["step"], b["loss"]) for b in lines[1]]
+    snapshots = [load_variables(tmp_path / name / "weights-1000", method) for name in ("whole", "parts")]
+    assert_equal(*snapshots)
+
+
+def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(data, tmp_path):
+    train_learned(TINY, data, settings(images=40), tmp_path)
+    with pytest.raises(FileExistsError, match="there is a run already"):
+        train_learned(TINY, data, settings(images=40), tmp_path)
+    with pytest.raises(ValueError, match=r"found others: settings\.seed"):
+        train_learned(TINY, data, settings(seed=1), tmp_path, resume=True)
+    with pytest.raises(FileNotFoundError, match="expected a run to resume"):
+        train_learned(TINY, data, settings(), tmp_path / "none", resume=True)
+    assert train_learned(TINY, data, settings(images=80), tmp_path, resume=True).images == 80
+
+
+def test_the_time_ends_a_run(data, tmp_path):
+    assert train_learned(TINY, data, settings(images=0, seconds=0.2), tmp_path).seconds >= 0.2
+
+
+def test_a_loss_that_is_not_finite_names_the_step(data, tmp_path):
+    def breaks(variables, tuples):
+        return jnp.where(tuples.descriptors.mean() > -jnp.inf, jnp.nan, 0.0)
+
+    with pytest.raises(FloatingPointError, match="step 1: the loss is nan"):
+        train_learned(dataclasses.replace(TINY, loss=breaks), data, settings(), tmp_path)
+
+
+def test_the_best_of_three_rates_is_found_and_recorded(data, held_out, tmp_path):
+    score = held_out_score(TINY, held_out)
+    options = {"seconds": 0.5}
+    best = best_rate(TINY, data, score, tmp_path, **options)
+    found = json.loads((tmp_path / "rates.json").read_text())
+    assert found["best"] == best and set(found["recall_at_1"]) == {"1e-06", "0.01", "0.02"}
+    assert found["recall_at_1"][f"{best:g}"] == max(found["recall_at_1"].values())
+    assert best_rate(TINY, data, score, tmp_path, **options) == best  # nothing is trained again
+    assert json.loads((tmp_path / "rates.json").read_text()) == found
+
+
+def test_recall_is_counted_by_hand():
+    rng = np.random.default_rng(0)
+    positions, descriptors = rng.uniform(0, 20, (120, 3)), rng.normal(size=(120, 4)).astype(np.float32)
+    times = np.arange(120) * 1.0
+    hits = asked = 0
+    for i in range(30, 120):
+        old = [j for j in range(i) if times[j] <= times[i] - 30] + [i - 29]
+        near = [np.hypot(*(positions[i] - positions[j])[:2]) <= 5 for j in old]
+        if any(near):
+            asked += 1
+            hits += near[int(np.argmin([np.linalg.norm(descriptors[i] - descriptors[j]) for j in old]))]
+    distance = learned_distance(TINY, {})
+    assert recall_at_1(descriptors, positions, times, distance) == pytest.approx(hits / asked)
+
+
+def test_a_recording_without_revisits_cannot_be_held_out(tmp_path):
+    recording = loop("c", 2)
+    straight = dataclasses.replace(recording, positions=np.arange(60.0)[:, None] * [10, 0, 0])
+    with pytest.raises(ValueError, match="sequence c: expected revisits within 5 m"):
+        held_out_score(TINY, prepared(TINY, [straight], tmp_path))
+
+
+def test_damaged_and_foreign_weights_are_errors(tmp_path):
+    variables = random_variables(TINY, seed=0)
+    save_variables(tmp_path / "w", TINY, variables, {"images": 3})
+    assert_equal(load_variables(tmp_path / "w", TINY), variables)
+    other = dataclasses.replace(TINY, name="other")
+    with pytest.raises(ValueError, match="expected weights of the method 'other', found those of 'tiny'"):
+        load_variables(tmp_path / "w", other)
+    with pytest.raises(ValueError, match="batch_stats/BatchNorm_0/mean as no array"):
+        load_variables(tmp_path / "w", dataclasses.replace(TINY, network=Rings(normalised=False)))
+    params = dict(variables["params"])
+    del params["Dense_1"]
+    save_variables(tmp_path / "less", TINY, {**variables, "params": params}, {})
+    with pytest.raises(ValueError, match=r"params/Dense_1/bias as float32 .*, found no array"):
+        load_variables(tmp_path / "less", TINY)
+    content = (tmp_path / "w/model.safetensors").read_bytes()
+    (tmp_path / "w/model.safetensors").write_bytes(content[:-4])
+    with pytest.raises(ValueError, match="found a damaged one"):
+        load_variables(tmp_path / "w", TINY)
+    (tmp_path / "w/model.safetensors").write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(ValueError, match="SHA-256"):
+        load_variables(tmp_path / "w", TINY)
+    with pytest.raises(FileNotFoundError, match=r"config\.json is missing"):
+        load_variables(tmp_path / "nothing", TINY)
+
+
+def test_random_weights_have_a_seed():
+    assert_equal(load_variables("random:3", TINY), random_variables(TINY, seed=3))
+    with pytest.raises(ValueError, match="expected a seed"):
+        load_variables("random:x", TINY)
