@@ -1,4 +1,15 @@
-"""BEVPlace++ (Luo et al., 2025) on density images, and its ablation ResNet-34 + NetVLAD, which has no rotations."""
+"""BEVPlace++ (Luo et al., 2025) on density images, and its ablation ResNet-34 + NetVLAD, which has no rotations.
+
+Published recipe: Adam with a constant 1e-4, 4 tuples a step, at most 40 epochs of frames 0 to 2999 of KITTI 00. A tuple
+has 1 random positive within 5 m and the 10 hardest negatives beyond 7 m. Mining renews the descriptors once per epoch.
+Images are rotated by random whole degrees. ResNet-34 starts from ImageNet, NetVLAD from k-means of 10,000 local
+features.
+
+Recipe here: the same loss, optimiser and distances, trained from scratch. Half of the positives come from another
+visit, mining renews the descriptors every 750 steps, and images are rotated by any angle. BEVPlace++ has 2 tuples a
+step, because a step of 24 images already needs 6 GB. NetVLAD starts from random weights. The interface has no pass over
+the data before the training; `NetVLAD` is the place for k-means.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +123,7 @@ def eight_turns(images: Float[Array, "b h h"]) -> Float[Array, "8*b h h"]:
     return jnp.concatenate([jnp.rot90(x, k, (1, 2)) for x in (images, between) for k in range(4)])
 
 
-def turned_back(maps: Float[Array, "8*b h h c"]) -> Float[Array, "8 b h h c"]:
+def turned_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
     """Undo the rotations of `eight_turns`."""
     parts = [jnp.rot90(x, -(k % 4), (1, 2)) for k, x in enumerate(jnp.split(maps, 8))]
     between = resampled_maps(jnp.concatenate(parts[4:]), turned_taps(maps.shape[1], -45))
@@ -149,10 +160,10 @@ def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     return lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False).mean()
 
 
-PUBLISHED = """ResNet-34 starts from ImageNet, NetVLAD from k-means of 10,000 local features. Adam with a constant 1e-4, 4
-tuples of 1 positive and 10 hardest negatives in a step, at most 40 epochs of frames 0 to 2999 of KITTI 00. Positives
-are within 5 m, negatives beyond 7 m. Descriptors for mining are renewed once per epoch. Images are rotated by random
-whole degrees. Loss: max over the negatives of [0.3 + d_positive - d_negative]_+ with d = L2."""
+PUBLISHED = (
+    "Adam 1e-4, constant; max over negatives of [0.3 + d_positive - d_negative]_+ with d = L2; 4 tuples of 1 positive "
+    "and 10 hardest negatives, 40 epochs of KITTI 00; ResNet-34 from ImageNet, NetVLAD from k-means"
+)
 SAMPLING = TupleConfig(
     positives=1, negatives=10, positive_m=5.0, negative_m=7.0, mining="hardest", hardest=10, refresh_steps=750
 )

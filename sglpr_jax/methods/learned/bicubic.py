@@ -20,7 +20,7 @@ class Taps(NamedTuple):
 
 
 @functools.cache
-def turned_taps(size: int, degrees: float) -> Taps:
+def turned_taps(size: int, degrees: int) -> Taps:
     """Return the table that rotates an image of `size` x `size` pixels about its centre, with zeros outside.
 
     Arguments:

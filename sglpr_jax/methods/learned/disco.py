@@ -1,4 +1,14 @@
-"""DiSCO (Xu et al., 2021): the spectrum of a polar map that a U-Net computes from the occupancy of a scan."""
+"""DiSCO (Xu et al., 2021): the spectrum of a polar map that a U-Net computes from the occupancy of a scan.
+
+Published recipe: Adam with a constant 1e-5, 20 epochs of NCLT. The loss is a lazy quadruplet with margins 0.5 and 0.2
+and the farthest positive. Positives are within 1.5 m, negatives beyond 2 m. From epoch 6 on, 5 negatives are the
+hardest ones. Images are shifted by random sectors. A second head estimates the yaw, with a cross entropy over 120
+sectors.
+
+Recipe here: the same optimiser and loss, 2 tuples of 2 positives and 9 random negatives a step. The distances of
+positives and negatives are those of the other methods. The head for the yaw is left out, because place recognition does
+not use it. Trained from scratch, as published.
+"""
 
 import functools
 
@@ -136,10 +146,10 @@ def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     return (first + lazy_triplet(positive, other, margin=OTHER_MARGIN, closest_positive=False)).mean()
 
 
-PUBLISHED = """Adam with a constant 1e-5, 20 epochs of NCLT. Lazy quadruplet loss with margins 0.5 and 0.2 on squared
-L2, with the farthest of 2 positives. Positives are within 1.5 m, negatives beyond 2 m, 5 of them the hardest from epoch
-6 on. A second head estimates the yaw by phase correlation, with a cross entropy over 120 sectors and an Adam of its
-own; it is left out here, because no protocol of place recognition uses it. Images are shifted by random sectors."""
+PUBLISHED = (
+    "Adam 1e-5, constant; lazy quadruplet with margins 0.5 and 0.2 on squared L2, and cross entropy of the yaw; "
+    "positives within 1.5 m, negatives beyond 2 m, 20 epochs of NCLT"
+)
 
 DISCO = LearnedMethod(
     name="disco",
@@ -151,7 +161,5 @@ DISCO = LearnedMethod(
     prepare=prepare,
     turned=turned,
     loss=loss,
-    recipe=Recipe(
-        PUBLISHED, TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)
-    ),
+    recipe=Recipe(PUBLISHED, TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)),
 )
