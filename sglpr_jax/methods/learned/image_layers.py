@@ -1,5 +1,7 @@
 """Layers of the learned methods on images: convolution, normalisation, pooling and NetVLAD without biases."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
@@ -43,7 +45,8 @@ def batch_norm(train: bool) -> nn.BatchNorm:
 
 def max_pool(x: Float[Array, "b h w c"], *, size: int, border: int = 0) -> Float[Array, "b _ _ c"]:
     """Return the maximum of each square of `size` pixels, with stride 2. `border` is the padding on each side."""
-    return nn.max_pool(x, (size, size), (2, 2), ((border, border), (border, border)))
+    padding: Any = ((border, border), (border, border))  # Flax declares the type of the names alone.
+    return nn.max_pool(x, (size, size), (2, 2), padding)
 
 
 class NetVLAD(nn.Module):
