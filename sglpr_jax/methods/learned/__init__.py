@@ -1,7 +1,19 @@
 """Networks of other publications, trained here from random weights. Each file declares one or two methods."""
 
+from sglpr_jax.methods.learned.bevplace import BEVPLACE, RESNET34_NETVLAD
+from sglpr_jax.methods.learned.disco import DISCO
 from sglpr_jax.methods.learned.method import LearnedMethod
+from sglpr_jax.methods.learned.overlap_transformer import OVERLAP_TRANSFORMER
 from sglpr_jax.methods.learned.rinet import RINET
 
-LEARNED: dict[str, LearnedMethod] = {method.name: method for method in (RINET,)}
+LEARNED: dict[str, LearnedMethod] = {
+    method.name: method
+    for method in (
+        RINET,
+        BEVPLACE,
+        RESNET34_NETVLAD,
+        DISCO,
+        OVERLAP_TRANSFORMER,
+    )
+}
 """All learned methods by their names on the command line."""

@@ -1,0 +1,197 @@
+"""BEVPlace++ (Luo et al., 2025) on density images, and its ablation ResNet-34 + NetVLAD, which has no rotations.
+
+Published recipe: Adam with a constant 1e-4, 4 tuples a step, at most 40 epochs of frames 0 to 2999 of KITTI 00. A tuple
+has 1 random positive within 5 m and the 10 hardest negatives beyond 7 m. Mining renews the descriptors once per epoch.
+Images are rotated by random whole degrees. ResNet-34 starts from ImageNet, NetVLAD from k-means of 10,000 local
+features.
+
+Recipe here: the same loss, optimiser and distances, trained from scratch. Half of the positives come from another
+visit, mining renews the descriptors every 750 steps, and images are rotated by any angle. BEVPlace++ has 2 tuples a
+step, because a step of 24 images already needs 6 GB. NetVLAD starts from random weights. The interface has no pass over
+the data before the training; `NetVLAD` is the place for k-means.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Float, Num, UInt8
+
+from sglpr_jax.bev import rotate_image
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.density_grid import MAX_COUNT, SIZE
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.data.views import check_ready_made, picture
+from sglpr_jax.losses import descriptor_distance, lazy_triplet
+from sglpr_jax.methods.learned.bicubic import resampled, resampled_maps, resized, turned_taps
+from sglpr_jax.methods.learned.image_layers import HE, Convolution, NetVLAD, batch_norm, max_pool
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.models.convolution import convolve
+from sglpr_jax.models.layers import l2_normalize
+
+GREY = 256.0
+"""Divisor of the grey values."""
+STRIDE = 8
+"""Pixels of the image per pixel of the encoder's result."""
+DENSER = 4
+"""The local features of NetVLAD are resampled to this fraction of the image's rows and columns."""
+MARGIN = 0.3
+
+
+class Block(nn.Module):
+    """Residual block of two convolutions 3 x 3. A stride needs a shortcut with its own convolution 1 x 1."""
+
+    features: int
+    stride: int = 1
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b _ _ {self.features}"]:
+        """Return the sum of the shortcut and the convolved images, after ReLU."""
+        y = batch_norm(train)(Convolution(self.features, stride=self.stride)(x))
+        y = batch_norm(train)(Convolution(self.features)(nn.relu(y)))
+        if self.stride > 1:
+            x = batch_norm(train)(Convolution(self.features, size=1, stride=self.stride)(x))
+        return nn.relu(x + y)
+
+
+class Encoder(nn.Module):
+    """ResNet-34 until the end of its second stage: 128 channels at an eighth of the resolution."""
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "b h w"], *, train: bool) -> Float[Array, "b _ _ 128"]:
+        """Encode grey images.
+
+        The published network repeats the grey three times as colours. The sum of the kernel over the colours gives the
+        same result from one channel.
+        """
+        kernel = self.param("kernel", HE, (7, 7, 3, 64))
+        x = convolve(images[..., None], kernel.sum(2, keepdims=True), (2, 2), False)
+        x = max_pool(nn.relu(batch_norm(train)(x)), size=3, border=1)
+        for _ in range(3):
+            x = Block(64)(x, train=train)
+        x = Block(128, stride=2)(x, train=train)
+        for _ in range(3):
+            x = Block(128)(x, train=train)
+        return x
+
+
+class REIN(nn.Module):
+    """Encoder of eight rotations or one, the maximum of its results, and NetVLAD: 8192 numbers of unit length.
+
+    The image is rotated by multiples of 45 degrees, and the result of each rotation is rotated back. A quarter turn of
+    the image only permutes the rotations, so it does not change the descriptor. For this, the number of pixels minus 1
+    must be a multiple of 8; `__call__` adds zeros at the border. The published network resamples every rotation. Here
+    quarter turns are exact, so that only 45 degrees are resampled.
+
+    The encoder sees all rotations as one batch. Batch normalisation then has common statistics for the eight rotations;
+    the published network computes them for each rotation.
+    """
+
+    rotations: int = 8
+    """8, or 1 for the ablation."""
+
+    @nn.compact
+    def __call__(self, images: Num[Array, "b h h"], *, train: bool = False) -> Float[Array, "b 8192"]:
+        """Return the descriptors of grey images from 0 to 255."""
+        x = bordered(images.astype(jnp.float32) / GREY)
+        encoder = Encoder()
+        if self.rotations == 1:
+            maps = encoder(x, train=train)
+        else:
+            maps = turned_back(encoder(eight_turns(x), train=train)).max(0)
+        local = l2_normalize(resized(maps, images.shape[1] // DENSER))
+        return NetVLAD(64)(local.reshape(len(local), -1, local.shape[-1]))
+
+
+def bordered(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
+    """Add zeros on all sides, so that all resolutions of the encoder have a pixel at the centre.
+
+    Raises:
+      ValueError: If the images have an even number of rows.
+    """
+    size = images.shape[1]
+    if size % 2 == 0:
+        raise ValueError(f"expected images with an odd number of rows, found {size}")
+    side = -(size - 1) % STRIDE // 2
+    return jnp.pad(images, ((0, 0), (side, side), (side, side)))
+
+
+def eight_turns(images: Float[Array, "b h h"]) -> Float[Array, "8*b h h"]:
+    """Return the images rotated by 0, 90, 180, 270, then 45, 135, 225 and 315 degrees."""
+    between = resampled(images, turned_taps(images.shape[1], 45))
+    return jnp.concatenate([jnp.rot90(x, k, (1, 2)) for x in (images, between) for k in range(4)])
+
+
+def turned_back(maps: Float[Array, "_ h h c"]) -> Float[Array, "8 b h h c"]:
+    """Undo the rotations of `eight_turns`."""
+    parts = [jnp.rot90(x, -(k % 4), (1, 2)) for k, x in enumerate(jnp.split(maps, 8))]
+    between = resampled_maps(jnp.concatenate(parts[4:]), turned_taps(maps.shape[1], -45))
+    return jnp.concatenate([*parts[:4], between]).reshape(8, -1, *maps.shape[1:])
+
+
+def grey_image(record: Record) -> UInt8[np.ndarray, "151 151"]:
+    """Return the ready-made density image of a record, or the density image of a scan, as grey values.
+
+    Raises:
+      ValueError: If the image has another size or is no density image, or if the scan shows no place.
+    """
+    if record.points is not None:
+        check_cloud(record.points, name=record.name)
+    check_ready_made(record, "density")
+    counts = picture(record, None)[0]
+    if counts.shape != (SIZE, SIZE):
+        raise ValueError(f"{record.name}: expected a density image of {SIZE} x {SIZE} pixels, found {counts.shape}")
+    return np.rint(counts * (255 / MAX_COUNT)).clip(0, 255).astype(np.uint8)
+
+
+def turned(key: Array, images: Num[Array, "b h h"]) -> Num[Array, "b h h"]:
+    """Rotate each image about its centre by a random angle, bilinearly, with zeros outside."""
+    angles = jax.random.uniform(key, (len(images),), maxval=2 * jnp.pi)
+    rotated = rotate_image(images.astype(jnp.float32), angles)
+    return jnp.rint(rotated).astype(images.dtype)
+
+
+def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
+    """Return the mean over the tuples of max over the negatives of [0.3 + d_positive - d_negative]_+, d = L2."""
+    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others))
+    positive, negative = jnp.split(distances, [tuples.positives], axis=1)
+    return lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False).mean()
+
+
+PUBLISHED = (
+    "Adam 1e-4, constant; max over negatives of [0.3 + d_positive - d_negative]_+ with d = L2; 4 tuples of 1 positive "
+    "and 10 hardest negatives, 40 epochs of KITTI 00; ResNet-34 from ImageNet, NetVLAD from k-means"
+)
+SAMPLING = TupleConfig(
+    positives=1, negatives=10, positive_m=5.0, negative_m=7.0, mining="hardest", hardest=10, refresh_steps=750
+)
+"""The hardest negatives are drawn from the 10 most similar places. 750 steps are one published epoch."""
+
+
+def _method(name: str, source: str, *, rotations: int, tuples: int) -> LearnedMethod:
+    """Return the method of one number of rotations. All weights start at random."""
+    recipe = Recipe(PUBLISHED, SAMPLING, tuples, learning_rates=(3e-5, 1e-4, 3e-4))
+    return LearnedMethod(
+        name=name,
+        source=source,
+        licence="MIT",
+        takes="images",
+        weights=1_364_288,
+        network=REIN(rotations),
+        prepare=grey_image,
+        turned=turned,
+        loss=loss,
+        recipe=recipe,
+    )
+
+
+BEVPLACE = _method("bevplace++", 'Luo et al., "BEVPlace++", T-RO 2025, trained from scratch', rotations=8, tuples=2)
+RESNET34_NETVLAD = _method(
+    "resnet34-netvlad",
+    'Luo et al., "BEVPlace", ICCV 2023, ablation ResNet-34 + NetVLAD, trained from scratch',
+    rotations=1,
+    tuples=4,
+)
+"""The same network without rotations. It has the same weights and recipe; a step has 48 images instead of 24."""

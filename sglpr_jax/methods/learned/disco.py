@@ -1,0 +1,165 @@
+"""DiSCO (Xu et al., 2021): the spectrum of a polar map that a U-Net computes from the occupancy of a scan.
+
+Published recipe: Adam with a constant 1e-5, 20 epochs of NCLT. The loss is a lazy quadruplet with margins 0.5 and 0.2
+and the farthest positive. Positives are within 1.5 m, negatives beyond 2 m. From epoch 6 on, 5 negatives are the
+hardest ones. Images are shifted by random sectors. A second head estimates the yaw, with a cross entropy over 120
+sectors.
+
+Recipe here: the same optimiser and loss, 2 tuples of 2 positives and 9 random negatives a step. The distances of
+positives and negatives are those of the other methods. The head for the yaw is left out, because place recognition does
+not use it. Trained from scratch, as published.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Float, Float32, Shaped, UInt8
+
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.losses import descriptor_distance, lazy_triplet
+from sglpr_jax.methods.learned.image_layers import Convolution, batch_norm, max_pool
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+
+RINGS, SECTORS, LAYERS = 40, 120, 20
+NEAREST_M, FARTHEST_M = 1.0, 70.0
+"""Horizontal distances from the sensor between which points count, in metres. A ring is 1.75 m wide."""
+LOWEST_M, LAYER_M = -1.5, 0.5
+"""Height of the lowest layer relative to the sensor, and height of a layer, in metres."""
+KEPT = 32
+"""Number of lowest frequencies that are kept along the rings and along the sectors."""
+MARGIN, OTHER_MARGIN = 0.5, 0.2
+
+
+def occupancy(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "40 120 20"]:
+    """Return the occupied cells of a polar grid as 1: rings of 1.75 m, sectors of 3 degrees and layers of 0.5 m.
+
+    Sectors are counter-clockwise from x. The layers reach from 0.23 m to 10.23 m above the ground of a sensor at 1.73
+    m. The published layers are 2 m high and begin 2 m above the zero of NCLT's vehicle, so that the lower 11 of 20
+    layers stay empty. A car's scan has few points above 10 m. Here all layers can be filled, and a façade reaches
+    several of them. Points beyond 70 m are dropped; the published grid adds the corners of a square to its last ring.
+
+    Arguments:
+      points: Points in metres: x forward, y left, z up. Points that are not finite are dropped.
+    """
+    x, y, z = points[np.isfinite(points).all(axis=1)].astype(np.float64).T
+    radius, angle = np.hypot(x, y), np.arctan2(y, x) % (2 * np.pi)
+    layer = np.floor((z - LOWEST_M) / LAYER_M)
+    inside = (radius >= NEAREST_M) & (radius < FARTHEST_M) & (layer >= 0) & (layer < LAYERS)
+    ring, sector = radius * (RINGS / FARTHEST_M), angle * (SECTORS / (2 * np.pi))
+    cells = np.zeros((RINGS, SECTORS, LAYERS), np.uint8)
+    at = (part[inside].astype(np.int64) for part in (ring, sector % SECTORS, layer))
+    cells[tuple(at)] = 1
+    return cells
+
+
+class Block(nn.Module):
+    """Two convolutions 3 x 3 with batch normalisation. The sectors wrap around, and zeros surround the rings."""
+
+    features: int
+    last: str = "relu"
+    """Last activation: "relu" or "sigmoid"."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b h w c"], *, train: bool) -> Float[Array, "b h w {self.features}"]:
+        """Convolve polar maps."""
+        for activation in ("relu", self.last):
+            x = Convolution(self.features, circular=True, use_bias=True)(x)
+            x = getattr(nn, activation)(batch_norm(train)(x))
+        return x
+
+
+class DiSCO(nn.Module):
+    """U-Net of a polar occupancy grid, and the magnitudes of the 32 x 32 lowest frequencies of its map.
+
+    The published network pads the sectors with zeros and interpolates between corners that coincide. Here the sectors
+    wrap around in all layers. A rotation by 24 degrees (8 sectors) therefore does not change the descriptor. Other
+    rotations change it a little, because three poolings by 2 keep the phase of the sectors.
+    """
+
+    @nn.compact
+    def __call__(self, cells: Shaped[Array, "b 40 120 20"], *, train: bool = False) -> Float[Array, "b 1024"]:
+        """Return the descriptors, which have no unit length."""
+        x, skipped = cells.astype(jnp.float32), []
+        for features in (64, 128, 256):
+            x = Block(features)(x, train=train)
+            skipped.append(x)
+            x = max_pool(x, size=2)
+        x = Block(512)(x, train=train)
+        for features, skip in zip((256, 128, 64), reversed(skipped), strict=True):
+            x = jnp.concatenate([skip, doubled(x)], axis=-1)
+            x = Block(features, "sigmoid" if features == 64 else "relu")(x, train=train)
+        return spectrum(nn.Dense(1)(x)[..., 0])
+
+
+def doubled(x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c"]:
+    """Double the rings and the sectors of maps, bilinearly.
+
+    The corners of the rings coincide. A sector becomes two sectors a quarter to its left and right, and the sectors
+    wrap around.
+    """
+    rings = x.shape[1]
+    at = np.linspace(0, rings - 1, 2 * rings)
+    along = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(rings))).astype(np.float32)
+    x = jnp.einsum("ip,bpwc->biwc", along, x)
+    left, right = (0.75 * x + 0.25 * jnp.roll(x, shift, axis=2) for shift in (1, -1))
+    return jnp.stack([left, right], axis=3).reshape(*x.shape[:2], -1, x.shape[3])
+
+
+def spectrum(maps: Float[Array, "b 40 120"]) -> Float[Array, "b 1024"]:
+    """Return the magnitudes of the orthonormal Fourier transform at frequencies -16 to 15 along both axes."""
+    magnitude = jnp.abs(jnp.fft.fft2(maps, norm="ortho"))
+    lowest = jnp.roll(magnitude, (KEPT // 2, KEPT // 2), axis=(1, 2))[:, :KEPT, :KEPT]
+    return lowest.reshape(len(maps), -1)
+
+
+def prepare(record: Record) -> UInt8[np.ndarray, "40 120 20"]:
+    """Return the polar occupancy grid of a scan. Raises ValueError if the scan shows no place."""
+    points = record.upright_points
+    check_cloud(points, name=record.name)
+    return occupancy(points)
+
+
+def turned(key: Array, cells: Shaped[Array, "b 40 120 20"]) -> Shaped[Array, "b 40 120 20"]:
+    """Rotate each grid by a random number of sectors."""
+    shifts = jax.random.randint(key, (len(cells),), 0, SECTORS)
+    return jax.vmap(functools.partial(jnp.roll, axis=1))(cells, shifts)
+
+
+def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
+    """Return the mean lazy quadruplet loss of the tuples, with d = L2 squared and the farthest positive.
+
+    max over negatives of [0.5 + d_positive - d_negative]_+ plus max over negatives of [0.2 + d_positive - d_other]_+.
+    d_other is the distance of a negative from another negative. The anchor of the next tuple serves as the other
+    negative. It is a random place, and may rarely be near one of the negatives.
+    """
+    anchors, places = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    distance = functools.partial(descriptor_distance, squared=True)
+    positive, negative = jnp.split(distance(*jnp.broadcast_arrays(anchors, places)), [tuples.positives], axis=1)
+    others = jnp.roll(anchors, -1, axis=0)
+    other = distance(*jnp.broadcast_arrays(others, places[:, tuples.positives :]))
+    first = lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False)
+    return (first + lazy_triplet(positive, other, margin=OTHER_MARGIN, closest_positive=False)).mean()
+
+
+PUBLISHED = (
+    "Adam 1e-5, constant; lazy quadruplet with margins 0.5 and 0.2 on squared L2, and cross entropy of the yaw; "
+    "positives within 1.5 m, negatives beyond 2 m, 20 epochs of NCLT"
+)
+
+DISCO = LearnedMethod(
+    name="disco",
+    source='Xu et al., "DiSCO", RA-L 2021, with circular padding',
+    licence="MIT by the README, no licence file",
+    takes="points",
+    weights=7_798_337,
+    network=DiSCO(),
+    prepare=prepare,
+    turned=turned,
+    loss=loss,
+    recipe=Recipe(PUBLISHED, TupleConfig(positives=2, negatives=9), tuples=2, learning_rates=(3e-6, 1e-5, 1e-4)),
+)

@@ -1,0 +1,143 @@
+"""OverlapTransformer (Ma et al., 2022), rebuilt from the paper: attention between the columns of a range image.
+
+Published recipe: Adam at 5e-6, multiplied by 0.9 every 5 epochs, 100 epochs of KITTI. A step has one anchor, 6
+positives with an overlap above 0.3 and 6 negatives. The loss is the sum over the negatives of a triplet loss with
+margin 0.5, with the farthest positive.
+
+Recipe here: the same optimiser and loss, 2 tuples a step. Distances decide which places are positives, not overlaps.
+Trained from scratch, as published.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Float, Float32
+
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.losses import descriptor_distance, lazy_triplet
+from sglpr_jax.methods.learned.image_layers import HE, NetVLAD
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.models.layers import l2_normalize
+
+ROWS, COLUMNS = 64, 900
+HIGHEST_DEG, LOWEST_DEG = 15.0, -25.0
+"""Elevations of the upper border of row 0 and of the lower border of row 63."""
+FARTHEST_M = 80.0
+"""Distance at which the range image is 1. Points farther away are dropped."""
+HEIGHTS = ((4, 2, 16), (4, 2, 32), (4, 2, 64), (4, 2, 128), (2, 1, 256))
+"""Kernel height, stride and channels of each convolution. The rows become 31, 14, 6, 2 and 1."""
+CHANNELS, HEADS, HIDDEN, CLUSTERS = 256, 4, 1024, 64
+"""Outputs of the last convolution and of NetVLAD, heads and hidden units of the transformer, clusters of NetVLAD."""
+MARGIN = 0.5
+
+
+def range_image(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "64 900"]:
+    """Return the distance of the nearest point of each pixel, divided by 80 m. Pixels without points are 0.
+
+    Rows are elevations from 15 degrees down to -25, in steps of 0.625 degrees. They contain the beams of HDL-64E (2 to
+    -24.8 degrees) and VLP-16 (15 to -15), and all but the lowest beams of HDL-32E (10.7 to -30.7). Rows between the
+    beams of a sensor stay empty. Points at other elevations are dropped. Columns are azimuths of 0.4 degrees,
+    counter-clockwise from x.
+
+    Arguments:
+      points: Points in metres: x forward, y left, z up. Points that are not finite are dropped.
+    """
+    x, y, z = points[np.isfinite(points).all(axis=1)].astype(np.float64).T
+    distance, angle = np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x) % (2 * np.pi)
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    row = np.floor((HIGHEST_DEG - elevation) * (ROWS / (HIGHEST_DEG - LOWEST_DEG)))
+    inside = (distance > 0) & (distance <= FARTHEST_M) & (row >= 0) & (row < ROWS)
+    column = np.floor(angle * (COLUMNS / (2 * np.pi))) % COLUMNS
+    pixel = (row * COLUMNS + column)[inside].astype(np.int64)
+    image = np.full(ROWS * COLUMNS, np.inf)
+    np.minimum.at(image, pixel, distance[inside] / FARTHEST_M)
+    return np.where(np.isfinite(image), image, 0).astype(np.float32).reshape(ROWS, COLUMNS)
+
+
+class OverlapTransformer(nn.Module):
+    """Convolutions along the rows, one transformer layer between the columns, and NetVLAD: 256 numbers of unit length.
+
+    No layer knows the position of a column. A rotation by whole columns (0.4 degrees) therefore does not change the
+    descriptor. The paper gives the order of the layers, the sizes of the transformer and the clusters and outputs of
+    NetVLAD. These details are chosen here: the heights of the kernels, convolutions without normalisation, layer norms
+    after each part of the transformer, unit length of the local features, and the context gating.
+    """
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "b 64 900"], *, train: bool = False) -> Float[Array, "b 256"]:
+        """Return the descriptors of range images. Training and evaluation do not differ."""
+        x = images[..., None]
+        for height, stride, features in HEIGHTS:
+            x = nn.relu(dense(features, stacked(x, height=height, stride=stride)))
+        x = nn.relu(dense(CHANNELS, x[:, 0]))
+        x = jnp.concatenate([x, Transformer()(x)], axis=-1)
+        y = nn.Dense(CHANNELS)(NetVLAD(CLUSTERS)(l2_normalize(x)))
+        return l2_normalize(y * nn.sigmoid(nn.Dense(CHANNELS)(y)))
+
+
+class Transformer(nn.Module):
+    """Transformer layer without positions: self-attention and a hidden layer, each with shortcut and layer norm."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
+        """Let every column attend to all columns of its image."""
+        x = nn.LayerNorm()(x + nn.MultiHeadDotProductAttention(HEADS)(x))
+        return nn.LayerNorm()(x + dense(x.shape[-1], nn.relu(dense(HIDDEN, x))))
+
+
+def stacked(x: Float[Array, "b h w c"], *, height: int, stride: int) -> Float[Array, "b _ w {height}*c"]:
+    """Stack the rows below a kernel of one column as channels. A linear layer then acts as the convolution."""
+    last = (x.shape[1] - height) // stride * stride + 1
+    return jnp.concatenate([x[:, i : i + last : stride] for i in range(height)], axis=-1)
+
+
+def dense(features: int, x: Float[Array, "*b c"]) -> Float[Array, "*b {features}"]:
+    """Apply a new linear layer as one product of two matrices, which is faster on a CPU."""
+    y = nn.Dense(features, kernel_init=HE)(x.reshape(-1, x.shape[-1]))
+    return y.reshape(*x.shape[:-1], features)
+
+
+def prepare(record: Record) -> Float32[np.ndarray, "64 900"]:
+    """Return the range image of a scan. Raises ValueError if the scan shows no place."""
+    points = record.upright_points
+    check_cloud(points, name=record.name)
+    return range_image(points)
+
+
+def turned(key: Array, images: Float[Array, "b 64 900"]) -> Float[Array, "b 64 900"]:
+    """Rotate each image by a random number of columns."""
+    shifts = jax.random.randint(key, (len(images),), 0, COLUMNS)
+    return jax.vmap(lambda image, shift: jnp.roll(image, shift, axis=1))(images, shifts)
+
+
+def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
+    """Return the mean over the tuples of the sum over negatives of [0.5 + d_positive - d_negative]_+.
+
+    d is L2 squared, and d_positive is the distance of the farthest positive.
+    """
+    anchors, others = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
+    distances = descriptor_distance(*jnp.broadcast_arrays(anchors, others), squared=True)
+    positive, negative = jnp.split(distances, [tuples.positives], axis=1)
+    return lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False, reduction="sum").mean()
+
+
+PUBLISHED = (
+    "Adam 5e-6, times 0.9 every 5 epochs; sum over negatives of [0.5 + d_positive - d_negative]_+ with d = L2 squared; "
+    "1 tuple of 6 positives (overlap above 0.3) and 6 negatives, 100 epochs of KITTI"
+)
+
+OVERLAP_TRANSFORMER = LearnedMethod(
+    name="overlap-transformer",
+    source='Ma et al., "OverlapTransformer", RA-L 2022, rebuilt from the paper',
+    licence="GPL-3.0, not read",
+    takes="points",
+    weights=9_484_848,
+    network=OverlapTransformer(),
+    prepare=prepare,
+    turned=turned,
+    loss=loss,
+    recipe=Recipe(PUBLISHED, TupleConfig(positives=6, negatives=6), tuples=2, learning_rates=(2e-6, 5e-6, 1e-4)),
+)
