@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from flax import linen as nn
@@ -25,6 +25,7 @@ class Tuples(NamedTuple):
     """Number of positives of each anchor."""
 
 
+@runtime_checkable
 class Compare(Protocol):
     """Distance of descriptors that needs the weights of the network."""
 
