@@ -199,7 +199,10 @@ def test_points_that_are_not_finite_are_ignored(places):
 
 @pytest.mark.parametrize(
     ("points", "words"),
-    [([[5, 0, -1.7], [6, 0, -1.6]], "scan 7: expected points within 40 m"), ([[np.nan] * 3], "scan 7: expected finite")],
+    [
+        ([[5, 0, -1.7], [6, 0, -1.6]], "scan 7: expected points within 40 m"),
+        ([[np.nan] * 3], "scan 7: expected finite"),
+    ],
 )
 def test_a_scan_without_a_place_is_named(points, words):
     with pytest.raises(ValueError, match=words):

@@ -15,7 +15,6 @@ from sglpr_jax.methods.handcrafted.ssc import SSC, SSC_24
 from sglpr_jax.methods.handcrafted.thumbnail import THUMBNAIL
 from sglpr_jax.methods.method import HandcraftedMethod
 
-HANDCRAFTED: dict[str, HandcraftedMethod] = {
-    method.name: method for method in (SCAN_CONTEXT, M2DP, LIDAR_IRIS, SSC, SSC_24, SOLID, RING, PROBE, POLAR_FFT, THUMBNAIL, RANDOM)
-}
+_METHODS = (SCAN_CONTEXT, M2DP, LIDAR_IRIS, SSC, SSC_24, SOLID, RING, PROBE, POLAR_FFT, THUMBNAIL, RANDOM)
+HANDCRAFTED: dict[str, HandcraftedMethod] = {method.name: method for method in _METHODS}
 """All handcrafted methods by their names on the command line."""

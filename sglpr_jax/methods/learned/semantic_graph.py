@@ -62,7 +62,9 @@ def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
     found = [_nodes(points[classes == category], column, rule) for column, (category, rule) in enumerate(RULES.items())]
     counts, nodes = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(nodes) == 0:
-        raise ValueError(f"{record.name}: expected clusters of {len(RULES)} classes, found none in {len(points)} points")
+        raise ValueError(
+            f"{record.name}: expected clusters of {len(RULES)} classes, found none in {len(points)} points"
+        )
     largest = np.sort(np.argsort(-counts, kind="stable")[:NODES])
     return np.pad(nodes[largest], ((0, NODES - len(largest)), (0, 0)))
 

@@ -135,9 +135,7 @@ def _logits(variables: Variables, queries: Float[Array, "q 32"], others: Float[A
 
 
 @jax.jit
-def compare(
-    variables: Variables, queries: Float[Array, "q 32"], database: Float[Array, "n 32"]
-) -> Float[Array, "q n"]:
+def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float[Array, "n 32"]) -> Float[Array, "q n"]:
     """Return -log(p) of the probability p that two graphs show the same place. The query is the first graph of a pair.
 
     The published score is p. Its negative logarithm has the same order, and distinguishes pairs whose p rounds to 1.
@@ -152,7 +150,7 @@ def turned(key: Array, graphs: Float[Array, "b n 15"]) -> Float[Array, "b n 15"]
 
 
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the mean binary cross-entropy of the anchors with their positives (1) and negatives (0), in both orders."""
+    """Return the mean binary cross-entropy of each anchor with its positives (1) and negatives (0), in both orders."""
 
     def of_tuple(vectors: Float[Array, "k d"]) -> Float[Array, "k-1"]:
         anchor, others = vectors[:1], vectors[1:]
