@@ -25,6 +25,7 @@ from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.losses import descriptor_distance, lazy_triplet
+from sglpr_jax.methods.learned.maximum import maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
 from sglpr_jax.methods.voxel_means import voxel_means
 from sglpr_jax.models.layers import l2_normalize
@@ -71,7 +72,7 @@ class TNet(nn.Module):
         """Return the transformed points."""
         b, n, c = points.shape
         features = Mlp((64, 128, 1024), normalised=True)(points.reshape(b * n, c), train=train)
-        whole = Mlp((512, 256), normalised=True)(features.reshape(b, n, -1).max(1), train=train)
+        whole = Mlp((512, 256), normalised=True)(maximum(features.reshape(b, n, -1), 1), train=train)
         matrix = nn.Dense(c * c, kernel_init=nn.initializers.zeros)(whole).reshape(b, c, c)
         return points @ (matrix + jnp.eye(c)[None])
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from sglpr_jax.bev import rotate_points
 from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.methods.learned.maximum import maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
 from sglpr_jax.methods.learned.semantic_graph import semantic_graph
 
@@ -59,7 +60,7 @@ class EdgeConv(nn.Module):
         relative = nn.Dense(self.features, use_bias=False, name="relative")(x)
         own = nn.Dense(self.features, use_bias=False, name="own")(x) - relative
         edges = jax.vmap(lambda rows, places: rows[places])(relative, neighbours) + own[:, :, None]
-        return nn.leaky_relu(batch_norm()(edges, use_running_average=not train), 0.2).max(2)
+        return maximum(nn.leaky_relu(batch_norm()(edges, use_running_average=not train), 0.2), 2)
 
 
 class Attention(nn.Module):
