@@ -1,8 +1,8 @@
 """PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD. The TensorFlow form of its authors.
 
-Published recipe: Adam 5e-5, times 0.9 every 5 epochs and at least 1e-5, for 20 epochs; 2 tuples of 2 positives within
-10 m, 18 negatives beyond 50 m and 1 other negative; hard negatives from epoch 6 on; the submaps of Oxford are not
-rotated; the decay of batch normalisation rises from 0.5 to 0.99.
+Published recipe: Adam 5e-5, times 0.9 every 5 epochs and at least 1e-5, for 20 epochs. A step has 2 tuples of 2
+positives within 10 m, 18 negatives beyond 50 m and 1 other negative. Hard negatives come from epoch 6 on. The submaps
+of Oxford are not rotated. The decay of batch normalisation rises from 0.5 to 0.99.
 
 Recipe here: the same loss, optimiser and distances, with a constant learning rate, 8 negatives and no mining. A step of
 22 scans needs 4 GB, one of 44 would need 8 GB. Scans are rotated. The statistics of batch normalisation decay by 0.9

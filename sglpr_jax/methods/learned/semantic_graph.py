@@ -47,7 +47,7 @@ FINER = 4
 
 
 def semantic_graph(record: Record) -> Float32[np.ndarray, "100 15"]:
-    """Return up to 100 nodes: x, y, z of the centre in metres, and the class as 12 numbers, of which one is 1.
+    """Return up to 100 nodes: x, y, z of the centre in metres, and the class as 12 numbers, one 1 and eleven 0.
 
     Missing nodes are zeros. If a scan has more than 100 clusters, those with the most points remain. The published
     graph has 100 random ones, and takes clusters from the instances of SemanticKITTI where a scan has them.

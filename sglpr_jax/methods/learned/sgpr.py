@@ -1,8 +1,8 @@
 """SGPR (Kong et al., 2020): a network on the semantic graph of a scan, with a learned comparison of two graphs.
 
-Published recipe: Adam 1e-3 with weight decay 5e-4, for 500 epochs of batches of 128 pairs; a pair within 3 m is
-positive, one beyond 20 m negative; binary cross-entropy of both orders of a pair; graphs are rotated, scaled, jittered,
-shifted and mirrored.
+Published recipe: Adam 1e-3 with weight decay 5e-4, for 500 epochs of batches of 128 pairs. A pair within 3 m is
+positive, one beyond 20 m negative. The loss is the binary cross-entropy of both orders of a pair. Graphs are rotated,
+scaled, jittered, shifted and mirrored.
 
 Recipe here: the same loss, optimiser and distances. The pairs are those of an anchor with the places of its tuple.
 Graphs are only rotated.
