@@ -10,6 +10,8 @@ HANDCRAFTED_NAMES = (
     "ssc",
     "ssc-24",
     "solid",
+    "ring",
+    "probe",
     "polar-fft",
     "thumbnail",
     "random",

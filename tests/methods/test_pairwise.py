@@ -6,6 +6,8 @@ import pytest
 
 from sglpr_jax.methods import pairwise
 from sglpr_jax.methods.handcrafted.lidar_iris import lidar_iris
+from sglpr_jax.methods.handcrafted.probe import probe
+from sglpr_jax.methods.handcrafted.ring import ring
 from sglpr_jax.methods.handcrafted.scan_context import scan_context
 from sglpr_jax.methods.handcrafted.ssc import ssc, ssc_24
 from sglpr_jax.retrieval.distances import DISTANCES
@@ -70,6 +72,8 @@ def test_blocks_change_no_distance(places, monkeypatch, name):
     rows = {
         "scan-context": lambda points, _: scan_context(points),
         "lidar-iris": lambda points, _: lidar_iris(points),
+        "ring": lambda points, _: ring(points),
+        "probe": lambda points, _: probe(points),
         "ssc": ssc,
         "ssc-24": ssc_24,
     }.get(name, lambda points, _: points[:4].ravel())

@@ -1,10 +1,11 @@
 """SOLiD (Kim et al., 2024): number of points at each range. Elevations with more points have a higher weight."""
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from sglpr_jax.methods.method import HandcraftedMethod
 from sglpr_jax.methods.unit_length import unit_length
+from sglpr_jax.methods.voxel_means import voxel_means
 
 RANGES = 40
 ELEVATIONS = 32
@@ -27,7 +28,7 @@ def solid(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "40"]:
     not used for retrieval and are left out.
     """
     near = np.linalg.norm(points.astype(np.float64), axis=1)
-    x, y, z = _voxel_means(points[(near >= NEAREST_M) & (near <= FARTHEST_M)]).T
+    x, y, z = voxel_means(points[(near >= NEAREST_M) & (near <= FARTHEST_M)], VOXEL_M).T
     radius = np.hypot(x, y)
     share = (np.degrees(np.arctan2(z, radius)) - LOWEST_DEG) / (HIGHEST_DEG - LOWEST_DEG)
     row = np.minimum(radius / FARTHEST_M * RANGES, RANGES - 1).astype(np.int64)
@@ -36,14 +37,6 @@ def solid(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "40"]:
     number = counts.sum(axis=0).astype(np.float64)
     weights = (number - number.min()) / max(np.ptp(number), 1)
     return unit_length((counts @ weights)[None])[0]
-
-
-def _voxel_means(points: Float32[np.ndarray, "n 3"]) -> Float64[np.ndarray, "voxels 3"]:
-    """Return the mean of the points of each occupied voxel."""
-    cells = np.floor(points / VOXEL_M).astype(np.int64)
-    _, voxel, counts = np.unique(cells @ [1 << 40, 1 << 20, 1], return_inverse=True, return_counts=True)
-    sums = [np.bincount(voxel, weights=axis, minlength=len(counts)) for axis in points.T]
-    return np.stack(sums, axis=1) / counts[:, None]
 
 
 SOLID = HandcraftedMethod(

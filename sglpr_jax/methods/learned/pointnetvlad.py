@@ -1,0 +1,194 @@
+"""PointNetVLAD (Uy and Lee, 2018): features of points, pooled by NetVLAD. The TensorFlow form of its authors.
+
+Published recipe: Adam 5e-5, times 0.9 every 5 epochs and at least 1e-5, for 20 epochs. A step has 2 tuples of 2
+positives within 10 m, 18 negatives beyond 50 m and 1 other negative. Hard negatives come from epoch 6 on. The submaps
+of Oxford are not rotated. The decay of batch normalisation rises from 0.5 to 0.99.
+
+Recipe here: the same loss, optimiser and distances, with a constant learning rate, 8 negatives and no mining. A step of
+22 scans needs 4 GB, one of 44 would need 8 GB. Scans are rotated. The statistics of batch normalisation decay by 0.9
+per step. The input is one scan instead of a submap of 20 m.
+
+The PyTorch port of others differs in batch normalisation, activations, the choice of the positive and the learning
+rate. It is not followed.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Float, Float32, Int
+
+from sglpr_jax.bev import rotate_points
+from sglpr_jax.data.degenerate import check_cloud
+from sglpr_jax.data.record import Record
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.losses import descriptor_distance, lazy_triplet
+from sglpr_jax.methods.learned.maximum import maximum
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.methods.voxel_means import voxel_means
+from sglpr_jax.models.layers import l2_normalize
+
+POINTS = 4096
+RANGE_M = 40.0
+"""Points farther than this are dropped, and coordinates are divided by it."""
+GROUND_M = -1.4
+"""Points at or below this height above the sensor count as ground, in metres. The ground is at -1.73 m."""
+VOXEL_M = 0.4
+"""Side of the voxels whose means replace the points, as in the authors' submaps."""
+CLUSTERS = 64
+NUMBERS = 256
+MARGIN, OTHER_MARGIN = 0.5, 0.2
+
+
+class Mlp(nn.Module):
+    """Linear layers with ReLU, applied to every row. With `normalised`, each has batch normalisation before ReLU."""
+
+    widths: Sequence[int]
+    normalised: bool = False
+
+    @nn.compact
+    def __call__(self, rows: Float[Array, "n c"], *, train: bool) -> Float[Array, "n _"]:
+        """Return the features of the last layer."""
+        for width in self.widths:
+            rows = nn.Dense(width, kernel_init=nn.initializers.glorot_uniform())(rows)
+            if self.normalised:
+                rows = normalised(train)(rows)
+            rows = nn.relu(rows)
+        return rows
+
+
+def normalised(train: bool) -> nn.BatchNorm:
+    """Return a batch normalisation with TensorFlow's epsilon."""
+    return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-3)
+
+
+class TNet(nn.Module):
+    """Predicts a matrix from all points of a scan and multiplies each point by it. It starts as the identity."""
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "b n c"], *, train: bool) -> Float[Array, "b n c"]:
+        """Return the transformed points."""
+        b, n, c = points.shape
+        features = Mlp((64, 128, 1024), normalised=True)(points.reshape(b * n, c), train=train)
+        whole = Mlp((512, 256), normalised=True)(maximum(features.reshape(b, n, -1), 1), train=train)
+        matrix = nn.Dense(c * c, kernel_init=nn.initializers.zeros)(whole).reshape(b, c, c)
+        return points @ (matrix + jnp.eye(c)[None])
+
+
+class Vlad(nn.Module):
+    """NetVLAD with batch normalisation and context gating.
+
+        a[n, k] = softmax over k of BN(x W);  v[d, k] = sum over n of a[n, k] (x[n, d] - centre[d, k])
+
+    v has length 1 over d, then as a whole. y = BN(v H), and the result is y * sigmoid(BN(y G)).
+    """
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "b n d"], *, train: bool) -> Float[Array, "b 256"]:
+        """Pool the features of each scan."""
+        b, n, d = features.shape
+        init = nn.initializers.normal(d**-0.5)
+        logits = nn.Dense(CLUSTERS, use_bias=False, kernel_init=init, name="clusters")(features.reshape(b * n, d))
+        share = nn.softmax(normalised(train)(logits)).reshape(b, n, CLUSTERS)
+        centres = self.param("centres", init, (d, CLUSTERS))
+        residuals = features.swapaxes(1, 2) @ share - share.sum(1)[:, None] * centres[None]
+        vlad = l2_normalize(l2_normalize(residuals, axis=1).reshape(b, -1))
+        hidden = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(CLUSTERS**-0.5), name="hidden")
+        y = normalised(train)(hidden(vlad))
+        gate = nn.Dense(NUMBERS, use_bias=False, kernel_init=nn.initializers.normal(NUMBERS**-0.5), name="gate")
+        return y * nn.sigmoid(normalised(train)(gate(y)))
+
+
+class PointNetVlad(nn.Module):
+    """PointNet without its last pooling, and NetVLAD: 256 numbers of unit length. The order of points has no effect."""
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "b n 3"], *, train: bool = False) -> Float[Array, "b 256"]:
+        """Return the descriptors of scans whose coordinates are between -1 and 1."""
+        b, n, _ = points.shape
+        moved = TNet()(points, train=train)
+        features = Mlp((64, 64))(moved.reshape(b * n, 3), train=train)
+        moved = TNet()(features.reshape(b, n, -1), train=train)
+        features = Mlp((64, 128, 1024))(moved.reshape(b * n, -1), train=train)
+        return l2_normalize(Vlad()(l2_normalize(features).reshape(b, n, -1), train=train))
+
+
+def scaled_points(record: Record) -> Float32[np.ndarray, "4096 3"]:
+    """Return 4096 points above the ground, with coordinates between -1 and 1.
+
+    The points are the means of the voxels of 0.4 m. They are drawn without replacement with the same seed for every
+    scan. If a scan has fewer voxels, all are used, and some of them are drawn again.
+
+    Raises:
+      ValueError: If the scan shows no place, or has no points above the ground within 40 m.
+    """
+    points = record.upright_points
+    check_cloud(points, name=record.name)
+    points = points[np.isfinite(points).all(axis=1)]
+    near = points[(points[:, 2] > GROUND_M) & (np.linalg.norm(points, axis=1) < RANGE_M)]
+    if len(near) == 0:
+        raise ValueError(
+            f"{record.name}: expected points within {RANGE_M:g} m and above {GROUND_M:g} m, found none of {len(points)}"
+        )
+    means = voxel_means(near, VOXEL_M)
+    return (means[_drawn(len(means))] / RANGE_M).astype(np.float32)
+
+
+def _drawn(available: int) -> Int[np.ndarray, "4096"]:
+    """Return 4096 row numbers below `available`."""
+    rng = np.random.default_rng(0)
+    if available >= POINTS:
+        return rng.choice(available, POINTS, replace=False)
+    return np.concatenate([np.arange(available), rng.choice(available, POINTS - available)])
+
+
+def turned(key: Array, points: Float[Array, "b n 3"]) -> Float[Array, "b n 3"]:
+    """Rotate each scan by a random angle."""
+    return rotate_points(points, jax.random.uniform(key, (len(points),), maxval=2 * jnp.pi))
+
+
+def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
+    """Return the lazy quadruplet loss, averaged over the tuples.
+
+        max over negatives of [0.5 + d(anchor, p) - d(anchor, n)]_+ + the same of [0.2 + d(anchor, p) - d(o, n)]_+
+
+    d is the squared L2 distance and p the closest positive. The published other negative o is far from all places of
+    the tuple. Here it is the anchor of the next tuple, because tuples have no more places. Its distance from the
+    negatives is not checked. A single tuple has no second term.
+    """
+    anchors, others = tuples.descriptors[:, 0], tuples.descriptors[:, 1:]
+    positive, negative = jnp.split(_squares(anchors, others), [tuples.positives], axis=1)
+    total = lazy_triplet(positive, negative, margin=MARGIN)
+    if len(anchors) > 1:
+        between = _squares(jnp.roll(anchors, -1, axis=0), others)[:, tuples.positives :]
+        total = total + lazy_triplet(positive, between, margin=OTHER_MARGIN)
+    return total.mean()
+
+
+def _squares(one: Float[Array, "t d"], several: Float[Array, "t k d"]) -> Float[Array, "t k"]:
+    return descriptor_distance(jnp.broadcast_to(one[:, None], several.shape), several, squared=True)
+
+
+POINTNETVLAD = LearnedMethod(
+    name="pointnetvlad",
+    source='Uy and Lee, "PointNetVLAD", CVPR 2018, TensorFlow form',
+    licence="MIT",
+    takes="points",
+    weights=19_784_393,
+    network=PointNetVlad(),
+    prepare=scaled_points,
+    turned=turned,
+    loss=loss,
+    recipe=Recipe(
+        published=(
+            "Adam 5e-5, times 0.9 every 5 epochs, at least 1e-5; lazy quadruplet loss with margins 0.5 and 0.2 and "
+            "squared distances; 2 tuples of 2 positives within 10 m, 18 negatives beyond 50 m and 1 other negative; 20 "
+            "epochs; hard negatives from epoch 6; no rotations"
+        ),
+        sampling=TupleConfig(positives=2, negatives=8, positive_m=10.0, negative_m=50.0),
+        tuples=2,
+        learning_rates=(1.5e-5, 5e-5, 1.5e-4),
+    ),
+)

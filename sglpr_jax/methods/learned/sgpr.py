@@ -1,0 +1,186 @@
+"""SGPR (Kong et al., 2020): a network on the semantic graph of a scan, with a learned comparison of two graphs.
+
+Published recipe: Adam 1e-3 with weight decay 5e-4, for 500 epochs of batches of 128 pairs. A pair within 3 m is
+positive, one beyond 20 m negative. The loss is the binary cross-entropy of both orders of a pair. Graphs are rotated,
+scaled, jittered, shifted and mirrored.
+
+Recipe here: the same loss, optimiser and distances. The pairs are those of an anchor with the places of its tuple.
+Graphs are only rotated.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Array, Float, Int
+
+from sglpr_jax.bev import rotate_points
+from sglpr_jax.data.sampling.config import TupleConfig
+from sglpr_jax.methods.learned.maximum import maximum
+from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.methods.learned.semantic_graph import semantic_graph
+
+NEIGHBOURS = 10
+WIDTHS = (64, 64, 32)
+NUMBERS = WIDTHS[-1]
+TENSORS = 16
+"""Number of bilinear forms that compare two graphs."""
+TIE = 1e-4
+"""Weight of the distance in space, per metre, among nodes whose classes are equally near."""
+
+
+def batch_norm() -> nn.BatchNorm:
+    """Return a batch normalisation with PyTorch's settings."""
+    return nn.BatchNorm(momentum=0.9, epsilon=1e-5)
+
+
+def nearest(squares: Float[Array, "b n n"]) -> Int[Array, "b n 10"]:
+    """Return the numbers of the 10 nearest nodes of each node, itself included."""
+    return jax.lax.top_k(-squares, NEIGHBOURS)[1]
+
+
+def squared_distances(x: Float[Array, "b n c"]) -> Float[Array, "b n n"]:
+    """Return the squared distances of all pairs of nodes."""
+    square = jnp.square(x).sum(-1)
+    return square[:, :, None] + square[:, None, :] - 2 * x @ x.swapaxes(1, 2)
+
+
+class EdgeConv(nn.Module):
+    """Maximum over the neighbours j of LeakyReLU(BN(W [x_j - x_i, x_i])), without bias.
+
+    W [x_j - x_i, x_i] = A x_j + (B - A) x_i, so each node is multiplied only once.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "b n c"], neighbours: Int[Array, "b n 10"], *, train: bool
+    ) -> Float[Array, "b n {self.features}"]:
+        """Return the features of the nodes."""
+        relative = nn.Dense(self.features, use_bias=False, name="relative")(x)
+        own = nn.Dense(self.features, use_bias=False, name="own")(x) - relative
+        edges = jax.vmap(lambda rows, places: rows[places])(relative, neighbours) + own[:, :, None]
+        return maximum(nn.leaky_relu(batch_norm()(edges, use_running_average=not train), 0.2), 2)
+
+
+class Attention(nn.Module):
+    """Sum of the nodes x_i, weighted by sigmoid(x_i . tanh(mean of W x))."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b c"]:
+        """Return the vector of each graph."""
+        init = nn.initializers.glorot_uniform()
+        context = nn.tanh(nn.Dense(x.shape[-1], use_bias=False, kernel_init=init)(x).mean(1))
+        weights = nn.sigmoid((x * context[:, None]).sum(-1))
+        return (x * weights[..., None]).sum(1)
+
+
+class TensorNetwork(nn.Module):
+    """Compares vectors a and b of two graphs by relu(a T b + V [a, b] + bias), and two linear layers."""
+
+    @nn.compact
+    def __call__(self, queries: Float[Array, "q c"], others: Float[Array, "n c"]) -> Float[Array, "q n"]:
+        """Return log(p / (1 - p)) of the probability p that two graphs show the same place, for all pairs."""
+        c = queries.shape[1]
+        init = nn.initializers.glorot_uniform()
+        tensor = self.param("tensor", init, (c, c, TENSORS))
+        linear = self.param("linear", init, (2 * c, TENSORS))
+        bias = self.param("bias", init, (TENSORS, 1))[:, 0]
+        bilinear = jnp.einsum("qc,cdk,nd->qnk", queries, tensor, others)
+        plain = (queries @ linear[:c])[:, None] + (others @ linear[c:])[None]
+        hidden = nn.relu(nn.Dense(16, name="hidden")(nn.relu(bilinear + plain + bias[None, None])))
+        return nn.Dense(1, name="score")(hidden)[..., 0]
+
+
+class Sgpr(nn.Module):
+    """Three layers of EdgeConv on positions and on classes, and attention: a vector of 32 numbers.
+
+    Each layer has its own neighbours: the nearest nodes by its features. Missing nodes take part like others, as
+    published. Classes have equal distances, so the published neighbours of the first layer depend on the order of the
+    nodes. Here nodes that are nearer in space come first, and the order has no effect.
+    """
+
+    def setup(self):
+        """Create the parts."""
+        self.space = [EdgeConv(width) for width in WIDTHS]
+        self.kinds = [EdgeConv(width) for width in WIDTHS]
+        self.joint = nn.Dense(NUMBERS, use_bias=False)
+        self.norm = batch_norm()
+        self.attention = Attention()
+        self.comparison = TensorNetwork()
+
+    def __call__(self, graphs: Float[Array, "b n 15"], *, train: bool = False) -> Float[Array, "b 32"]:
+        """Return the vectors of graphs: nodes with x, y, z in metres and a class as 12 numbers."""
+        space, kinds = graphs[..., :3], graphs[..., 3:]
+        ties = TIE * jnp.sqrt(jnp.maximum(squared_distances(space), 0))
+        for depth, (of_space, of_kinds) in enumerate(zip(self.space, self.kinds, strict=True)):
+            space = of_space(space, nearest(squared_distances(space)), train=train)
+            apart = squared_distances(kinds) + (ties if depth == 0 else 0)
+            kinds = of_kinds(kinds, nearest(apart), train=train)
+        both = self.joint(jnp.concatenate([space, kinds], axis=-1))
+        vectors = self.attention(nn.leaky_relu(self.norm(both, use_running_average=not train), 0.2))
+        if self.is_initializing():
+            self.comparison(vectors, vectors)
+        return vectors
+
+    def logits(self, queries: Float[Array, "q 32"], others: Float[Array, "n 32"]) -> Float[Array, "q n"]:
+        """Return the result of `TensorNetwork` for all pairs."""
+        return self.comparison(queries, others)
+
+
+NETWORK = Sgpr()
+
+
+def _logits(variables: Variables, queries: Float[Array, "q 32"], others: Float[Array, "n 32"]) -> Float[Array, "q n"]:
+    return NETWORK.apply({"params": variables["params"]}, queries, others, method="logits")
+
+
+@jax.jit
+def compare(variables: Variables, queries: Float[Array, "q 32"], database: Float[Array, "n 32"]) -> Float[Array, "q n"]:
+    """Return -log(p) of the probability p that two graphs show the same place. The query is the first graph of a pair.
+
+    The published score is p. Its negative logarithm has the same order, and distinguishes pairs whose p rounds to 1.
+    """
+    return jax.lax.map(lambda query: nn.softplus(-_logits(variables, query[None], database)[0]), queries)
+
+
+def turned(key: Array, graphs: Float[Array, "b n 15"]) -> Float[Array, "b n 15"]:
+    """Rotate each graph about z by a random angle."""
+    angles = jax.random.uniform(key, (len(graphs),), maxval=2 * jnp.pi)
+    return graphs.at[..., :3].set(rotate_points(graphs[..., :3], angles))
+
+
+def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
+    """Return the mean binary cross-entropy of each anchor with its positives (1) and negatives (0), in both orders."""
+
+    def of_tuple(vectors: Float[Array, "k d"]) -> Float[Array, "k-1"]:
+        anchor, others = vectors[:1], vectors[1:]
+        same = jnp.arange(len(others)) < tuples.positives
+        orders = (_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0])
+        return sum(nn.softplus(jnp.where(same, -logits, logits)) for logits in orders) / 2
+
+    return jax.vmap(of_tuple)(tuples.descriptors).mean()
+
+
+SGPR = LearnedMethod(
+    name="sgpr",
+    source='Kong et al., "Semantic Graph Based Place Recognition for 3D Point Clouds", IROS 2020',
+    licence="MIT",
+    takes="labelled points",
+    weights=47_985,
+    network=NETWORK,
+    prepare=semantic_graph,
+    turned=turned,
+    loss=loss,
+    recipe=Recipe(
+        published=(
+            "Adam 1e-3 with weight decay 5e-4; binary cross-entropy of 128 pairs in both orders; positives within 3 m, "
+            "negatives beyond 20 m; 500 epochs"
+        ),
+        sampling=TupleConfig(positives=1, negatives=3, positive_m=3.0, negative_m=20.0),
+        tuples=32,
+        learning_rates=(3e-4, 1e-3, 3e-3),
+        weight_decay=5e-4,
+    ),
+    compare=compare,
+)
