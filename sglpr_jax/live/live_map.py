@@ -168,6 +168,7 @@ class LiveMap:
             self._log.append(loops)
             if time.monotonic() - self._synced > SYNC_S:
                 self._journal.sync()
+                self._log.sync()
                 self._synced = time.monotonic()
         except OSError as error:
             self._report("disk", f"{error}; the map is not written any more, and a restart continues before this scan")

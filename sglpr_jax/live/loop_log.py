@@ -30,14 +30,19 @@ class LoopLog:
         return missed
 
     def append(self, loops: Sequence[Loop]) -> None:
-        """Add loops at the end of the file and wait until the disk has them. Raises WriteError."""
+        """Add loops at the end of the file. They survive the end of the process. Raises WriteError."""
         if not loops:
             return
         assert self._file is not None
         content = loop_lines(loops).encode()
         with writing(self.path):
             os.write(self._file, content)
-            os.fsync(self._file)
+
+    def sync(self) -> None:
+        """Wait until the disk has all loops. Raises WriteError."""
+        if self._file is not None:
+            with writing(self.path):
+                os.fsync(self._file)
 
     def close(self) -> None:
         """Close the file."""

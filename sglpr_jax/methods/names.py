@@ -18,7 +18,15 @@ HANDCRAFTED_NAMES = (
 )
 METHODS = (NETWORK, *HANDCRAFTED_NAMES)
 """Names of the methods that need no trained weights of their own, or have shipped ones."""
-LEARNED_NAMES = ("rinet",)
+LEARNED_NAMES = (
+    "rinet",
+    "bevplace++",
+    "resnet34-netvlad",
+    "disco",
+    "overlap-transformer",
+    "pointnetvlad",
+    "sgpr",
+)
 """Names of the networks of other publications. Their weights are trained by the user."""
 UNTRAINED, SHIPPED = "untrained", "shipped"
 """Methods for comparison with a newly trained network: the same network with random weights, and the default
