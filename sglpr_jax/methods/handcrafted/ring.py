@@ -82,7 +82,7 @@ def ring_distance(
 
 
 def _standardised(rows: Float32[np.ndarray, "n 3660"]) -> Float32[np.ndarray, "n 61 60"]:
-    """Return the magnitudes with mean 0 and length 1 over all 120 frequencies, of which 59 occur twice."""
+    """Return the magnitudes with mean 0 and length 1 over all 120 frequencies. 59 of them occur twice."""
     times = np.full(FREQUENCIES, 2.0)
     times[[0, -1]] = 1
     magnitudes = rows.reshape(-1, ANGLES, FREQUENCIES).astype(np.float64)
