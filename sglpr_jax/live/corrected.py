@@ -40,7 +40,7 @@ class CorrectedTrajectory:
 
 
 def corrected_trajectory(live: LiveMap, *, odometry: bool, report: Report) -> CorrectedTrajectory | None:
-    """Create the trajectory of a map with odometry. Without gtsam, the result is None and a line says so."""
+    """Create the trajectory of a map with odometry. Without gtsam, report a line and return None."""
     if not odometry:
         return None
     try:

@@ -186,7 +186,7 @@ class IncrementalTrajectory:
         return float(error @ np.linalg.solve(rotation_first(loop.covariance), error)) > AGREES**2
 
     def _place(self, node: int, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Insert the nodes of a segment, one of which has a known pose."""
+        """Insert the nodes of a segment. The pose of one node is known."""
         segment = self._segment(node)
         self._placed.add(segment)
         nodes = [one for one, its in zip(self._nodes, self._segments, strict=True) if its == segment]
