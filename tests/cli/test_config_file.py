@@ -35,6 +35,7 @@ LINES = {
     ),
     "loops": ("scans", "--out", "found", "--seq", "1_0", "--near-m", "inf", "--candidates.rivals.age", "0", "1e-1"),
     "map": ("scans", "--poses", "poses.tum", "--out", "a.safetensors", "--spacing-m", "0", "--skip-bad"),
+    "peers": ("train", "rinet", "towns", "1e3", "--out", "run", "--learning-rate", "1e-3", "--held-out", "no"),
     "relocalize": ("drive", "--map", "a.safetensors", "--frame", "0", "--sensor-height", "estimate"),
     "reproduce": ("table1", "figure5", "--preset", "paper", "--seq", "00", "07", "--loss.margin", "0.25"),
     "segment": ("--data", "scans", "--out", "maps", "--min-confidence", "1", "--seq", "null"),
