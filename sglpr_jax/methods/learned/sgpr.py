@@ -132,7 +132,7 @@ NETWORK = Sgpr()
 
 
 def _logits(variables: Variables, queries: Float[Array, "q 32"], others: Float[Array, "n 32"]) -> Float[Array, "q n"]:
-    return NETWORK.apply({"params": variables["params"]}, queries, others, method="logits")
+    return jnp.asarray(NETWORK.apply({"params": variables["params"]}, queries, others, method="logits"))
 
 
 @jax.jit
@@ -156,8 +156,8 @@ def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
     def of_tuple(vectors: Float[Array, "k d"]) -> Float[Array, "k-1"]:
         anchor, others = vectors[:1], vectors[1:]
         same = jnp.arange(len(others)) < tuples.positives
-        orders = (_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0])
-        return sum(nn.softplus(jnp.where(same, -logits, logits)) for logits in orders) / 2
+        orders = jnp.stack([_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0]])
+        return nn.softplus(jnp.where(same[None], -orders, orders)).mean(0)
 
     return jax.vmap(of_tuple)(tuples.descriptors).mean()
 
