@@ -8,8 +8,6 @@ Recipe here: the same loss, optimiser and distances. The pairs are those of an a
 Graphs are only rotated.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -134,8 +132,7 @@ NETWORK = Sgpr()
 
 
 def _logits(variables: Variables, queries: Float[Array, "q 32"], others: Float[Array, "n 32"]) -> Float[Array, "q n"]:
-    found: Any = NETWORK.apply({"params": variables["params"]}, queries, others, method="logits")
-    return found
+    return jnp.asarray(NETWORK.apply({"params": variables["params"]}, queries, others, method="logits"))
 
 
 @jax.jit
@@ -160,7 +157,7 @@ def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
         anchor, others = vectors[:1], vectors[1:]
         same = jnp.arange(len(others)) < tuples.positives
         orders = jnp.stack([_logits(variables, anchor, others)[0], _logits(variables, others, anchor)[:, 0]])
-        return nn.softplus(jnp.where(same[None], -orders, orders)).mean(axis=0)
+        return nn.softplus(jnp.where(same[None], -orders, orders)).mean(0)
 
     return jax.vmap(of_tuple)(tuples.descriptors).mean()
 
