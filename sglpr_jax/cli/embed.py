@@ -104,8 +104,7 @@ def _check_weights(command: EmbedCommand) -> None:
         )
     if command.weights is not None and command.method not in (NETWORK, *LEARNED_NAMES):
         raise ValueError(
-            f"{command.weights}: expected --method {' or '.join((NETWORK, *LEARNED_NAMES))} with --weights, "
-            f"found {command.method}"
+            f"{command.weights}: expected --method sglpr or one of bin/peers with --weights, found {command.method}"
         )
 
 

@@ -172,7 +172,7 @@ def test_a_batch_of_no_image_is_refused(embed, town, batch):
 
 def test_weights_beside_a_method_that_has_none_are_refused(embed, town):
     ended, _ = embed("--method", "solid", "--weights", "sglpr", "--data", town, "--seq", "08")
-    assert_one_line_error(ended, "sglpr: expected --method sglpr with --weights, found solid")
+    assert_one_line_error(ended, "sglpr: expected --method sglpr or one of bin/peers with --weights, found solid")
 
 
 @pytest.mark.slow
