@@ -39,7 +39,8 @@ class EmbedCommand:
     a folder with a / at the end. A store gets a Parquet file for each recording, unless it is there already."""
     weights: str | None = None
     """Name of shipped weights, folder of a training run, or folder with config.json and model.safetensors. None: the
-    shipped weights sglpr. Learned methods need the folder of their training, or random:SEED for an untrained network."""
+    shipped weights sglpr. Learned methods need the folder of their training, or random:SEED for a network without
+    training."""
     method: AnyMethodName = "sglpr"
     """The network, a handcrafted method, which needs no weights, or a learned method of another publication. Some
     methods need points; ssc and rinet also need labels."""
