@@ -1,0 +1,68 @@
+"""Simulated recordings on which the networks of other publications are trained, chosen and scored.
+
+    python -m benchmarks.learned.data --out build/learned
+
+`train` has towns of the card of `sglpr` and car parks and garages, whose places repeat. The learning rates are chosen
+on `held-out`. `test` has towns that no weights have seen, with several sensors and sceneries, and one town on two days.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+
+from sglpr_jax.sim.simulation import simulate
+
+TRAIN, HELD_OUT, TEST = "train", "held-out", "test"
+
+
+class Dataset(NamedTuple):
+    """A folder of recordings, and what makes it."""
+
+    part: str
+    name: str
+    options: dict[str, Any]
+
+    def folder(self, root: Path) -> Path:
+        """Path of the dataset."""
+        return root / self.part / self.name
+
+
+def _town(part: str, seed: int, *routes: str, **options: Any) -> Dataset:
+    kind = options.get("scenery", options.get("sensor", "town"))
+    return Dataset(part, f"{kind}-{seed}", {"seed": seed, "routes": routes, **options})
+
+
+DATASETS = (
+    *(_town(TRAIN, seed, "00", "02", "05", "06", "08") for seed in (10, 11, 12, 13)),
+    *(_town(TRAIN, 61, "00", "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
+    *(_town(TRAIN, 11, "00", "08", scenery=scenery) for scenery in ("car_park", "garage")),
+    _town(HELD_OUT, 37, "00", "08"),
+    _town(TEST, 601, "00", "08"),
+    *(_town(TEST, 602, "08", scenery=scenery) for scenery in ("outskirts", "lanes", "car_park")),
+    *(_town(TEST, 603, "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
+    Dataset(TEST, "days-604", {"seed": 604, "sessions": ("2012-01-15", "2012-02-04"), "sensor": "hdl64e"}),
+)
+
+
+def folders(root: Path, part: str) -> list[Path]:
+    """Paths of the datasets of a part."""
+    return [one.folder(root) for one in DATASETS if one.part == part]
+
+
+def main(*, out: Path = Path("build/learned"), scans: int = 300, azimuth_steps: int = 900) -> None:
+    """Write all datasets, unless they exist.
+
+    Args:
+        out: folder of the parts.
+        scans: of each recording.
+        azimuth_steps: firings of a sensor per revolution.
+    """
+    for one in DATASETS:
+        folder = one.folder(out)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        print(simulate(folder, scans=scans, azimuth_steps=azimuth_steps, **one.options), flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
