@@ -1,5 +1,7 @@
 """Trajectory of a live map, corrected by its loops after each scan (extra `gtsam`)."""
 
+from collections import deque
+
 import numpy as np
 from jaxtyping import Float
 
@@ -30,11 +32,12 @@ class CorrectedTrajectory:
     def update(self) -> None:
         """Take the scans and loops since the last call."""
         poses, segments = self._live.odometry, self._live.detector.finder.motion.segments
-        loops = sorted(self._live.detector.loops[self._loops :], key=lambda loop: loop.query)
+        loops = deque(sorted(self._live.detector.loops[self._loops :], key=lambda loop: loop.query))
         self._loops += len(loops)
         for frame in range(len(self._trajectory), len(poses)):
-            known = [loop for loop in loops if loop.query <= frame]
-            loops = loops[len(known) :]
+            known = []
+            while loops and loops[0].query <= frame:
+                known.append(loops.popleft())
             continues = frame == 0 or segments[frame] == segments[frame - 1]
             self._trajectory.add(poses[frame], known, continues=bool(continues))
 

@@ -21,9 +21,9 @@ from jaxtyping import Array, Float, Float32, Shaped, UInt8
 from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.learned.image_layers import Convolution, batch_norm, max_pool
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.methods.learned.quadruplet import quadruplet
 
 RINGS, SECTORS, LAYERS = 40, 120, 20
 NEAREST_M, FARTHEST_M = 1.0, 70.0
@@ -32,7 +32,6 @@ LOWEST_M, LAYER_M = -1.5, 0.5
 """Height of the lowest layer relative to the sensor, and height of a layer, in metres."""
 KEPT = 32
 """Number of lowest frequencies that are kept along the rings and along the sectors."""
-MARGIN, OTHER_MARGIN = 0.5, 0.2
 
 
 def occupancy(points: Float32[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "40 120 20"]:
@@ -131,19 +130,8 @@ def turned(key: Array, cells: Shaped[Array, "b 40 120 20"]) -> Shaped[Array, "b 
 
 
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the mean lazy quadruplet loss of the tuples, with d = L2 squared and the farthest positive.
-
-    max over negatives of [0.5 + d_positive - d_negative]_+ plus max over negatives of [0.2 + d_positive - d_other]_+.
-    d_other is the distance of a negative from another negative. The anchor of the next tuple serves as the other
-    negative. It is a random place, and may rarely be near one of the negatives.
-    """
-    anchors, places = tuples.descriptors[:, :1], tuples.descriptors[:, 1:]
-    distance = functools.partial(descriptor_distance, squared=True)
-    positive, negative = jnp.split(distance(*jnp.broadcast_arrays(anchors, places)), [tuples.positives], axis=1)
-    others = jnp.roll(anchors, -1, axis=0)
-    other = distance(*jnp.broadcast_arrays(others, places[:, tuples.positives :]))
-    first = lazy_triplet(positive, negative, margin=MARGIN, closest_positive=False)
-    return (first + lazy_triplet(positive, other, margin=OTHER_MARGIN, closest_positive=False)).mean()
+    """Return the lazy quadruplet loss with the farthest positive."""
+    return quadruplet(tuples, closest_positive=False)
 
 
 PUBLISHED = (

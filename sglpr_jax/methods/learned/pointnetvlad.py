@@ -24,9 +24,9 @@ from sglpr_jax.bev import rotate_points
 from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.learned.maximum import maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
+from sglpr_jax.methods.learned.quadruplet import quadruplet
 from sglpr_jax.methods.voxel_means import voxel_means
 from sglpr_jax.models.layers import l2_normalize
 
@@ -39,7 +39,6 @@ VOXEL_M = 0.4
 """Side of the voxels whose means replace the points, as in the authors' submaps."""
 CLUSTERS = 64
 NUMBERS = 256
-MARGIN, OTHER_MARGIN = 0.5, 0.2
 
 
 class Mlp(nn.Module):
@@ -150,25 +149,8 @@ def turned(key: Array, points: Float[Array, "b n 3"]) -> Float[Array, "b n 3"]:
 
 
 def loss(variables: Variables, tuples: Tuples) -> Float[Array, ""]:
-    """Return the lazy quadruplet loss, averaged over the tuples.
-
-        max over negatives of [0.5 + d(anchor, p) - d(anchor, n)]_+ + the same of [0.2 + d(anchor, p) - d(o, n)]_+
-
-    d is the squared L2 distance and p the closest positive. The published other negative o is far from all places of
-    the tuple. Here it is the anchor of the next tuple, because tuples have no more places. Its distance from the
-    negatives is not checked. A single tuple has no second term.
-    """
-    anchors, others = tuples.descriptors[:, 0], tuples.descriptors[:, 1:]
-    positive, negative = jnp.split(_squares(anchors, others), [tuples.positives], axis=1)
-    total = lazy_triplet(positive, negative, margin=MARGIN)
-    if len(anchors) > 1:
-        between = _squares(jnp.roll(anchors, -1, axis=0), others)[:, tuples.positives :]
-        total = total + lazy_triplet(positive, between, margin=OTHER_MARGIN)
-    return total.mean()
-
-
-def _squares(one: Float[Array, "t d"], several: Float[Array, "t k d"]) -> Float[Array, "t k"]:
-    return descriptor_distance(jnp.broadcast_to(one[:, None], several.shape), several, squared=True)
+    """Return the lazy quadruplet loss with the closest positive."""
+    return quadruplet(tuples, closest_positive=True)
 
 
 POINTNETVLAD = LearnedMethod(
