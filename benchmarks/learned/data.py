@@ -4,6 +4,7 @@
 
 `train` has towns of the card of `sglpr` and car parks and garages, whose places repeat. The learning rates are chosen
 on `held-out`. `test` has towns that no weights have seen, with several sensors and sceneries, and one town on two days.
+`train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
 """
 
 from pathlib import Path
@@ -13,7 +14,7 @@ import tyro
 
 from sglpr_jax.sim.simulation import simulate
 
-TRAIN, HELD_OUT, TEST = "train", "held-out", "test"
+TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"
 
 
 class Dataset(NamedTuple):
@@ -33,15 +34,19 @@ def _town(part: str, seed: int, *routes: str, **options: Any) -> Dataset:
     return Dataset(part, f"{kind}-{seed}", {"seed": seed, "routes": routes, **options})
 
 
-DATASETS = (
+_TRAIN = (
     *(_town(TRAIN, seed, "00", "02", "05", "06", "08") for seed in (10, 11, 12, 13)),
     *(_town(TRAIN, 61, "00", "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
     *(_town(TRAIN, 11, "00", "08", scenery=scenery) for scenery in ("car_park", "garage")),
+)
+DATASETS = (
+    *_TRAIN,
+    *(Dataset(TRAIN_IMAGES, one.name, {**one.options, "images": True}) for one in _TRAIN),
     _town(HELD_OUT, 37, "00", "08"),
     _town(TEST, 601, "00", "08"),
     *(_town(TEST, 602, "08", scenery=scenery) for scenery in ("outskirts", "lanes", "car_park")),
     *(_town(TEST, 603, "08", sensor=sensor) for sensor in ("vlp16", "os1-64")),
-    Dataset(TEST, "days-604", {"seed": 604, "sessions": ("2012-01-15", "2012-02-04"), "sensor": "hdl64e"}),
+    Dataset(TEST, "days-604", {"seed": 604, "sessions": ("2012-01-15", "2012-02-04")}),
 )
 
 
