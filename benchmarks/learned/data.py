@@ -7,6 +7,7 @@ on `held-out`. `test` has towns that no weights have seen, with several sensors 
 `train-images` has the images of the scans of `train`, for the presets of `bin/train`, which rotate images.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,22 +52,29 @@ DATASETS = (
 
 
 def folders(root: Path, part: str) -> list[Path]:
-    """Paths of the datasets of a part."""
-    return [one.folder(root) for one in DATASETS if one.part == part]
+    """Return the written datasets of a part. Raises FileNotFoundError if there are none."""
+    found = [one.folder(root) for one in DATASETS if one.part == part and one.folder(root).is_dir()]
+    if not found:
+        raise FileNotFoundError(f"{root / part}: expected datasets of benchmarks.learned.data, found none")
+    return found
 
 
-def main(*, out: Path = Path("build/learned"), scans: int = 300, azimuth_steps: int = 900) -> None:
-    """Write all datasets, unless they exist.
+def main(
+    *, out: Path = Path("build/learned"), only: Sequence[str] = (), scans: int = 300, azimuth_steps: int = 900
+) -> None:
+    """Write the datasets, unless they exist.
 
     Args:
         out: folder of the parts.
+        only: PART/NAME of the datasets to write; all if omitted.
         scans: of each recording.
         azimuth_steps: firings of a sensor per revolution.
     """
     for one in DATASETS:
-        folder = one.folder(out)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        print(simulate(folder, scans=scans, azimuth_steps=azimuth_steps, **one.options), flush=True)
+        if not only or f"{one.part}/{one.name}" in only:
+            folder = one.folder(out)
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            print(simulate(folder, scans=scans, azimuth_steps=azimuth_steps, **one.options), flush=True)
 
 
 if __name__ == "__main__":

@@ -325,3 +325,15 @@ def test_random_weights_have_a_seed():
     assert_equal(load_variables("random:3", TINY), random_variables(TINY, seed=3))
     with pytest.raises(ValueError, match="expected a seed"):
         load_variables("random:x", TINY)
+
+
+def test_a_training_starts_from_the_weights_of_its_method(data, tmp_path):
+    def start(variables, inputs):
+        assert inputs.shape == (100, SECTORS)
+        kernel = np.zeros_like(variables["params"]["Dense_1"]["kernel"])
+        return {**variables, "params": {**variables["params"], "Dense_1": {"kernel": kernel, "bias": kernel[0]}}}
+
+    still = dataclasses.replace(TINY, start=start)
+    found = train_learned(still, data, settings(images=120, learning_rate=1e-9), tmp_path / "run")
+    assert abs(found.state.variables["params"]["Dense_1"]["kernel"]).max() < 1e-6
+    train_learned(still, data, settings(images=240, learning_rate=1e-9), tmp_path / "run", resume=True)

@@ -27,6 +27,7 @@ from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import check_ready_made, picture
 from sglpr_jax.losses import descriptor_distance, lazy_triplet
 from sglpr_jax.methods.learned.bicubic import resampled, resampled_maps, resized, turned_taps
+from sglpr_jax.methods.learned.clusters import FEATURES, LOCAL, with_clusters
 from sglpr_jax.methods.learned.image_layers import HE, Convolution, NetVLAD, batch_norm, max_pool
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables
 from sglpr_jax.models.convolution import convolve
@@ -103,7 +104,9 @@ class REIN(nn.Module):
         else:
             maps = functools.reduce(jnp.maximum, turned_back(encoder(eight_turns(x), train=train)))
         local = l2_normalize(resized(maps, images.shape[1] // DENSER))
-        return NetVLAD(64)(local.reshape(len(local), -1, local.shape[-1]))
+        local = local.reshape(len(local), -1, local.shape[-1])
+        self.sow(LOCAL, FEATURES, local)
+        return NetVLAD(64)(local)
 
 
 def bordered(images: Float[Array, "b h h"]) -> Float[Array, "b _ _"]:
@@ -182,18 +185,19 @@ the training time."""
 
 def _method(name: str, source: str, *, rotations: int, tuples: int) -> LearnedMethod:
     """Return the method of one number of rotations. All weights start at random."""
-    recipe = Recipe(PUBLISHED, SAMPLING, tuples, learning_rates=(3e-5, 1e-4, 3e-4))
+    recipe, network = Recipe(PUBLISHED, SAMPLING, tuples, learning_rates=(3e-5, 1e-4, 3e-4)), REIN(rotations)
     return LearnedMethod(
         name=name,
         source=source,
         licence="MIT",
         takes="images",
         weights=1_364_288,
-        network=REIN(rotations),
+        network=network,
         prepare=grey_image,
         turned=turned,
         loss=loss,
         recipe=recipe,
+        start=functools.partial(with_clusters, network),
     )
 
 

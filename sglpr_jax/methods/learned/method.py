@@ -79,3 +79,6 @@ class LearnedMethod:
     recipe: Recipe
     compare: Compare | None = None
     """Distance of descriptors, if it is learned. None: L2."""
+    start: Callable[[Variables, Shaped[np.ndarray, "n ..."]], Variables] | None = None
+    """Changes random weights before the first step, for example to clusters of local features. It receives the inputs
+    of random training places. None: the weights stay as they are."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int, Shaped
 
 from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
 from sglpr_jax.data.sampling.read_ahead import read_ahead
@@ -57,6 +57,11 @@ class Batches:
             with contextlib.closing(read_ahead(make, start=step, stop=stop)) as ahead:
                 yield from ahead
             step = stop
+
+    def random_inputs(self, n: int) -> Shaped[np.ndarray, "n ..."]:
+        """Return the inputs of up to n random places."""
+        places = np.random.default_rng(self._seed).permutation(len(self._pool))[:n]
+        return self._data.of(self._pool, places)
 
     def drop_before(self, step: int) -> None:
         """Delete the mined descriptors that a run resumed at `step` does not need."""

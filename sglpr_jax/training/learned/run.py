@@ -31,6 +31,8 @@ from sglpr_jax.training.metrics_log import MetricsLog
 
 FIRST_SNAPSHOT = 1000
 """Number of images at the first snapshot. Each further one has twice as many."""
+START_PLACES = 100
+"""Number of random places from which `LearnedMethod.start` sets weights."""
 LOG_EVERY = 10
 """Number of steps between two lines of the metrics."""
 SAVE_EVERY_S, REPORT_EVERY_S = 60.0, 30.0
@@ -79,7 +81,7 @@ def train_learned(
         run = _Run(method, data, settings, out, score, report)
         opened.callback(run.close)
         show = opened.enter_context(progress(f"train {method.name}", math.ceil(settings.seconds)))
-        run.compile()
+        run.start()
         while not run.finished and not stopped():
             run.step()
             show(int(run.now.seconds))
@@ -116,11 +118,15 @@ class _Run:
         images = self._settings.images
         return self.now.seconds >= self._settings.seconds or (0 < images <= self.now.images)
 
-    def compile(self) -> None:
-        """Compile the step before the clock starts."""
-        if not self.finished:
-            batch = self._batches.batch(0)
-            jax.block_until_ready(self._computed(batch))
+    def start(self) -> None:
+        """Compile the step, whose time does not count, and set the weights that the training starts from."""
+        if self.finished:
+            return
+        jax.block_until_ready(self._computed(self._batches.batch(0)))
+        if int(self.now.state.step) == 0 and self._method.start is not None:
+            started = time.perf_counter()
+            variables = self._method.start(self.now.state.variables, self._batches.random_inputs(START_PLACES))
+            self.now = Progressed(self.now.state._replace(variables=variables), 0, time.perf_counter() - started)
 
     def step(self) -> None:
         """Do one step, and write what is due after it."""
