@@ -37,6 +37,7 @@ class ReproduceCommand:
       bin/reproduce table4 figure9 --plan                          prints the missing trainings and their duration
       bin/reproduce all                                            on the simulated recordings, preset sglpr
       bin/reproduce table1 table2 --data KITTI --preset paper
+      bin/reproduce table1 table2 --data KITTI --weights sglpr runs/rinet --no-train
     """
 
     what: tyro.conf.Positional[tuple[What, ...]]
@@ -53,6 +54,11 @@ class ReproduceCommand:
     """Folder for the runs, tables and pictures."""
     method: tuple[str, ...] = ("m2dp", "scan-context", "lidar-iris", "ssc", "solid", "polar-fft")
     """Handcrafted methods in tables 1 to 3 and figure 5. On ready-made images, only polar-fft and thumbnail work."""
+    weights: tuple[str, ...] = ()
+    """Further weights in tables 1 to 3 and figure 5: names of shipped weights, or folders of bin/train or bin/peers.
+    They may have been trained on the tested recordings; this is not checked."""
+    train: bool = True
+    """Train the variants of the tables and figures. Otherwise, only --weights and --method are compared."""
     pose_source: PoseChoice = "auto"
     """Pose files of KITTI's layout: SemanticKITTI's (sequences/NN/poses.txt) or KITTI's own (poses/NN.txt)."""
     plan: bool = False
@@ -80,8 +86,11 @@ def reproduce(command: ReproduceCommand) -> Path:
     root = dataset_root(command.data, write=not command.plan)
     runs = Runs(command.out, root, command.preset, command.config, command.pose_source, progress_bar)
     seqs = command.seq or tuple(seq for seq in PAPER_SEQUENCES if seq in recording_names(runs.data))
-    check(runs, names, seqs, command.method, command.nclt)
-    plan = make_plan(runs, names, seqs)
+    check(runs, names, seqs, command.method, command.nclt, weights=command.weights, trained=command.train)
+    if not command.train and not command.plan:
+        _write(command, names, runs, seqs)
+        return command.out
+    plan = make_plan(runs, names if command.train else [], seqs)
     print(plan.text(time_a_step(runs, *plan.missing[0]) if plan.missing else None), file=sys.stderr)
     if not command.plan:
         _train(runs, plan)
@@ -106,13 +115,14 @@ def _write(command: ReproduceCommand, names: list[str], runs: "Runs", seqs: tupl
     from sglpr_jax.reproduce.tables import PaperTable
 
     record_command(command, command.out)
-    found = Reproduction(runs, seqs, command.method, lambda: command.nclt or cached_sessions())
+    compared = (*command.weights, *command.method)
+    found = Reproduction(runs, seqs, compared, lambda: command.nclt or cached_sessions(), trained=command.train)
     for name in names:
-        made = write_experiment(name, found, command.out)
-        if isinstance(made, PaperTable):
-            console().print(made)
-        else:
-            print(*(f"written: {path}" for path in made), sep="\n")
+        for made in write_experiment(name, found, command.out):
+            if isinstance(made, PaperTable):
+                console().print(made)
+            else:
+                print(f"written: {made}")
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,10 +11,11 @@ import numpy as np
 from sglpr_jax.data import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
+from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network
 from sglpr_jax.methods.learned.distance import stated_distance
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.learned.weights_file import load_variables, variables_hash
+from sglpr_jax.methods.learned.weights_file import load_variables, method_of, variables_hash
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, RecordMethod, ScanMethod
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
 from sglpr_jax.models.input_image import field_of_view
@@ -53,6 +55,15 @@ def method_beside(trained: Params, name: str, recording: Recording, *, seed: int
     if name == SHIPPED:
         return network(load(DEFAULT_WEIGHTS))
     return handcrafted(name, recording, trained.config.grid)
+
+
+def method_with_weights(weights: str) -> Method:
+    """Return the method of shipped weights, or of a folder of weights: of a run of bin/train or of bin/peers.
+
+    Raises the errors of `load` or `load_variables`.
+    """
+    name = method_of(Path(weights))
+    return trained_method(LEARNED[name], weights) if name in LEARNED else network(load(weights))
 
 
 def trained_method(method: LearnedMethod, weights: str) -> RecordMethod:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 
+TOP1, PAIRS = "top1-f1max", "pairs-f1max"
 FULL = "full"
 NO_SEGMENTATION = "no-segmentation"
 
@@ -53,6 +54,8 @@ class Experiment:
     across_sessions: bool = False
     """Whether the test uses sessions of another dataset. One model per variant then suffices: the one trained without
     the first recording."""
+    protocols: tuple[str, ...] = (TOP1,)
+    """Protocols of a table. There is a table for each; the published rows are in the table of their protocol."""
     needs_labels: bool = False
     """Whether the experiment draws labels or compares variants that learn from them."""
 
@@ -65,9 +68,14 @@ class Experiment:
 _WITH_FIGURE_9 = ("categories-6", "categories-15", FULL, "categories-25", "categories-34")
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "table1": Experiment("table", "F1max beside other methods", beside_handcrafted=True),
+    "table1": Experiment("table", "F1max beside other methods", beside_handcrafted=True, protocols=(TOP1, PAIRS)),
     "table2": Experiment(
-        "table", "F1max, every scan rotated", (FULL, "no-rotation"), rotated=True, beside_handcrafted=True
+        "table",
+        "F1max, every scan rotated",
+        (FULL, "no-rotation"),
+        rotated=True,
+        beside_handcrafted=True,
+        protocols=(TOP1, PAIRS),
     ),
     "table3": Experiment(
         "table",

@@ -7,13 +7,14 @@ from pathlib import Path
 
 from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.evaluation import figures
+from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.files import write_json, write_text
 from sglpr_jax.reproduce import pictures
-from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, FULL, TOP1
 from sglpr_jax.reproduce.pictures import Pictures
 from sglpr_jax.reproduce.runs import Runs
-from sglpr_jax.reproduce.scores import across_sessions_rows, f1max_rows, methods_of, top1
-from sglpr_jax.reproduce.tables import PUBLISHED, PaperTable
+from sglpr_jax.reproduce.scores import across_sessions_rows, f1max_rows, methods_of, scored
+from sglpr_jax.reproduce.tables import PUBLISHED, PaperTable, Row
 
 
 @dataclass(frozen=True)
@@ -24,27 +25,48 @@ class Reproduction:
     seqs: tuple[str, ...]
     """Test recordings."""
     methods: tuple[str, ...]
-    """Handcrafted methods for comparison."""
+    """Handcrafted methods and weights for comparison."""
     sessions: Callable[[], Path]
     """Returns the folder of sessions in NCLT's layout. Called only by experiments that need sessions."""
+    trained: bool = True
+    """Whether there are runs of the variants."""
 
-    def table(self, name: str) -> PaperTable:
-        """Return a table with the reproduced numbers and the paper's."""
+    def tables(self, name: str) -> dict[str, PaperTable]:
+        """Return the tables with the reproduced numbers and the paper's, one for each protocol, by file name."""
         experiment = EXPERIMENTS[name]
-        about = f"here: preset {Path(self.runs.preset).stem}, {self.runs.config.steps} steps"
         if experiment.across_sessions:
-            columns, rows = across_sessions_rows(name, self.runs, self.seqs[0], self.sessions(), self.methods)
-            caption = f"{about}, without recording {self.seqs[0]}; Recall@1 within 5 m"
-        else:
-            columns, rows = list(self.seqs), f1max_rows(name, self.runs, self.seqs, self.methods)
-            caption = f"{about}, leave-one-out; top-1 F1max, 3 m / 20 m"
-        if any(row.source == PUBLISHED for row in rows):
-            caption += "; published: the paper's numbers, on the real dataset"
-        return PaperTable(f"{name}: {experiment.title}", rows, columns, caption)
+            options = {"trained": self.trained}
+            columns, rows = across_sessions_rows(
+                name, self.runs, self.seqs[0], self.sessions(), self.methods, **options
+            )
+            caption = [*self._about(f"without recording {self.seqs[0]}"), "Recall@1 within 5 m"]
+            return {name: _table(experiment.title, name, columns, rows, caption)}
+        return {
+            name if protocol == TOP1 else f"{name}-{protocol}": self._of_protocol(name, protocol)
+            for protocol in experiment.protocols
+        }
+
+    def _of_protocol(self, name: str, protocol: str) -> PaperTable:
+        rows = f1max_rows(name, self.runs, self.seqs, self.methods, protocol=protocol, trained=self.trained)
+        poses = dict.fromkeys(self.runs.recording(seq).pose_source for seq in self.seqs)
+        of_protocol = f"{protocol} ({PROTOCOLS[protocol].rule})"
+        caption = [*self._about("leave-one-out"), of_protocol, f"poses: {', '.join(map(str, poses))}"]
+        return _table(EXPERIMENTS[name].title, name, self.seqs, rows, caption)
+
+    def _about(self, split: str) -> list[str]:
+        """Describe the training of the variants."""
+        trained = f"here: preset {Path(self.runs.preset).stem}, {self.runs.config.steps} steps, {split}"
+        return [trained] if self.trained else []
 
     def pictures(self, name: str) -> Pictures:
         """Return the pictures of a figure by their file names. Some figures have one picture for each recording."""
         return _FIGURES[name](self)
+
+
+def _table(title: str, name: str, columns: Sequence[str], rows: Sequence[Row], caption: Sequence[str]) -> PaperTable:
+    if any(row.source == PUBLISHED for row in rows):
+        caption = [*caption, "published: the paper's numbers, on the real dataset"]
+    return PaperTable(f"{name}: {title}", rows, list(columns), "; ".join(caption))
 
 
 def write_table(table: PaperTable, name: str, folder: Path) -> None:
@@ -63,14 +85,14 @@ def write_pictures(found: Pictures, folder: Path) -> list[Path]:
 
 
 def _precision_recall(found: Reproduction) -> Pictures:
-    methods = methods_of("figure5", found.methods)
+    methods = methods_of("figure5", found.methods, trained=found.trained)
     return pictures.precision_recall(
-        {seq: {label: top1(found.runs, method, seq) for method, label in methods.items()} for seq in found.seqs}
+        {seq: {label: scored(found.runs, method, seq) for method, label in methods.items()} for seq in found.seqs}
     )
 
 
 def _trajectories(found: Reproduction) -> Pictures:
-    return pictures.trajectories(found.runs, {seq: top1(found.runs, FULL, seq) for seq in found.seqs})
+    return pictures.trajectories(found.runs, {seq: scored(found.runs, FULL, seq) for seq in found.seqs})
 
 
 def _semantic_maps(found: Reproduction) -> Pictures:
@@ -88,7 +110,7 @@ def _categories(found: Reproduction) -> Pictures:
 
 
 def _top1_score(runs: Runs, variant: str, seq: str) -> float:
-    return top1(runs, variant, seq).score
+    return scored(runs, variant, seq).score
 
 
 _FIGURES: dict[str, Callable[[Reproduction], Pictures]] = {
@@ -105,10 +127,11 @@ def chosen_experiments(names: Sequence[str]) -> list[str]:
     return list(EXPERIMENTS) if "all" in names else list(dict.fromkeys(names))
 
 
-def write_experiment(name: str, found: Reproduction, folder: Path) -> PaperTable | list[Path]:
-    """Create and write a table or a figure. Returns the table, or the paths of the pictures."""
+def write_experiment(name: str, found: Reproduction, folder: Path) -> list[PaperTable] | list[Path]:
+    """Create and write the tables or pictures of an experiment. Returns the tables, or the paths of the pictures."""
     if EXPERIMENTS[name].kind == "figure":
         return write_pictures(found.pictures(name), folder)
-    table = found.table(name)
-    write_table(table, name, folder)
-    return table
+    tables = found.tables(name)
+    for file, table in tables.items():
+        write_table(table, file, folder)
+    return list(tables.values())

@@ -10,8 +10,9 @@ from sglpr_jax.data.choices import PoseChoice
 from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION
 from sglpr_jax.evaluation.learning_curves import LearningCurves
 from sglpr_jax.files import read_json, write_json
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import Method
-from sglpr_jax.methods.registry import handcrafted, network
+from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.names import file_name
@@ -106,18 +107,17 @@ class Runs:
     def descriptors(
         self, method: str, seq: str, *, of: Recording | None = None, rotated: bool = False
     ) -> DescriptorFile:
-        """Return a method's descriptors of the recording `seq`, or of the recording `of`.
+        """Return the descriptors of the recording `seq`, or of the recording `of`.
 
-        The model of a variant was trained without `seq`.
+        `method` is a variant, whose model was trained without `seq`, a handcrafted method, or weights.
         """
         recording = of or self.recording(seq)
-        folder = self._folder(method, seq) if method in VARIANTS else self.folder / WITHOUT_TRAINING / method
+        folder = self._folder(method, seq) if method in VARIANTS else self.folder / WITHOUT_TRAINING / file_name(method)
         (folder / "descriptors").mkdir(parents=True, exist_ok=True)
         corruption = ROTATION if rotated else CLEAN
-        described_by = network(self.params(method, seq)) if method in VARIANTS else self._handcrafted(method, recording)
         return embed_or_reuse(
             folder / "descriptors" / f"{file_name(recording.name)}-{corruption.name}.npz",
-            described_by,
+            self._method(method, seq, recording),
             recording,
             corruption,
             seed=ROTATION_SEED,
@@ -126,8 +126,12 @@ class Runs:
             progress=self.progress,
         )
 
-    def _handcrafted(self, method: str, recording: Recording) -> Method:
-        return handcrafted(method, recording, self.config.model.grid)
+    def _method(self, method: str, seq: str, recording: Recording) -> Method:
+        if method in VARIANTS:
+            return network(self.params(method, seq))
+        if method in HANDCRAFTED:
+            return handcrafted(method, recording, self.config.model.grid)
+        return method_with_weights(method)
 
     def _settings(self, seq: str) -> dict[str, str]:
         return {"seq": seq, "data": str(self.data), "preset": self.preset, "pose_source": self.pose_source}

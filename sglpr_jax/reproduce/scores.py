@@ -6,36 +6,50 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sglpr_jax.data import open_recording, recording_names
-from sglpr_jax.evaluation.protocols import Result
+from sglpr_jax.evaluation.protocols import PROTOCOLS, Result
 from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
-from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
-from sglpr_jax.evaluation.published import TABLES
-from sglpr_jax.methods.handcrafted import HANDCRAFTED
-from sglpr_jax.reproduce.experiments import EXPERIMENTS
+from sglpr_jax.evaluation.published import RINET, TABLES
+from sglpr_jax.evaluation.published import Row as PublishedRow
+from sglpr_jax.reproduce.compared import content_of
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, PAIRS, TOP1
 from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, Row, score_or_none
 
 
 @functools.cache
-def top1(runs: Runs, method: str, seq: str, *, rotated: bool = False) -> Result:
-    """Return the paper's F1max (top-1, 3 m / 20 m) of a variant or of a handcrafted method."""
-    return top1_f1max(runs.descriptors(method, seq, rotated=rotated))
+def scored(runs: Runs, method: str, seq: str, *, protocol: str = TOP1, rotated: bool = False) -> Result:
+    """Return the result of a variant, a handcrafted method or weights. The default protocol is that of the paper: F1max
+    of top-1 retrieval, 3 m / 20 m."""
+    return PROTOCOLS[protocol](runs.descriptors(method, seq, rotated=rotated))
 
 
-def f1max_rows(name: str, runs: Runs, seqs: Sequence[str], methods: Sequence[str]) -> list[Row]:
-    """Return the rows of table 1, 2, 4, 5, 6 or 7, the reproduced ones first."""
+def f1max_rows(
+    name: str, runs: Runs, seqs: Sequence[str], methods: Sequence[str], *, protocol: str = TOP1, trained: bool = True
+) -> list[Row]:
+    """Return the rows of table 1, 2, 4, 5, 6 or 7, the reproduced ones first.
+
+    Arguments:
+      name: Name of the table.
+      runs: Runs of the variants.
+      seqs: Test recordings.
+      methods: Handcrafted methods and weights that are compared with the variants.
+      protocol: Protocol of the scores.
+      trained: Whether the table has the variants, which are trained for it.
+    """
     rotated = EXPERIMENTS[name].rotated
     ours = []
-    for method, label in methods_of(name, methods).items():
-        row = _row(label, runs, method, seqs, rotated=rotated)
+    for method, label in methods_of(name, methods, trained=trained).items():
+        row = _row(label, runs, method, seqs, protocol=protocol, rotated=rotated)
         if rotated:
-            row = dataclasses.replace(row, change=_change(row, _row(label, runs, method, seqs), seqs))
+            raw = _row(label, runs, method, seqs, protocol=protocol)
+            row = dataclasses.replace(row, change=_change(row, raw, seqs))
         ours.append(row)
-    return [*ours, *published_rows(name, seqs)]
+    several = len(EXPERIMENTS[name].protocols) > 1
+    return [*ours, *published_rows(name, seqs, protocol=protocol if several else None)]
 
 
 def across_sessions_rows(
-    name: str, runs: Runs, seq: str, root: Path, methods: Sequence[str]
+    name: str, runs: Runs, seq: str, root: Path, methods: Sequence[str], *, trained: bool = True
 ) -> tuple[list[str], list[Row]]:
     """Return the columns and rows of a table across sessions.
 
@@ -43,9 +57,9 @@ def across_sessions_rows(
     has seen none of the sessions. Methods that need labels are omitted if the sessions have no labels.
     """
     database, *queries = (open_recording(root, session) for session in recording_names(root))
-    fitting = [other for other in methods if HANDCRAFTED[other].takes != "labelled points" or database.has_labels]
+    fitting = [other for other in methods if content_of(other) != "labelled points" or database.has_labels]
     ours = []
-    for method, label in methods_of(name, fitting).items():
+    for method, label in methods_of(name, fitting, trained=trained).items():
         there = runs.descriptors(method, seq, of=database)
         found = {q.name: bevplace_nclt_recall(there, runs.descriptors(method, seq, of=q)).score for q in queries}
         ours.append(Row(label, OURS, {name: score_or_none(score) for name, score in found.items()}))
@@ -53,24 +67,37 @@ def across_sessions_rows(
     return columns, [*ours, *published_rows(name, columns)]
 
 
-def methods_of(name: str, methods: Sequence[str]) -> Mapping[str, str]:
-    """Return the label of each variant of a table or figure by its name, and of the handcrafted methods."""
+def methods_of(name: str, methods: Sequence[str], *, trained: bool = True) -> Mapping[str, str]:
+    """Return the label of each variant of a table or figure by its name, and of the methods compared with them."""
     experiment = EXPERIMENTS[name]
-    return experiment.names() | ({other: other for other in methods} if experiment.beside_handcrafted else {})
+    variants = experiment.names() if trained else {}
+    return variants | ({other: other for other in methods} if experiment.beside_handcrafted else {})
 
 
-def published_rows(name: str, columns: Sequence[str]) -> list[Row]:
-    """Return the paper's rows of a table, if it has any of these columns."""
+def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = None) -> list[Row]:
+    """Return the paper's rows of a table, if it has any of these columns.
+
+    With a protocol, only the rows of this protocol, with the source that the paper names. Rows from RINet's paper are
+    F1max of pairs; for all others it is that of top-1 retrieval (`evaluation.published`).
+    """
     return [
-        Row(row.method, PUBLISHED, dict(zip(table.columns, row.scores, strict=True)))
+        Row(_label(row, protocol), PUBLISHED, dict(zip(table.columns, row.scores, strict=True)))
         for table in TABLES
         if name == f"table{table.number}" and set(columns) & set(table.columns)
         for row in table.rows
+        if protocol is None or (protocol == PAIRS) == (row.source == RINET)
     ]
 
 
-def _row(label: str, runs: Runs, method: str, seqs: Sequence[str], *, rotated: bool = False) -> Row:
-    return Row(label, OURS, {seq: score_or_none(top1(runs, method, seq, rotated=rotated).score) for seq in seqs})
+def _label(row: PublishedRow, protocol: str | None) -> str:
+    return row.method if protocol is None else f"{row.method} ({row.source})"
+
+
+def _row(
+    label: str, runs: Runs, method: str, seqs: Sequence[str], *, protocol: str = TOP1, rotated: bool = False
+) -> Row:
+    options = {"protocol": protocol, "rotated": rotated}
+    return Row(label, OURS, {seq: score_or_none(scored(runs, method, seq, **options).score) for seq in seqs})
 
 
 def _change(rotated: Row, raw: Row, seqs: Sequence[str]) -> float | None:

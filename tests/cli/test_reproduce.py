@@ -6,6 +6,8 @@ import shutil
 import pytest
 
 from sglpr_jax.evaluation.published import KITTI, TABLES
+from sglpr_jax.methods.learned.disco import DISCO
+from sglpr_jax.methods.learned.weights_file import random_variables, save_variables
 from sglpr_jax.reproduce import plan
 from sglpr_jax.reproduce import runs as runs_module
 from sglpr_jax.reproduce.experiments import EXPERIMENTS, VARIANTS, variant_config
@@ -231,3 +233,23 @@ def test_a_plan_writes_no_simulated_recordings(command, tmp_path, monkeypatch):
     ended = command("reproduce", "table5", "--plan", "--out", tmp_path / "out")
     assert_one_line_error(ended, "expected the simulated recordings, found none", "--data")
     assert not list(tmp_path.glob("cache/**/*.bin"))
+
+
+def test_weights_are_compared_without_training_by_both_protocols(town, tmp_path, command):
+    out, peer = tmp_path / "out", tmp_path / "disco"
+    save_variables(peer, DISCO, random_variables(DISCO, seed=0), {})
+    options = ("--data", town, "--seq", "08", "--out", out, "--method", "polar-fft", "--no-train")
+    ended = command("reproduce", "table1", *options, "--weights", "sglpr", peer)
+    assert ended.status == 0, ended.error
+    for file, absent, present in (
+        ("table1", "SSC (RINet's paper)", "DiSCO (its own paper)"),
+        ("table1-pairs-f1max", "DiSCO (its own paper)", "SSC (RINet's paper)"),
+    ):
+        rows = {row["method"]: row for row in json.loads((out / f"{file}.json").read_text())}
+        assert [name for name, row in rows.items() if row["source"] == OURS] == ["sglpr", str(peer), "polar-fft"]
+        assert absent not in rows and present in rows
+        assert "poses: " in ended.out
+    assert not list(out.glob("full"))
+    assert_one_line_error(command("reproduce", "table5", *options), "--no-train", "table5")
+    missing = command("reproduce", "table1", *options, "--weights", tmp_path / "none")
+    assert_one_line_error(missing, "none")

@@ -92,6 +92,13 @@ def load_variables(source: Path | str, method: LearnedMethod) -> Variables:
     return jax.device_put(as_tree(values))
 
 
+def method_of(folder: Path) -> str | None:
+    """Return the name of the learned method of a run or of weights, or None if the folder has none."""
+    about = read_json(folder / CONFIG_FILE) if (folder / CONFIG_FILE).is_file() else None
+    found = about.get("method") if isinstance(about, dict) else None
+    return found if isinstance(found, str) else None
+
+
 def read_tensors(path: Path) -> dict[str, np.ndarray]:
     """Read a safetensors file. Raises ValueError if it is damaged or its values do not have the stored checksum."""
     try:
