@@ -97,6 +97,14 @@ def density_label_image(
     return labels.reshape(SIZE, SIZE)
 
 
+def values_of_points(image: Int[np.ndarray, "151 151"], points: Float32[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Return the value of each point's cell in an image aligned with `density_image`, and 0 outside the crop."""
+    counted = _in_crop(points)
+    values = np.zeros(len(points), image.dtype)
+    values[counted] = image.reshape(-1)[_cell_of_point(points[counted].T)]
+    return values
+
+
 def _in_crop(points: Float32[np.ndarray, "n 3"]) -> np.ndarray:
     x, y, z = points.T
     return (np.abs(x) < REACH_M) & (np.abs(y) < REACH_M) & (z > FLOOR_M) & (z < CEILING_M)
