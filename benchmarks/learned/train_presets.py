@@ -44,7 +44,7 @@ class Settings:
     """Settings of a run."""
 
     preset: str = "sglpr"
-    """Name of a file in configs/."""
+    """Name of a file in configs/, or path of your own file."""
     seed: int = 0
     data: Path = Path("build/learned")
     """Folder of the recordings of `data`."""
@@ -68,7 +68,7 @@ class Settings:
     @property
     def folder(self) -> Path:
         """Folder of the run."""
-        return self.out / f"{self.preset}{'' if self.labels else '-no-labels'}-{self.seed}"
+        return self.out / f"{Path(self.preset).stem}{'' if self.labels else '-no-labels'}-{self.seed}"
 
 
 def main(settings: Settings) -> None:
