@@ -41,6 +41,10 @@ def variables():
     return reference.random_statistics(start)
 
 
+def test_the_variables_are_weights_and_statistics(variables):
+    assert set(variables) == {"params", "batch_stats"}
+
+
 def cubic(t):
     t = abs(t)
     if t <= 1:

@@ -105,7 +105,8 @@ class REIN(nn.Module):
             maps = functools.reduce(jnp.maximum, turned_back(encoder(eight_turns(x), train=train)))
         local = l2_normalize(resized(maps, images.shape[1] // DENSER))
         local = local.reshape(len(local), -1, local.shape[-1])
-        self.sow(LOCAL, FEATURES, local)
+        if not self.is_initializing():  # the collection does not belong to the variables
+            self.sow(LOCAL, FEATURES, local)
         return NetVLAD(64)(local)
 
 
