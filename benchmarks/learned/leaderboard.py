@@ -43,7 +43,8 @@ chosen by three short trainings on a held-out town. They start from random weigh
 * `bevplace++@resnet34-netvlad-0` describes eight rotations with the weights of one.
 
 `python -m benchmarks.learned.leaderboard` writes this page from `benchmarks/learned/results.json`. The
-[guide](guides/peers.md#all-methods-on-equal-terms) has the commands. Missing cells were not measured.
+[guide](guides/peers.md#all-methods-on-equal-terms) has the commands. Missing cells were not measured, and networks
+without a row were not trained yet.
 """
 
 

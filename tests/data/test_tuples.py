@@ -251,12 +251,3 @@ def test_places_at_random_differ_and_follow_seed_and_step():
     np.testing.assert_array_equal(pool.draw_places(seed=0, step=5, tuples=6), rows)
     assert (pool.draw_places(seed=0, step=6, tuples=6) != rows).any()
     assert pool.draw_places(seed=0, step=0, tuples=100).shape == (100, 5)
-
-
-@pytest.mark.parametrize(("share", "own"), [(0.5, 3), (1.0, 6)])
-def test_a_share_of_the_negatives_is_from_the_recording_of_the_anchor(share, own):
-    pool = TuplePool([circuit(1, seed=k) for k in range(3)], TupleConfig(negatives=6, own_negatives=share))
-    rows = pool.draw(seed=0, step=0, tuples=20)
-    from_own = pool.recording[rows[:, 2:]] == pool.recording[rows[:, :1]]
-    assert from_own[:, :own].all()
-    assert own == 6 or from_own[:, own:].mean() < 0.6

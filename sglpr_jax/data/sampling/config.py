@@ -15,9 +15,6 @@ class TupleConfig:
     """Number of positives of an anchor."""
     negatives: CountOrNone = 10
     """Number of negatives of an anchor."""
-    own_negatives: Share = 0.0
-    """Fraction of the negatives from the anchor's own recording, as far as it has any. The others are from all
-    recordings. A town with its sensor is easier to recognise than a place in it."""
     positive_m: NotNegative = POSITIVE_M
     """Maximum distance of a positive from its anchor, in metres."""
     negative_m: NotNegative = NEGATIVE_M

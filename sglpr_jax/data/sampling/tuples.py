@@ -117,25 +117,6 @@ class TuplePool:
         size = self.config.negatives
         if size and not len(choices):
             raise ValueError(f"no frame lies farther than {self.config.negative_m} m from frame {anchor} of the pool")
-        own = choices[self.recording[choices] == self.recording[anchor]]
-        from_own = round(self.config.own_negatives * size) if len(own) else 0
-        drawn = [
-            self._drawn(rng, own, from_own, anchor, cache),
-            self._drawn(rng, choices, size - from_own, anchor, cache),
-        ]
-        return np.concatenate(drawn)
-
-    def _drawn(
-        self,
-        rng: np.random.Generator,
-        choices: Int[np.ndarray, "_"],
-        size: int,
-        anchor: int,
-        cache: DescriptorCache | None,
-    ) -> Int[np.ndarray, "{size}"]:
-        """Draw negatives of an anchor, without repetition if there are enough. With a cache, from the most similar."""
-        if not size:
-            return choices[:0]
         if cache is not None:
             choices = _unless_empty(cache.nearest(anchor, choices, self.config.hardest), choices)
         return rng.choice(choices, size, replace=len(choices) < size)
