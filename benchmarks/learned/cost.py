@@ -8,7 +8,7 @@ descriptor, one scan at a time: the image or graph is part of it. A product and 
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.weights_file import load
 
 TOWN = "town-601"
+DescribeRecord = Callable[[Record], np.ndarray]
+"""Maps a scan to its descriptor."""
 
 
 def main(
@@ -53,26 +55,26 @@ def main(
     contenders = [entry(name, runs) for name in entries]
     describers = {one.name: _describer(one, recording) for one in contenders}
     records = [recording.record(row) for row in range(scans + 1)]
+    times, found = _milliseconds(describers, records), {}
+    for one in contenders:
+        numbers = np.asarray(describers[one.name](records[0])).size
+        found[one.name] = {"ms": times[one.name], "numbers": numbers, "bytes": 4 * numbers, **_network(one)}
+        print(one.name, json.dumps(found[one.name]), flush=True)
+    write_json(out, found)
+
+
+def _milliseconds(describers: Mapping[str, DescribeRecord], records: Sequence[Record]) -> dict[str, float]:
+    """Return the median time of each contender. The first record, for which programs are compiled, does not count."""
     times: dict[str, list[float]] = {name: [] for name in describers}
     for record in records:
         for name, of_scan in describers.items():
             start = time.perf_counter()
             of_scan(record)
-            times[name].append(time.perf_counter() - start)
-    found = {}
-    for one in contenders:
-        numbers = np.asarray(describers[one.name](records[0])).size
-        found[one.name] = {
-            "ms": 1e3 * float(np.median(times[one.name][1:])),
-            "numbers": numbers,
-            "bytes": 4 * numbers,
-            **_network(one),
-        }
-        print(one.name, json.dumps(found[one.name]), flush=True)
-    write_json(out, found)
+            times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: float(np.median(found[1:])) for name, found in times.items()}
 
 
-def _describer(contender: Entry, recording: Recording) -> Callable[[Record], np.ndarray]:
+def _describer(contender: Entry, recording: Recording) -> DescribeRecord:
     """Return a function from a scan to its descriptor."""
     method = contender.method(recording)
     if isinstance(method, RecordMethod):

@@ -19,12 +19,16 @@ from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network
 from sglpr_jax.methods.learned.method import LearnedMethod
-from sglpr_jax.methods.learned.weights_file import LAST, RANDOM, load_variables
+from sglpr_jax.methods.learned.weights_file import LAST, RANDOM, load_variables, method_of
 from sglpr_jax.methods.method import Method, RecordMethod, Takes
-from sglpr_jax.methods.registry import handcrafted, network, trained_method
+from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
 from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import init
+from sglpr_jax.reproduce.compared import content_of
 from sglpr_jax.training.learned.run_files import SCORES_FILE
+
+GRID = model_preset("sglpr").grid
+"""Grid of handcrafted methods on images."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,18 +64,12 @@ def entry(name: str, runs: Path) -> Entry:
         return _untrained(name, method, weights)
     folder = runs / weights
     folder = folder if "/" in weights else _last(folder)
-    about, seen = _about(folder), _seen(folder)
-    if "method" not in about:
-        return Entry(name, "images", functools.partial(_constant, network(sglpr_jax.load(folder))), *seen)
-    own = LEARNED[about["method"]]
-    other = LEARNED[method] if method else own
-    made = trained_method(own, str(folder))
-    made = made if other is own else _with_network(made, other, own, folder)
-    return Entry(name, other.takes, functools.partial(_constant, made), *seen)
-
-
-GRID = model_preset("sglpr").grid
-"""Grid of handcrafted methods on images."""
+    seen, own = _seen(folder), method_of(folder)
+    if own is None or not method:
+        made = method_with_weights(str(folder))
+        return Entry(name, content_of(str(folder)), functools.partial(_constant, made), *seen)
+    made = _with_network(LEARNED[method], LEARNED[own], folder)
+    return Entry(name, made.takes, functools.partial(_constant, made), *seen)
 
 
 def _constant(method: Method, recording: Recording) -> Method:
@@ -86,11 +84,12 @@ def _untrained(name: str, method: str, weights: str) -> Entry:
     return Entry(name, "images", functools.partial(_constant, network(params)), 0, 0.0)
 
 
-def _with_network(made: RecordMethod, other: LearnedMethod, own: LearnedMethod, folder: Path) -> RecordMethod:
-    """Return the method `other` with the weights of `own`. The distance must be L2."""
-    describe = functools.partial(apply_network, load_variables(folder, own), method=other)
-    about = {"method": other.name, "weights": str(folder)}
-    return dataclasses.replace(made, prepare=other.prepare, describe=describe, takes=other.takes, about=about)
+def _with_network(method: LearnedMethod, own: LearnedMethod, folder: Path) -> RecordMethod:
+    """Return a method with the weights of another one, `own`, which has the same parameters and the distance L2."""
+    describe = functools.partial(apply_network, load_variables(folder, own), method=method)
+    about = {"method": method.name, "weights": str(folder)}
+    made = trained_method(own, str(folder))
+    return dataclasses.replace(made, prepare=method.prepare, describe=describe, takes=method.takes, about=about)
 
 
 def _last(run: Path) -> Path:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
 
@@ -53,4 +52,4 @@ def images_of(recording: Recording, rows: Sequence[int]) -> Float32[np.ndarray, 
     """Return the density images of scans or images of a recording, in the window of `sglpr`."""
     grid = model_preset("sglpr").grid
     seen = (view(recording.record(row, labels=False), grid, image="density").image for row in rows)
-    return np.stack([np.asarray(jnp.asarray(one), np.float32) for one in seen])
+    return np.stack([np.asarray(one, np.float32) for one in seen])

@@ -42,6 +42,11 @@ class Row:
     source: str
     """Source of the numbers according to the paper. It determines the protocol."""
 
+    @property
+    def f1max_protocol(self) -> str:
+        """Name of the protocol of an F1max, in tables 1 and 2."""
+        return "pairs-f1max" if self.source == RINET else "top1-f1max"
+
 
 @dataclass(frozen=True)
 class Table:

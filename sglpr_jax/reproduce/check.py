@@ -46,6 +46,8 @@ def check(
     _check_recordings(runs, seqs, trained=trained)
     if nclt is not None and any(EXPERIMENTS[name].across_sessions for name in names):
         _check_sessions(nclt)
+    for name in weights:
+        method_with_weights(name)  # raises an error if the weights are missing or damaged
     for name in names:
         _check_labels(runs, name)
         if EXPERIMENTS[name].beside_handcrafted:
@@ -84,8 +86,6 @@ def _check_methods(runs: Runs, seqs: Sequence[str], methods: Sequence[str], weig
         if name not in HANDCRAFTED:
             raise ValueError(f"expected a handcrafted method, found {name!r}; available: {', '.join(HANDCRAFTED)}")
     for name in (*methods, *weights):
-        if name in weights:
-            method_with_weights(name)
         needs = content_of(name)
         for seq in seqs:
             recording = runs.recording(seq)

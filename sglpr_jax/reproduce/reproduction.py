@@ -35,9 +35,8 @@ class Reproduction:
         """Return the tables with the reproduced numbers and the paper's, one for each protocol, by file name."""
         experiment = EXPERIMENTS[name]
         if experiment.across_sessions:
-            options = {"trained": self.trained}
             columns, rows = across_sessions_rows(
-                name, self.runs, self.seqs[0], self.sessions(), self.methods, **options
+                name, self.runs, self.seqs[0], self.sessions(), self.methods, trained=self.trained
             )
             caption = [*self._about(f"without recording {self.seqs[0]}"), "Recall@1 within 5 m"]
             return {name: _table(experiment.title, name, columns, rows, caption)}

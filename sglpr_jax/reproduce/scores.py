@@ -8,10 +8,10 @@ from pathlib import Path
 from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.evaluation.protocols import PROTOCOLS, Result
 from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
-from sglpr_jax.evaluation.published import RINET, TABLES
+from sglpr_jax.evaluation.published import TABLES
 from sglpr_jax.evaluation.published import Row as PublishedRow
 from sglpr_jax.reproduce.compared import content_of
-from sglpr_jax.reproduce.experiments import EXPERIMENTS, PAIRS, TOP1
+from sglpr_jax.reproduce.experiments import EXPERIMENTS, TOP1
 from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, Row, score_or_none
 
@@ -77,19 +77,20 @@ def methods_of(name: str, methods: Sequence[str], *, trained: bool = True) -> Ma
 def published_rows(name: str, columns: Sequence[str], *, protocol: str | None = None) -> list[Row]:
     """Return the paper's rows of a table, if it has any of these columns.
 
-    With a protocol, only the rows of this protocol, with the source that the paper names. Rows from RINet's paper are
-    F1max of pairs; for all others it is that of top-1 retrieval (`evaluation.published`).
+    With a protocol, only the rows that were scored by it are returned. The source that the paper names then stands
+    beside each method.
     """
     return [
         Row(_label(row, protocol), PUBLISHED, dict(zip(table.columns, row.scores, strict=True)))
         for table in TABLES
         if name == f"table{table.number}" and set(columns) & set(table.columns)
         for row in table.rows
-        if protocol is None or (protocol == PAIRS) == (row.source == RINET)
+        if protocol in (None, row.f1max_protocol)
     ]
 
 
 def _label(row: PublishedRow, protocol: str | None) -> str:
+    """Return the method and, in a table of one protocol, the source of its scores."""
     return row.method if protocol is None else f"{row.method} ({row.source})"
 
 

@@ -13,6 +13,8 @@ from sglpr_jax.methods.learned.method import Variables
 
 LOCAL, FEATURES = "local", "features"
 """Collection and name in which a network sows the local features that it gives to NetVLAD."""
+VLAD = "NetVLAD_0"
+"""Name of the parameters of NetVLAD."""
 POSITIONS, ITERATIONS = 100, 100
 """Number of features of each image, and of iterations of k-means."""
 BATCH = 4
@@ -21,9 +23,7 @@ FAR = 0.01
 """Weight of the second-nearest cluster, divided by that of the nearest one, for the average feature."""
 
 
-def with_clusters(
-    network: nn.Module, variables: Variables, inputs: Shaped[np.ndarray, "n ..."], *, path: str = "NetVLAD_0"
-) -> Variables:
+def with_clusters(network: nn.Module, variables: Variables, inputs: Shaped[np.ndarray, "n ..."]) -> Variables:
     """Return the variables with clusters from the local features of some images.
 
     The centres are those of k-means (Arandjelović et al., 2016). The assignment is a * x · centre / |centre|, with the
@@ -33,16 +33,15 @@ def with_clusters(
       network: Network that sows its local features as `FEATURES` in the collection `LOCAL`.
       variables: Random variables of the network.
       inputs: Inputs of random training places.
-      path: Name of NetVLAD's parameters.
     """
     features = _local_features(network, variables, inputs)
-    vlad = variables["params"][path]
+    vlad = variables["params"][VLAD]
     centres, _ = kmeans2(features, len(vlad["centres"]), iter=ITERATIONS, minit="++", rng=np.random.default_rng(0))
     units = centres / np.linalg.norm(centres, axis=1, keepdims=True)
     second, first = np.sort(features @ units.T, axis=1)[:, -2:].T
     factor = -np.log(FAR) / np.mean(first - second)
     new = {"assignment": jnp.asarray((factor * units).T), "centres": jnp.asarray(centres)}
-    return {**variables, "params": {**variables["params"], path: new}}
+    return {**variables, "params": {**variables["params"], VLAD: new}}
 
 
 def _local_features(
