@@ -41,9 +41,19 @@ class FleetIndex:
             self._connection = lancedb.connect(self.place, read_consistency_interval=timedelta(0), **options)
             self.table: Any = None  # until the first `add`
             if TABLE in self._connection.list_tables().tables:
-                self.table = self._connection.open_table(TABLE)
+                self.table = self._opened()
         if self.table is not None:
             self._check(self.about)
+
+    def _opened(self) -> Any:
+        """Return the listed table, or None if another process is about to create it: its folder is there before its
+        first version."""
+        try:
+            return self._connection.open_table(TABLE)
+        except ValueError as error:
+            if "was not found" not in str(error):
+                raise
+            return None
 
     def __len__(self) -> int:
         with usable(self.place):

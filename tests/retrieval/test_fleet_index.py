@@ -125,3 +125,10 @@ def test_recordings_with_places_of_similar_descriptors_may_overlap(filled):
     again = place_rows(file_of(30), "again")
     assert [one[:2] for one in overlaps(filled, again, max_distance=0.01)] == [("again", "first")]
     assert overlaps(filled, again, max_distance=0.01, where="site = 'south'") == []
+
+
+def test_a_table_that_another_process_is_about_to_create_has_no_places_yet(tmp_path):
+    (tmp_path / f"{TABLE}.lance" / "_versions").mkdir(parents=True)
+    index = FleetIndex(tmp_path, weights_hash="abc")
+    assert len(index) == 0
+    assert index.add(place_rows(file_of(3), "first")) == 3
