@@ -1,6 +1,6 @@
 """Time of a descriptor, its size, and the size of the network, for all contenders.
 
-    taskset -c 0 python -m benchmarks.learned.cost sglpr circular rinet@random:0 bevplace++@random:0 scan-context
+    taskset -c 0 python -m benchmarks.learned.cost sglpr paper-112@random:0 rinet@random:0 bevplace++@random:0 ring
 
 Contenders take turns, so that other programs slow all of them. The time is that from a scan in memory to its
 descriptor, one scan at a time: the image or graph is part of it. A product and a sum are two operations.
@@ -22,11 +22,13 @@ from sglpr_jax.data import Recording, open_recording
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.views import view
 from sglpr_jax.files import write_json
+from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network
 from sglpr_jax.methods.learned.weights_file import example_inputs, random_variables, weight_count
 from sglpr_jax.methods.method import ImageMethod, RecordMethod
-from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.sglpr import describe, init
+from sglpr_jax.models.shipped import shipped_weights
 from sglpr_jax.models.weights_file import load
 
 TOWN = "town-601"
@@ -96,9 +98,9 @@ def _network(contender: Entry) -> Mapping[str, Any]:
         variables, inputs = random_variables(method, seed=0), example_inputs(method)
         cost = apply_network.lower(variables, inputs, method=method).cost_analysis()
         return {"weights": weight_count(variables), "gflop": _gflop(cost)}
-    if contender.takes != "images" or name not in ("sglpr", "circular"):
+    if name in HANDCRAFTED:
         return {}
-    params = load(name)
+    params = load(name) if name in shipped_weights() else init(jax.random.key(0), preset=name)
     grid = params.config.grid
     cost = jax.jit(describe).lower(params, np.zeros((1, grid.height, grid.width), np.float32)).cost_analysis()
     return {"weights": sum(leaf.size for leaf in jax.tree.leaves(params)), "gflop": _gflop(cost)}

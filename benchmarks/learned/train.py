@@ -32,6 +32,7 @@ def main(
     seconds: float = 3600.0,
     images: int = 200_000,
     search_seconds: float = 300.0,
+    learning_rate: float | None = None,
 ) -> None:
     """Train every method with every seed, one after the other.
 
@@ -43,12 +44,14 @@ def main(
         seconds: training time of each run.
         images: number of images after which a run stops, if its time is not over before.
         search_seconds: training time of each of the three learning rates. Further seeds use the rate of the first.
+        learning_rate: rate of all runs, in place of the search.
     """
     for method in methods:
         for seed in seeds:
             run, first = out / f"{method}-{seed}", out / f"{method}-{seeds[0]}"
             limits = {"seed": seed, "seconds": seconds, "images": images, "search-seconds": search_seconds}
-            _train(method, data, run, limits | ({} if run == first else {"learning-rate": _best_rate(first)}))
+            rate = learning_rate or (None if run == first else _best_rate(first))
+            _train(method, data, run, limits | ({} if rate is None else {"learning-rate": rate}))
 
 
 def _train(method: str, data: Path, run: Path, flags: Mapping[str, float]) -> None:

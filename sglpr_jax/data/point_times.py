@@ -1,6 +1,6 @@
 """Times of the points of a scan: drivers write them in several units, relative to the scan or to an epoch.
 
-A field of times does not state its unit. A scan takes .02 to 1 s, so the span of the values has one possible unit.
+A field of times does not state its unit. A scan takes 2 ms to 1 s, so the span of the values has one possible unit.
 """
 
 from collections.abc import Collection

@@ -1,7 +1,7 @@
 """Correction of a trajectory while it is driven: an incremental pose graph, solved by gtsam's iSAM2 (extra `gtsam`).
 
-`optimization` solves the same graph at the end and removes wrong loops. Here a robust cost (Cauchy) limits the
-influence of a wrong loop.
+`optimization` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
+limits the influence of a wrong loop.
 """
 
 import bisect

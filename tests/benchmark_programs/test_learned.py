@@ -6,6 +6,8 @@ import os
 import jax
 import pytest
 
+from benchmarks.learned.leaderboard_page import page_of
+
 from .programs import ROOT, TINY, printed
 
 FILES = ("train/vlp16-61", "train-images/vlp16-61", "held-out/town-37", "test/town-601")
@@ -28,12 +30,13 @@ def test_all_contenders_are_trained_scored_and_compared(build, tmp_path, monkeyp
     printed("learned.train", *runs, "--methods", "rinet", "--seeds", 0, 1, *few)
     configs = [json.loads((build / "runs" / f"rinet-{seed}" / "config.json").read_text()) for seed in (0, 1)]
     assert len({one["settings"]["learning_rate"] for one in configs}) == 1
-    preset = (*runs, "--preset", TINY, "--images", 600, "--upright-images", 300, "--learning-rate", 1e-3)
-    printed("learned.train_presets", *preset, "--compile-cache", tmp_path / "compiled")
+    preset = (*runs, "--preset", TINY, "--upright-images", 300, "--learning-rate", 1e-3)
+    for images in (600, 800):  # the second run goes on from the first
+        printed("learned.train_presets", *preset, "--images", images, "--compile-cache", tmp_path / "compiled")
     jax.config.update("jax_compilation_cache_dir", None)
     curve = (build / "runs" / "tiny-0" / "scores.jsonl").read_text().splitlines()
-    upright, whole = (json.loads(line)["images"] for line in curve)
-    assert 250 < upright <= 300 and 550 < whole <= 600
+    upright, first, whole = (json.loads(line)["images"] for line in curve)
+    assert 250 < upright <= 300 and 550 < first <= 600 and 750 < whole <= 800
 
     places = ("--data", build, "--runs", build / "runs", "--out", build / "scores")
     entries = ("rinet-0", "rinet@random:0", "tiny-0", f"tiny-0/weights-{upright}", "thumbnail")
@@ -45,6 +48,10 @@ def test_all_contenders_are_trained_scored_and_compared(build, tmp_path, monkeyp
     kept, page = tmp_path / "results.json", tmp_path / "leaderboard.md"
     printed("learned.leaderboard", "--build", build, "--kept", kept, "--page", page)
     assert "`tiny-0`" in page.read_text() and "98,765" in page.read_text()
+    assert "## At equal numbers of images" not in page.read_text()  # there is no run of `sglpr` yet
+    copied = json.loads(kept.read_text())
+    copied["scores"]["sglpr-0"] = copied["scores"]["rinet-0"]
+    assert "## At equal numbers of images" in page_of(copied)
     before = page.read_text()
     printed("learned.leaderboard", "--build", tmp_path / "none", "--kept", kept, "--page", page)
     assert page.read_text() == before

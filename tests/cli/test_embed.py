@@ -15,6 +15,7 @@ from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.names import AnyMethodName
 from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.retrieval.place_store import read_places, stored_places
 
 from .conftest import assert_one_line_error
 
@@ -39,6 +40,17 @@ def scans(town, tmp_path):
     for path in sorted(folder.iterdir())[12:]:
         path.unlink()
     return folder
+
+
+def test_a_store_gets_each_recording_once(command, scans, tmp_path):
+    arguments = ("--method", "thumbnail", "--data", scans, "--site", "north", "--out", f"{tmp_path}/places/")
+    first, again = command("embed", *arguments), command("embed", *arguments)
+    assert first.status == again.status == 0, (first.error, again.error)
+    (address,) = stored_places(f"{tmp_path}/places/")
+    rows = read_places(address)
+    assert len(rows) == 12 and set(rows["site"].to_pylist()) == {"north"}
+    name = Path(address).name
+    assert f"{name}: 12 places" in first.out and f"{name}: already there" in again.out
 
 
 def test_embedding_is_what_the_training_tested_and_twice_the_same(embed, trained, town):
