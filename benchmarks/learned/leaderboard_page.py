@@ -28,8 +28,10 @@ SCENERIES = Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_
 SENSORS = Column("other sensors", ("vlp16-603-08", "os1-64-603-08"))
 DAY = Column("another day", ("days-604",))
 SIMULATED = (TOWN, TOWN.rotated, SCENERIES, SENSORS, DAY)
-SEQS = ("00", "02", "06")
-KITTI = Column("KITTI", tuple(f"kitti-{seq}" for seq in SEQS))
+LABELLED = SIMULATED[:-1]
+"""The recordings of two days have no labels."""
+SEQS = tuple(Column(seq, (f"kitti-{seq}",)) for seq in ("00", "02", "06"))
+KITTI = Column("KITTI", tuple(test for column in SEQS for test in column.tests))
 OURS = "sglpr-0"
 """The run that the peers are compared with at equal numbers of images."""
 AHEAD = 0.005
@@ -71,9 +73,9 @@ LABELS = {
 """Contenders, and the labels that they have."""
 HEAD = """# Leaderboard
 
-All networks were trained by the same program on the same simulated recordings, each for one hour on one core. They
-start from random weights. The learning rate was chosen by three short trainings on a held-out town. All scores are of
-recordings that no network has seen.
+All networks were trained on the same simulated recordings, each for one hour on one core, while the second core trained
+another network. They start from random weights. The learning rate was chosen by three short trainings, scored on a
+held-out town. The tables along the training are of this town, all others of recordings that nothing was chosen on.
 
 * `NAME-0` and `NAME-1` are two seeds. `random:0` are untrained networks.
 * `sglpr` and `circular` are the shipped weights, which were trained longer and on more towns. `sglpr-0` has the
@@ -143,7 +145,7 @@ def _semantics(scores: Mapping[str, Scores]) -> str:
         [
             f"`{name.split(',')[0]}`",
             labels,
-            *(_text(_mean(scores[name], column, "recall")) for column in SIMULATED[:-1]),
+            *(_text(_mean(scores[name], column, "recall")) for column in LABELLED),
         ]
         for name, labels in LABELS.items()
         if name in scores
@@ -153,7 +155,7 @@ def _semantics(scores: Mapping[str, Scores]) -> str:
 Recall@1. RINet and SGPR need a label for each point: the true one, that of the segmentation head of `sglpr`, or one and
 the same for all points. `sglpr` needs labels only while training, for its segmentation head.
 """
-    return _section(about, ["", "labels", *(column.title for column in SIMULATED[:-1])], rows)
+    return _section(about, ["", "labels", *(column.title for column in LABELLED)], rows)
 
 
 def _orders(scores: Mapping[str, Scores]) -> str:
@@ -203,9 +205,7 @@ correlation of `align`.
 
 def _kitti(scores: Mapping[str, Scores]) -> str:
     """Return the table of the images of KITTI."""
-    columns = [
-        each for seq in SEQS for each in (Column(seq, (f"kitti-{seq}",)), Column(seq, (f"kitti-{seq}",)).rotated)
-    ]
+    columns = [each for one in SEQS for each in (one, one.rotated)]
     rows = [
         [f"`{name}`", *(_three(found, column) for column in columns)]
         for name, found in scores.items()
@@ -217,8 +217,7 @@ def _kitti(scores: Mapping[str, Scores]) -> str:
 
 def _split(scores: Mapping[str, Scores]) -> str:
     """Return the table of Recall@1 by the published split into map and queries."""
-    columns = [Column(seq, (f"kitti-{seq}",)) for seq in SEQS]
-    ours = {name: [_mean(found, column, "split recall") for column in columns] for name, found in scores.items()}
+    ours = {name: [_mean(found, column, "split recall") for column in SEQS] for name, found in scores.items()}
     rows = [[f"`{name}`", *map(_text, found)] for name, found in ours.items() if any(found)]
     if rows:
         rows += [[f"{name}, published", *map(_text, found)] for name, found in PUBLISHED_RECALL.items()]
@@ -227,7 +226,7 @@ def _split(scores: Mapping[str, Scores]) -> str:
 Recall@1 of the same images by the split of BEVPlace++. The published networks were trained on KITTI 00 itself, for far
 longer. Those of BEVPlace start from ImageNet.
 """
-    return _section(about, ["", *SEQS], rows)
+    return _section(about, ["", *(column.title for column in SEQS)], rows)
 
 
 def _curves(runs: Mapping[str, Any]) -> Iterator[str]:
