@@ -2,36 +2,28 @@
 
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
+from benchmarks.learned.cells import (
+    KITTI,
+    LABELLED,
+    SCENERIES,
+    SENSORS,
+    SEQS,
+    SIMULATED,
+    TOWN,
+    Scores,
+    both,
+    joined,
+    mean,
+    number,
+    section,
+    text,
+    three,
+)
 from sglpr_jax.evaluation.published import TABLE_1
 
-Scores = Mapping[str, Mapping[str, Any]]
-"""Results of one contender, by test recording."""
-
-
-class Column(NamedTuple):
-    """A mean over test recordings."""
-
-    title: str
-    tests: tuple[str, ...]
-
-    @property
-    def rotated(self) -> "Column":
-        """The same recordings with rotated scans."""
-        return Column(f"{self.title}, rotated", tuple(f"{test}-rotated" for test in self.tests))
-
-
-TOWN = Column("town", ("town-601-00", "town-601-08"))
-SCENERIES = Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_park-602-08"))
-SENSORS = Column("other sensors", ("vlp16-603-08", "os1-64-603-08"))
-DAY = Column("another day", ("days-604",))
-SIMULATED = (TOWN, TOWN.rotated, SCENERIES, SENSORS, DAY)
-LABELLED = SIMULATED[:-1]
-"""The recordings of two days have no labels."""
-SEQS = tuple(Column(seq, (f"kitti-{seq}",)) for seq in ("00", "02", "06"))
-KITTI = Column("KITTI", tuple(test for column in SEQS for test in column.tests))
 OURS = "sglpr-0"
 """The run that the peers are compared with at equal numbers of images."""
 AHEAD = 0.005
@@ -104,9 +96,9 @@ def _summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
         found = scores[name]
         cost = by_method.get(_method(name), {})
         seen = next(iter(found.values()))
-        training = (_number(seen["images"]), _number(seen["seconds"]))
-        recalls = (_text(_mean(found, column, "recall")) for column in (*SIMULATED, KITTI))
-        size = (_number(cost.get("ms"), 1), _number(cost.get("bytes")))
+        training = (number(seen["images"]), number(seen["seconds"]))
+        recalls = (text(mean(found, column, "recall")) for column in (*SIMULATED, KITTI))
+        size = (number(cost.get("ms"), 1), number(cost.get("bytes")))
         rows.append([f"`{name}`", *recalls, *training, *size])
     head = ["", *(column.title for column in (*SIMULATED, KITTI)), "images seen", "seconds", "ms", "bytes"]
     about = """## Summary
@@ -115,7 +107,7 @@ Recall@1: the fraction of the revisits whose nearest descriptor, among frames ol
 day* searches a first session for the scans of a second one. Then images and seconds of the training, and time and size
 of a descriptor.
 """
-    return _section(about, head, rows)
+    return section(about, head, rows)
 
 
 def _equal_images(scores: Mapping[str, Scores]) -> str:
@@ -127,16 +119,16 @@ def _equal_images(scores: Mapping[str, Scores]) -> str:
         if name == OURS or not fitting:
             continue
         theirs, ours = scores[name], scores[snapshots[max(fitting)]]
-        cells = [(column, _mean(theirs, column, "recall"), _mean(ours, column, "recall")) for column in SIMULATED]
+        cells = [(column, mean(theirs, column, "recall"), mean(ours, column, "recall")) for column in SIMULATED]
         ahead += [f"`{name}` ({column.title})" for column, a, b in cells if a and b and a >= b + AHEAD]
-        rows.append([f"`{name}`", f"{_images(theirs):,}", f"{max(fitting):,}", *(_both(a, b) for _, a, b in cells)])
+        rows.append([f"`{name}`", f"{_images(theirs):,}", f"{max(fitting):,}", *(both(a, b) for _, a, b in cells)])
     head = ["", "its images", f"images of `{OURS}`", *(column.title for column in SIMULATED)]
     about = f"""## At equal numbers of images
 
 Recall@1 of each network / of `{OURS}` after at most as many images. Ahead of `{OURS}` by {AHEAD} or more:
 {", ".join(ahead) or "none"}.
 """
-    return _section(about, head, rows)
+    return section(about, head, rows)
 
 
 def _semantics(scores: Mapping[str, Scores]) -> str:
@@ -145,7 +137,7 @@ def _semantics(scores: Mapping[str, Scores]) -> str:
         [
             f"`{name.split(',')[0]}`",
             labels,
-            *(_text(_mean(scores[name], column, "recall")) for column in LABELLED),
+            *(text(mean(scores[name], column, "recall")) for column in LABELLED),
         ]
         for name, labels in LABELS.items()
         if name in scores
@@ -155,7 +147,7 @@ def _semantics(scores: Mapping[str, Scores]) -> str:
 Recall@1. RINet and SGPR need a label for each point: the true one, that of the segmentation head of `sglpr`, or one and
 the same for all points. `sglpr` needs labels only while training, for its segmentation head.
 """
-    return _section(about, ["", "labels", *(column.title for column in LABELLED)], rows)
+    return section(about, ["", "labels", *(column.title for column in LABELLED)], rows)
 
 
 def _orders(scores: Mapping[str, Scores]) -> str:
@@ -164,19 +156,19 @@ def _orders(scores: Mapping[str, Scores]) -> str:
     pairs, rows = 0, []
     for (name, row), (other, against) in itertools.permutations(known, 2):
         score = "pairs" if row.f1max_protocol == "pairs-f1max" else "top1"
-        here, there = _mean(scores[name], TOWN, score), _mean(scores[other], TOWN, score)
+        here, there = mean(scores[name], TOWN, score), mean(scores[other], TOWN, score)
         if row.f1max_protocol != against.f1max_protocol or here is None or there is None:
             continue
         if row.mean >= against.mean + REVERSED:
             pairs += 1
             if here <= there - REVERSED:
-                rows.append([f"{row.method}, {against.method}", _both(row.mean, against.mean), _both(here, there)])
+                rows.append([f"{row.method}, {against.method}", both(row.mean, against.mean), both(here, there)])
     about = f"""## Published orders that do not hold here
 
 Two methods of the paper's table 1 with the same protocol, the mean of its row, and F1max by this protocol in the unseen
 town. Of {pairs} pairs whose means differ by {REVERSED} or more, these are reversed by as much:
 """
-    return _section(about, ["", "published", "here"], rows)
+    return section(about, ["", "published", "here"], rows)
 
 
 def _row(title: str) -> Any:
@@ -189,44 +181,44 @@ def _simulated(scores: Mapping[str, Scores]) -> str:
     rows = [
         [
             f"`{name}`",
-            *(_three(found, column) for column in columns),
-            _joined(_mean(found, TOWN, f"verified {score}") for score in ("top1", "recall")),
+            *(three(found, column) for column in columns),
+            joined(mean(found, TOWN, f"verified {score}") for score in ("top1", "recall")),
         ]
         for name, found in scores.items()
-        if _mean(found, TOWN, "recall") is not None
+        if mean(found, TOWN, "recall") is not None
     ]
     about = """## Simulated recordings
 
 Top-1 F1max, pairs F1max, Recall@1. *Verified* is top-1 F1max and Recall@1 of the best of the 5 nearest places by the
 correlation of `align`.
 """
-    return _section(about, ["", *(column.title for column in columns), "town, verified"], rows)
+    return section(about, ["", *(column.title for column in columns), "town, verified"], rows)
 
 
 def _kitti(scores: Mapping[str, Scores]) -> str:
     """Return the table of the images of KITTI."""
     columns = [each for one in SEQS for each in (one, one.rotated)]
     rows = [
-        [f"`{name}`", *(_three(found, column) for column in columns)]
+        [f"`{name}`", *(three(found, column) for column in columns)]
         for name, found in scores.items()
         if any(test in found for test in KITTI.tests)
     ]
     about = "## Images of KITTI\n\nTop-1 F1max, pairs F1max, Recall@1.\n"
-    return _section(about, ["", *(column.title for column in columns)], rows)
+    return section(about, ["", *(column.title for column in columns)], rows)
 
 
 def _split(scores: Mapping[str, Scores]) -> str:
     """Return the table of Recall@1 by the published split into map and queries."""
-    ours = {name: [_mean(found, column, "split recall") for column in SEQS] for name, found in scores.items()}
-    rows = [[f"`{name}`", *map(_text, found)] for name, found in ours.items() if any(found)]
+    ours = {name: [mean(found, column, "split recall") for column in SEQS] for name, found in scores.items()}
+    rows = [[f"`{name}`", *map(text, found)] for name, found in ours.items() if any(found)]
     if rows:
-        rows += [[f"{name}, published", *map(_text, found)] for name, found in PUBLISHED_RECALL.items()]
+        rows += [[f"{name}, published", *map(text, found)] for name, found in PUBLISHED_RECALL.items()]
     about = """## Beside published numbers
 
 Recall@1 of the same images by the split of BEVPlace++. The published networks were trained on KITTI 00 itself, for far
 longer. Those of BEVPlace start from ImageNet.
 """
-    return _section(about, ["", *(column.title for column in SEQS)], rows)
+    return section(about, ["", *(column.title for column in SEQS)], rows)
 
 
 def _curves(runs: Mapping[str, Any]) -> Iterator[str]:
@@ -239,12 +231,12 @@ def _curves(runs: Mapping[str, Any]) -> Iterator[str]:
         for name, curve in curves.items()
     ]
     about = "## Along the training\n\nRecall@1 on the held-out town after numbers of images.\n"
-    yield _section(about, ["", "learning rate", *(f"{mark:,}" for mark in marks)], rows)
+    yield section(about, ["", "learning rate", *(f"{mark:,}" for mark in marks)], rows)
     rows = [
         [
             f"`{name}`",
             *(_until(curve, mark) for mark in MARKS_S),
-            _number(curve[-1]["images"]),
+            number(curve[-1]["images"]),
             ", ".join(f"{loss:.3g}" for loss in runs[name]["losses"] or ()) or "-",
         ]
         for name, curve in curves.items()
@@ -252,28 +244,28 @@ def _curves(runs: Mapping[str, Any]) -> Iterator[str]:
     about = """The same after seconds: the last weights that were kept until then. Then the images at the end, and the
 mean loss of each quarter of the steps.
 """
-    yield _section(about, ["", *map(str, MARKS_S), "images", "loss"], rows)
+    yield section(about, ["", *map(str, MARKS_S), "images", "loss"], rows)
 
 
 def _after(curve: Sequence[Mapping[str, float]], images: int) -> str:
     found = next((one for one in curve if images <= one["images"] < 1.5 * images), None)
-    return _text(None if found is None else found["recall_at_1"])
+    return text(None if found is None else found["recall_at_1"])
 
 
 def _until(curve: Sequence[Mapping[str, float]], seconds: float) -> str:
     found = [one for one in curve if one["seconds"] <= 1.01 * seconds]
-    return _text(found[-1]["recall_at_1"] if found else None)
+    return text(found[-1]["recall_at_1"] if found else None)
 
 
 def _costs(costs: Mapping[str, Any]) -> str:
     """Return the table of times and sizes."""
     digits = {"ms": 1, "bytes": 0, "weights": 0, "gflop": 2}
     rows = [
-        [f"`{_method(name)}`", *(_number(cost.get(key), each) for key, each in digits.items())]
+        [f"`{_method(name)}`", *(number(cost.get(key), each) for key, each in digits.items())]
         for name, cost in costs.items()
     ]
     about = "## Cost\n\nFrom a scan in memory to its descriptor, one scan at a time on one core.\n"
-    return _section(about, ["", "ms", "bytes", "weights", "GFLOP"], rows)
+    return section(about, ["", "ms", "bytes", "weights", "GFLOP"], rows)
 
 
 def _method(name: str) -> str:
@@ -292,39 +284,4 @@ def _images(found: Scores) -> int:
 
 def _overall(found: Scores) -> float:
     """Return the mean Recall@1 over the simulated recordings; missing ones count as 0."""
-    return sum(_mean(found, column, "recall") or 0 for column in SIMULATED) / len(SIMULATED)
-
-
-def _mean(found: Scores, column: Column, score: str) -> float | None:
-    """Return the mean of a score over recordings, or None if one is missing."""
-    values = [found[test]["scores"].get(score) if test in found else None for test in column.tests]
-    return None if None in values else sum(values) / len(values)  # type: ignore[arg-type]
-
-
-def _three(found: Scores, column: Column) -> str:
-    return _joined(_mean(found, column, score) for score in ("top1", "pairs", "recall"))
-
-
-def _joined(values: Iterable[float | None]) -> str:
-    texts = [_text(value) for value in values]
-    return "-" if set(texts) == {"-"} else ", ".join(texts)
-
-
-def _both(a: float | None, b: float | None) -> str:
-    return f"{_text(a)} / {_text(b)}"
-
-
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _number(value: float | None, digits: int = 0) -> str:
-    return "-" if value is None else f"{value:,.{digits}f}"
-
-
-def _section(about: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a text and its table, or nothing if the table has no rows."""
-    if not rows:
-        return ""
-    table = "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
-    return f"{about}\n{table}\n"
+    return sum(mean(found, column, "recall") or 0 for column in SIMULATED) / len(SIMULATED)

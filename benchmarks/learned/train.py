@@ -30,7 +30,7 @@ def main(
     methods: Sequence[str] = LEARNED_NAMES,
     seeds: Sequence[int] = (0, 1),
     seconds: float = 3600.0,
-    images: int = 200_000,
+    images: int = 0,
     search_seconds: float = 300.0,
     learning_rate: float | None = None,
 ) -> None:
@@ -42,7 +42,7 @@ def main(
         methods: names of the methods.
         seeds: seeds of weights, tuples and rotations.
         seconds: training time of each run.
-        images: number of images after which a run stops, if its time is not over before.
+        images: number of images after which a run stops, if its time is not over before; 0: no limit.
         search_seconds: training time of each of the three learning rates. Further seeds use the rate of the first.
         learning_rate: rate of all runs, in place of the search.
     """

@@ -2,7 +2,8 @@
 
     python -m benchmarks.learned.train_presets --preset sglpr --seed 0
     python -m benchmarks.learned.train_presets --preset sglpr --seed 0 --no-labels    # without the semantic branch
-    python -m benchmarks.learned.train_presets --preset paper-112 --seconds 9000 --upright-images 6000
+    python -m benchmarks.learned.train_presets --preset benchmarks/learned/paper-112.py --seconds 9000 \\
+        --upright-images 6000 --learning-rate 4e-4
 
 The learning rate is the best of three short trainings on the held-out town. As for the learned methods, weights are
 kept after 1,000, 2,000, 4,000, ... images, an interrupted training is continued, and a finished one is left alone.
@@ -52,8 +53,8 @@ class Settings:
     """Folder of the runs, PRESET-SEED."""
     seconds: float = 3600.0
     """Training time, without scores and compilation."""
-    images: int = 200_000
-    """Number of images after which the run stops, if its time is not over before."""
+    images: int = 0
+    """Number of images after which the run stops, if its time is not over before; 0: no limit."""
     upright_images: int = 0
     """Number of images, out of all, that are not rotated: a first stage of the training."""
     search_seconds: float = 300.0
@@ -140,8 +141,9 @@ def _any(stopped: Callable[[], bool], clock: Clock) -> Callable[[], bool]:
 
 def _ends(settings: Settings) -> Iterator[int]:
     """Yield the numbers of images at which a stage ends."""
-    doubled = itertools.takewhile(lambda n: n < settings.images, (FIRST_SNAPSHOT * 2**k for k in itertools.count()))
-    yield from sorted({*doubled, settings.images, settings.upright_images} - {0})
+    limit = settings.images or ENDLESS
+    doubled = itertools.takewhile(lambda n: n < limit, (FIRST_SNAPSHOT * 2**k for k in itertools.count()))
+    yield from sorted({*doubled, limit, settings.upright_images} - {0})
 
 
 def _keep(folder: Path, params: sglpr_jax.Params, images: int, seconds: float, held_out: list[Recording]) -> None:
