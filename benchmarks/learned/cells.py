@@ -1,5 +1,6 @@
 """Columns and cells of the tables of the leaderboard."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -28,6 +29,16 @@ LABELLED = SIMULATED[:-1]
 """The recordings of two days have no labels."""
 SEQS = tuple(Column(seq, (f"kitti-{seq}",)) for seq in ("00", "02", "06"))
 KITTI = Column("KITTI", tuple(test for column in SEQS for test in column.tests))
+
+
+def method_of(name: str) -> str:
+    """Return the method of a contender: `rinet` of `rinet-0/weights-1000` and of `rinet@random:0`."""
+    return re.sub(r"-\d$", "", name.split("/")[0].split("@")[0])
+
+
+def finals(scores: Mapping[str, Scores]) -> list[str]:
+    """Return the contenders, without the weights along a training and those with other labels."""
+    return [name for name in scores if "/" not in name and "," not in name]
 
 
 def mean(found: Scores, column: Column, score: str) -> float | None:

@@ -2,9 +2,9 @@
 
     python -m benchmarks.learned.leaderboard
 
-Reads the results of `score`, `cost` and the trainings, keeps them in one file, and writes docs/leaderboard.md from it.
-Without new results, the page is that of the kept file. Contenders that were trained and scored with the labels of
-`labels` are called `NAME, predicted labels` and `NAME, no labels`.
+Reads the results of `score`, `cost` and the trainings, keeps them in one file, and writes docs/leaderboard.md with its
+figure from it. Without new results, they are those of the kept file. Contenders that were trained and scored with the
+labels of `labels` are called `NAME, predicted labels` and `NAME, no labels`.
 """
 
 import json
@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import tyro
 
+from benchmarks.learned.leaderboard_figure import draw
 from benchmarks.learned.leaderboard_page import page_of
 from sglpr_jax.files import write_json, write_text
 
 KEPT = Path(__file__).with_name("results.json")
-PAGE = Path("docs/leaderboard.md")
+PAGE, FIGURE = Path("docs/leaderboard.md"), Path("docs/images/leaderboard.svg")
 
 
 def main(
@@ -28,8 +29,9 @@ def main(
     none: Path = Path("build/learned-none"),
     kept: Path = KEPT,
     page: Path = PAGE,
+    figure: Path = FIGURE,
 ) -> None:
-    """Keep new results and write the page.
+    """Keep new results, and write the page and its figure.
 
     Args:
         build: folder of the results.
@@ -37,6 +39,7 @@ def main(
         none: folder of the results without labels.
         kept: file of the kept results.
         page: page to write.
+        figure: figure to write.
     """
     results = json.loads(kept.read_text()) if kept.is_file() else {"scores": {}, "costs": {}, "runs": {}}
     for folder, labels in ((build, ""), (predicted, ", predicted labels"), (none, ", no labels")):
@@ -49,6 +52,7 @@ def main(
         results["runs"][path.parent.name] = _run(path.parent)
     write_json(kept, results)
     write_text(page, page_of(results))
+    draw(results, figure)
 
 
 def _run(folder: Path) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The text of the page that compares all contenders."""
 
 import itertools
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -15,8 +14,10 @@ from benchmarks.learned.cells import (
     TOWN,
     Scores,
     both,
+    finals,
     joined,
     mean,
+    method_of,
     number,
     section,
     text,
@@ -78,23 +79,25 @@ held-out town. The tables along the training are of this town, all others of rec
 [guide](guides/peers.md#all-methods-on-equal-terms) has the commands. Missing cells were not measured, and networks
 without a row were not trained yet.
 """
+FIGURE = """![Recall@1 against images seen and against milliseconds](images/leaderboard.svg)
+"""
 
 
 def page_of(results: Mapping[str, Any]) -> str:
     """Return the page of kept results."""
     scores, runs, costs = results["scores"], results["runs"], results["costs"]
-    parts = [HEAD, _summary(scores, costs), _equal_images(scores), _semantics(scores), _orders(scores)]
+    parts = [HEAD, FIGURE, _summary(scores, costs), _equal_images(scores), _semantics(scores), _orders(scores)]
     parts += [_simulated(scores), _kitti(scores), _split(scores), *_curves(runs), _costs(costs)]
     return "\n".join(part for part in parts if part)
 
 
 def _summary(scores: Mapping[str, Scores], costs: Mapping[str, Any]) -> str:
     """Return the table of Recall@1 beside what it costs, the highest mean first."""
-    by_method = {_method(name): cost for name, cost in costs.items()}
+    by_method = {method_of(name): cost for name, cost in costs.items()}
     rows = []
-    for name in sorted(_finals(scores), key=lambda name: -_overall(scores[name])):
+    for name in sorted(finals(scores), key=lambda name: -_overall(scores[name])):
         found = scores[name]
-        cost = by_method.get(_method(name), {})
+        cost = by_method.get(method_of(name), {})
         seen = next(iter(found.values()))
         training = (number(seen["images"]), number(seen["seconds"]))
         recalls = (text(mean(found, column, "recall")) for column in (*SIMULATED, KITTI))
@@ -114,7 +117,7 @@ def _equal_images(scores: Mapping[str, Scores]) -> str:
     """Return the table of each peer beside our network after at most as many images, and who is ahead."""
     snapshots = {_images(scores[name]): name for name in scores if name.split("/")[0] == OURS}
     rows, ahead = [], []
-    for name in _finals(scores):
+    for name in finals(scores):
         fitting = [count for count in snapshots if 0 < count <= _images(scores[name])]
         if name == OURS or not fitting:
             continue
@@ -261,21 +264,11 @@ def _costs(costs: Mapping[str, Any]) -> str:
     """Return the table of times and sizes."""
     digits = {"ms": 1, "bytes": 0, "weights": 0, "gflop": 2}
     rows = [
-        [f"`{_method(name)}`", *(number(cost.get(key), each) for key, each in digits.items())]
+        [f"`{method_of(name)}`", *(number(cost.get(key), each) for key, each in digits.items())]
         for name, cost in costs.items()
     ]
     about = "## Cost\n\nFrom a scan in memory to its descriptor, one scan at a time on one core.\n"
     return section(about, ["", "ms", "bytes", "weights", "GFLOP"], rows)
-
-
-def _method(name: str) -> str:
-    """Return the method of a contender: `rinet` of `rinet-0/weights-1000` and of `rinet@random:0`."""
-    return re.sub(r"-\d$", "", name.split("/")[0].split("@")[0])
-
-
-def _finals(scores: Mapping[str, Scores]) -> list[str]:
-    """Return the contenders, without the weights along a training and those with other labels."""
-    return [name for name in scores if "/" not in name and "," not in name]
 
 
 def _images(found: Scores) -> int:

@@ -18,4 +18,5 @@ CONFIG = dataclasses.replace(
     model=model_preset("paper-112"),
     optimizer=OptimizerConfig(learning_rate=4e-4, warmup_steps=60, decay_rate=0.5, decay_steps=300, clip_norm=1.0),
     tuples=10,
+    chunk=4,
 )

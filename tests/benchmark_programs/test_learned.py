@@ -45,16 +45,17 @@ def test_all_contenders_are_trained_scored_and_compared(build, tmp_path, monkeyp
     assert "verified recall" in out
     printed("learned.cost", "rinet@random:0", "sglpr", "thumbnail", "--data", build, "--out", build / "cost.json")
 
-    kept, page = tmp_path / "results.json", tmp_path / "leaderboard.md"
-    printed("learned.leaderboard", "--build", build, "--kept", kept, "--page", page)
+    kept, page, figure = (tmp_path / name for name in ("results.json", "leaderboard.md", "leaderboard.svg"))
+    written = ("--kept", kept, "--page", page, "--figure", figure)
+    printed("learned.leaderboard", "--build", build, *written)
     assert "`tiny-0`" in page.read_text() and "98,765" in page.read_text()
     assert "## At equal numbers of images" not in page.read_text()  # there is no run of `sglpr` yet
     copied = json.loads(kept.read_text())
     copied["scores"]["sglpr-0"] = copied["scores"]["rinet-0"]
     assert "## At equal numbers of images" in page_of(copied)
-    before = page.read_text()
-    printed("learned.leaderboard", "--build", tmp_path / "none", "--kept", kept, "--page", page)
-    assert page.read_text() == before
+    before = page.read_text(), figure.read_text()
+    printed("learned.leaderboard", "--build", tmp_path / "none", *written)
+    assert (page.read_text(), figure.read_text()) == before
 
 
 def test_labels_are_replaced_and_scans_linked(build, tmp_path):
