@@ -37,6 +37,8 @@ from sglpr_jax.training.recipe import WEIGHTS
 RATE_FACTORS = (1 / 3, 1.0, 3.0)
 """Learning rates of the search, as multiples of the preset's."""
 UPRIGHT, RATES = "upright", "rates"
+OPPOSITE = "08"
+"""Name of the recordings whose revisits are in the opposite direction, that is rotated by half a turn."""
 ENDLESS = 10**9
 
 
@@ -56,7 +58,8 @@ class Settings:
     images: int = 0
     """Number of images after which the run stops, if its time is not over before; 0: no limit."""
     upright_images: int = 0
-    """Number of images, out of all, that are not rotated: a first stage of the training."""
+    """Number of images, out of all, of a first stage without rotations, on recordings with revisits in the same
+    direction."""
     search_seconds: float = 300.0
     """Training time of each of the three learning rates."""
     learning_rate: float | None = None
@@ -125,9 +128,10 @@ def _train(
         if clock.over:
             return
         start_from = folder / UPRIGHT / WEIGHTS if done else None
+        stage = [one for one in recordings if not upright or one.name != OPPOSITE]
         with stop_on_signal() as stopped:
             options = {"resume": (run / "config.json").is_file(), "weights": start_from, "callback": clock}
-            result = sglpr_jax.train(staged, recordings, out=run, stopped=_any(stopped, clock), **options)
+            result = sglpr_jax.train(staged, stage, out=run, stopped=_any(stopped, clock), **options)
         seen = done + result.steps * per_step
         print(f"{run}: {seen} images, {clock.seconds:.0f} s", file=sys.stderr, flush=True)
         if stopped():
