@@ -245,7 +245,7 @@ def _curves(runs: Mapping[str, Any]) -> Iterator[str]:
         for name, curve in curves.items()
     ]
     about = """The same after seconds: the last weights that were kept until then. Then the images at the end, and the
-mean loss of each quarter of the steps.
+mean loss of each quarter of the steps. A training without a score after 3600 s is not finished yet.
 """
     yield section(about, ["", *map(str, MARKS_S), "images", "loss"], rows)
 
@@ -257,7 +257,8 @@ def _after(curve: Sequence[Mapping[str, float]], images: int) -> str:
 
 def _until(curve: Sequence[Mapping[str, float]], seconds: float) -> str:
     found = [one for one in curve if one["seconds"] <= 1.01 * seconds]
-    return text(found[-1]["recall_at_1"] if found else None)
+    finished = seconds <= 1.01 * curve[-1]["seconds"]
+    return text(found[-1]["recall_at_1"] if found and finished else None)
 
 
 def _costs(costs: Mapping[str, Any]) -> str:
