@@ -5,8 +5,9 @@
     python -m benchmarks.learned.train_presets --preset benchmarks/learned/paper-112.py --seconds 9000 \\
         --upright-images 6000 --learning-rate 4e-4
 
-The learning rate is the best of three short trainings on the held-out town. As for the learned methods, weights are
-kept after 1,000, 2,000, 4,000, ... images, an interrupted training is continued, and a finished one is left alone.
+Without --learning-rate, the rate is the best of three short trainings, scored on the held-out town. As for the learned
+methods, weights are kept after 1,000, 2,000, 4,000, ... images, an interrupted training is continued, and a finished
+one is left alone.
 """
 
 import dataclasses
