@@ -1,6 +1,6 @@
 """Training time of a run of `bin/train`, added up over its stages."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from sglpr_jax.training.callbacks import Callback
@@ -8,6 +8,13 @@ from sglpr_jax.training.loop import METRICS_FILE
 from sglpr_jax.training.metrics_log import read_metrics
 
 SPEED = "steps_per_second"
+UPRIGHT, RATES = "upright", "rates"
+"""Folders in that of a run: its first stage, and the short trainings that choose the learning rate."""
+
+
+def stages(folder: Path) -> Iterator[Path]:
+    """Yield the metrics of a run's stages, in their order."""
+    yield from (path for path in (folder / UPRIGHT / METRICS_FILE, folder / METRICS_FILE) if path.is_file())
 
 
 class Clock(Callback):
@@ -15,14 +22,13 @@ class Clock(Callback):
     their steps count with the mean speed."""
 
     def __init__(self, folder: Path, *, limit_s: float):
-        """Continue the time of the metrics in the folder and in the folders below it, without those in `rates`."""
+        """Continue the time of the stages in the folder of a run."""
         self._limit_s = limit_s
         self._timed_s, self._timed, self._steps, self._last = 0.0, 0, 0, 0
-        for path in folder.glob(f"**/{METRICS_FILE}"):
-            if "rates" not in path.relative_to(folder).parts:
-                self._last = 0
-                for line in read_metrics(path):
-                    self.on_step(int(line["step"]), line)
+        for path in stages(folder):
+            self._last = 0
+            for line in read_metrics(path):
+                self.on_step(int(line["step"]), line)
 
     @property
     def seconds(self) -> float:

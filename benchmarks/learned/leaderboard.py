@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import tyro
 
+from benchmarks.learned.clock import RATES, stages
 from benchmarks.learned.leaderboard_figure import draw
 from benchmarks.learned.leaderboard_page import page_of
-from benchmarks.learned.train_presets import UPRIGHT
 from sglpr_jax.files import write_json, write_text
-from sglpr_jax.training.learned.run_files import METRICS_FILE
+from sglpr_jax.training.learned.rate_search import RATES_FILE
 
 KEPT = Path(__file__).with_name("results.json")
 PAGE, FIGURE = Path("docs/leaderboard.md"), Path("docs/images/leaderboard.svg")
@@ -61,11 +61,10 @@ def _run(folder: Path) -> dict[str, Any]:
     """Return the learning curve of a run, its losses in all stages, and the search of its learning rate."""
     lines = [json.loads(line) for line in (folder / "scores.jsonl").read_text().splitlines()]
     curve = [{name: line[name] for name in ("images", "seconds", "recall_at_1")} for line in lines]
-    stages = [path for path in (folder / UPRIGHT / METRICS_FILE, folder / METRICS_FILE) if path.is_file()]
-    logged = [json.loads(line) for path in stages for line in path.read_text().splitlines()]
+    logged = [json.loads(line) for path in stages(folder) for line in path.read_text().splitlines()]
     losses = [line["loss"] for line in logged if "loss" in line]
     quarters = [float(np.mean(part)) for part in np.array_split(losses, 4)] if len(losses) >= 4 else None
-    rates = folder / "rates" / "rates.json"
+    rates = folder / RATES / RATES_FILE
     found = json.loads(rates.read_text()) if rates.is_file() else None
     return {"curve": curve, "losses": quarters, "rates": found}
 

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 import sglpr_jax
-from benchmarks.learned.clock import Clock
+from benchmarks.learned.clock import RATES, UPRIGHT, Clock
 from benchmarks.learned.data import HELD_OUT, TRAIN_IMAGES, folders
 from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data import Recording, open_recording, recording_names
@@ -37,7 +37,6 @@ from sglpr_jax.training.recipe import WEIGHTS
 
 RATE_FACTORS = (1 / 3, 1.0, 3.0)
 """Learning rates of the search, as multiples of the preset's."""
-UPRIGHT, RATES = "upright", "rates"
 OPPOSITE = "08"
 """Name of the recordings whose revisits are in the opposite direction, that is rotated by half a turn."""
 ENDLESS = 10**9
@@ -121,6 +120,8 @@ def _train(
     """Train in stages that end where a snapshot is due, until the time or the number of images is reached."""
     per_step = config.tuples * (1 + config.sampling.positives + config.sampling.negatives)
     for images in _ends(settings):
+        if any(line["images"] > images - per_step for line in _scores(folder)):
+            continue
         upright = images <= settings.upright_images
         run = folder / UPRIGHT if upright else folder
         done = 0 if upright else settings.upright_images

@@ -6,7 +6,9 @@ import os
 import jax
 import pytest
 
+import sglpr_jax
 from benchmarks.learned.leaderboard_page import page_of
+from sglpr_jax.models.presets import model_preset
 
 from .programs import ROOT, TINY, printed
 
@@ -31,12 +33,12 @@ def test_all_contenders_are_trained_scored_and_compared(build, tmp_path, monkeyp
     configs = [json.loads((build / "runs" / f"rinet-{seed}" / "config.json").read_text()) for seed in (0, 1)]
     assert len({one["settings"]["learning_rate"] for one in configs}) == 1
     preset = (*runs, "--preset", TINY, "--upright-images", 300, "--learning-rate", 1e-3)
-    for images in (600, 800):  # the second run goes on from the first
+    for images in (1050, 1100):  # the second run goes on from the first, beyond the snapshot after 1,000 images
         printed("learned.train_presets", *preset, "--images", images, "--compile-cache", tmp_path / "compiled")
     jax.config.update("jax_compilation_cache_dir", None)
     curve = (build / "runs" / "tiny-0" / "scores.jsonl").read_text().splitlines()
-    upright, first, whole = (json.loads(line)["images"] for line in curve)
-    assert 250 < upright <= 300 and 550 < first <= 600 and 750 < whole <= 800
+    upright, thousand, first, whole = (json.loads(line)["images"] for line in curve)
+    assert 250 < upright <= 300 and 950 < thousand <= 1000 < first <= 1050 < whole <= 1100
 
     places = ("--data", build, "--runs", build / "runs", "--out", build / "scores")
     entries = ("rinet-0", "rinet@random:0", "tiny-0", f"tiny-0/weights-{upright}", "thumbnail")
@@ -56,6 +58,12 @@ def test_all_contenders_are_trained_scored_and_compared(build, tmp_path, monkeyp
     before = page.read_text(), figure.read_text()
     printed("learned.leaderboard", "--build", tmp_path / "none", *written)
     assert (page.read_text(), figure.read_text()) == before
+
+
+def test_the_paper_on_images_has_its_network_and_the_losses_of_sglpr():
+    paper, ours = (sglpr_jax.preset(name) for name in (str(ROOT / "benchmarks/learned/paper-112.py"), "sglpr"))
+    assert paper.model == model_preset("paper-112")
+    assert (paper.loss, paper.sampling) == (ours.loss, ours.sampling)
 
 
 def test_labels_are_replaced_and_scans_linked(build, tmp_path):
