@@ -12,6 +12,7 @@ from benchmarks.learned.cells import (
     SEQS,
     SIMULATED,
     TOWN,
+    Column,
     Scores,
     both,
     finals,
@@ -29,6 +30,8 @@ OURS = "sglpr-0"
 """The run that the peers are compared with at equal numbers of images."""
 AHEAD = 0.005
 """Difference of two scores from which a contender is ahead."""
+FAR = 0.1
+"""Difference of two scores from which a training has taught something."""
 REVERSED = 0.02
 """Difference from which two means are in an order."""
 MARKS_S = (225, 450, 900, 1800, 3600)
@@ -89,8 +92,8 @@ FIGURE = """![Recall@1 against images seen, and against milliseconds once they a
 def page_of(results: Mapping[str, Any]) -> str:
     """Return the page of kept results."""
     scores, runs, costs = results["scores"], results["runs"], results["costs"]
-    parts = [HEAD, FIGURE, _summary(scores, costs), _equal_images(scores), _semantics(scores), _orders(scores)]
-    parts += [_simulated(scores), _kitti(scores), _split(scores), *_curves(runs), _costs(costs)]
+    parts = [HEAD, FIGURE, _summary(scores, costs), _equal_images(scores), _baselines(scores), _semantics(scores)]
+    parts += [_orders(scores), _simulated(scores), _kitti(scores), _split(scores), *_curves(runs), _costs(costs)]
     return "\n".join(part for part in parts if part)
 
 
@@ -126,15 +129,35 @@ def _equal_images(scores: Mapping[str, Scores]) -> str:
             continue
         theirs, ours = scores[name], scores[snapshots[max(fitting)]]
         cells = [(column, mean(theirs, column, "recall"), mean(ours, column, "recall")) for column in SIMULATED]
-        ahead += [f"`{name}` ({column.title})" for column, a, b in cells if a and b and a >= b + AHEAD]
+        titles = [column.title for column, a, b in cells if a and b and a >= b + AHEAD]
+        ahead += [f"`{name}` ({'all columns' if len(titles) == len(cells) else '; '.join(titles)})"] if titles else []
         rows.append([f"`{name}`", f"{_images(theirs):,}", f"{max(fitting):,}", *(both(a, b) for _, a, b in cells)])
     head = ["", "its images", f"images of `{OURS}`", *(column.title for column in SIMULATED)]
     about = f"""## At equal numbers of images
 
-Recall@1 of each network / of `{OURS}` after at most as many images. Ahead of `{OURS}` by {AHEAD} or more:
-{", ".join(ahead) or "none"}.
+Recall@1 of each network / of `{OURS}` after at most as many images. RINet and SGPR have the true label of each point.
+Ahead of `{OURS}` by {AHEAD} or more: {", ".join(ahead) or "none"}.
 """
     return section(about, head, rows)
+
+
+def _baselines(scores: Mapping[str, Scores]) -> str:
+    """Return the table of each network beside its untrained self and the thumbnail, and who is not far above both."""
+    rows, near = [], []
+    for name in finals(scores):
+        baselines = [mean(scores.get(one, {}), TOWN, "recall") for one in (f"{method_of(name)}@random:0", "thumbnail")]
+        recall = mean(scores[name], TOWN, "recall")
+        if not _images(scores[name]) or recall is None:
+            continue
+        near += [f"`{name}`"] if any(one is not None and recall < one + FAR for one in baselines) else []
+        ways = (text(mean(scores[name], Column("", (test,)), "recall")) for test in TOWN.tests)
+        rows.append([f"`{name}`", text(recall), *map(text, baselines), *ways])
+    about = f"""## Beside untrained networks and the thumbnail
+
+Recall@1 in the unseen town, and the same for revisits in the same direction and in the opposite one. Not above both
+baselines by {FAR} or more: {", ".join(near) or "none"}.
+"""
+    return section(about, ["", "trained", "untrained", "thumbnail", "same direction", "opposite"], rows)
 
 
 def _semantics(scores: Mapping[str, Scores]) -> str:

@@ -7,8 +7,7 @@ features.
 
 Recipe here: the same loss, optimiser and distances, trained from scratch. Half of the positives come from another
 visit, mining describes 256 random places every 25 steps, and images are rotated by any angle. BEVPlace++ has 2 tuples a
-step, because a step of 24 images already needs 6 GB. NetVLAD starts from random weights. The interface has no pass over
-the data before the training; `NetVLAD` is the place for k-means.
+step, because a step of 24 images already needs 6 GB. NetVLAD starts from k-means of local features, too.
 """
 
 import functools
