@@ -8,8 +8,8 @@ from sglpr_jax.training.loop import METRICS_FILE
 from sglpr_jax.training.metrics_log import read_metrics
 
 SPEED = "steps_per_second"
-UPRIGHT, RATES = "upright", "rates"
-"""Folders in that of a run: its first stage, and the short trainings that choose the learning rate."""
+UPRIGHT = "upright"
+"""Folder of the first stage, in that of the run."""
 
 
 def stages(folder: Path) -> Iterator[Path]:

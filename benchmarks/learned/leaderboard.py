@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks.learned.clock import RATES, stages
+from benchmarks.learned.clock import stages
 from benchmarks.learned.leaderboard_figure import draw
 from benchmarks.learned.leaderboard_page import page_of
+from sglpr_jax.cli.peers import RATES
 from sglpr_jax.files import write_json, write_text
 from sglpr_jax.training.learned.rate_search import RATES_FILE
 

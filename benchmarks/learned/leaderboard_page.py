@@ -31,7 +31,7 @@ OURS = "sglpr-0"
 AHEAD = 0.005
 """Difference of two scores from which a contender is ahead."""
 FAR = 0.1
-"""Difference of two scores from which a training has taught something."""
+"""Difference by which a trained network is far above a baseline."""
 REVERSED = 0.02
 """Difference from which two means are in an order."""
 MARKS_S = (225, 450, 900, 1800, 3600)

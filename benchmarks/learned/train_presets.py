@@ -23,8 +23,9 @@ import numpy as np
 import tyro
 
 import sglpr_jax
-from benchmarks.learned.clock import RATES, UPRIGHT, Clock
+from benchmarks.learned.clock import UPRIGHT, Clock
 from benchmarks.learned.data import HELD_OUT, TRAIN_IMAGES, folders
+from sglpr_jax.cli.peers import RATES
 from sglpr_jax.cli.runtime import stop_on_signal
 from sglpr_jax.data import Recording, open_recording, recording_names
 from sglpr_jax.files import write_json
@@ -121,7 +122,7 @@ def _train(
     per_step = config.tuples * (1 + config.sampling.positives + config.sampling.negatives)
     for images in _ends(settings):
         if any(line["images"] > images - per_step for line in _scores(folder)):
-            continue
+            continue  # the weights of this end, or later ones, are kept already
         upright = images <= settings.upright_images
         run = folder / UPRIGHT if upright else folder
         done = 0 if upright else settings.upright_images
