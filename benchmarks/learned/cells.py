@@ -21,6 +21,8 @@ class Column(NamedTuple):
 
 
 TOWN = Column("town", ("town-601-00", "town-601-08"))
+TRAINED_TOWN = ("town-10-00", "town-10-08")
+"""Revisits in the same and in the opposite direction in a town of the training."""
 SCENERIES = Column("other sceneries", ("outskirts-602-08", "lanes-602-08", "car_park-602-08"))
 SENSORS = Column("other sensors", ("vlp16-603-08", "os1-64-603-08"))
 DAY = Column("another day", ("days-604",))

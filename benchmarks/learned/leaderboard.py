@@ -20,6 +20,7 @@ from benchmarks.learned.leaderboard_page import page_of
 from sglpr_jax.cli.peers import RATES
 from sglpr_jax.files import write_json, write_text
 from sglpr_jax.training.learned.rate_search import RATES_FILE
+from sglpr_jax.training.learned.run_files import SCORES_FILE
 
 KEPT = Path(__file__).with_name("results.json")
 PAGE, FIGURE = Path("docs/leaderboard.md"), Path("docs/images/leaderboard.svg")
@@ -51,7 +52,7 @@ def main(
             results["scores"].setdefault(one["entry"] + labels, {})[one["test"]] = one
     if (build / "cost.json").is_file():
         results["costs"] |= json.loads((build / "cost.json").read_text())
-    for path in sorted((build / "runs").glob("*/scores.jsonl")):
+    for path in sorted((build / "runs").glob(f"*/{SCORES_FILE}")):
         results["runs"][path.parent.name] = _run(path.parent)
     write_json(kept, results)
     write_text(page, page_of(results))
@@ -60,7 +61,7 @@ def main(
 
 def _run(folder: Path) -> dict[str, Any]:
     """Return the learning curve of a run, its losses in all stages, and the search of its learning rate."""
-    lines = [json.loads(line) for line in (folder / "scores.jsonl").read_text().splitlines()]
+    lines = [json.loads(line) for line in (folder / SCORES_FILE).read_text().splitlines()]
     curve = [{name: line[name] for name in ("images", "seconds", "recall_at_1")} for line in lines]
     logged = [json.loads(line) for path in stages(folder) for line in path.read_text().splitlines()]
     losses = [line["loss"] for line in logged if "loss" in line]

@@ -1,4 +1,4 @@
-"""The figure of the leaderboard: Recall@1 along the trainings, and against the time of descriptors if it is known."""
+"""The figure of the leaderboard: Recall@1 along the trainings, and against the time of a descriptor."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,18 +19,17 @@ def draw(results: Mapping[str, Any], path: Path) -> None:
     """Write the figure as SVG. The same results give the same bytes."""
     figure = Figure(figsize=(10, 4), layout="constrained")
     times = {method_of(name): cost["ms"] for name, cost in results["costs"].items()}
-    left, *others = figure.subplots(1, 2 if times else 1, sharey=True, squeeze=False)[0]
+    left, right = figure.subplots(1, 2, sharey=True)
     for name, run in results["runs"].items():
         curve = run["curve"]
         left.plot([one["images"] for one in curve], [one["recall_at_1"] for one in curve], "o-", label=name)
     left.set(xscale="log", ylim=(0, 1.04), xlabel="images seen", ylabel="Recall@1", title="held-out town")
     left.legend(fontsize="x-small")
-    for right in others:
-        for name in (one for one in finals(results["scores"]) if RANDOM not in one):
-            recall = mean(results["scores"][name], TOWN, "recall")
-            if method_of(name) in times and recall is not None:
-                right.plot(times[method_of(name)], recall, "o")
-                right.annotate(name, (times[method_of(name)], recall), fontsize="x-small", **LABEL)
-        right.set(xscale="log", xlabel="milliseconds per descriptor", title="unseen town")
+    for name in (one for one in finals(results["scores"]) if RANDOM not in one):
+        recall = mean(results["scores"][name], TOWN, "recall")
+        if method_of(name) in times and recall is not None:
+            right.plot(times[method_of(name)], recall, "o")
+            right.annotate(name, (times[method_of(name)], recall), fontsize="x-small", **LABEL)
+    right.set(xscale="log", xlabel="milliseconds per descriptor", title="unseen town")
     with matplotlib.rc_context({"svg.hashsalt": "leaderboard", "svg.fonttype": "none"}), replacing(path) as temporary:
         figure.savefig(temporary, format="svg", metadata={"Date": None})

@@ -60,6 +60,7 @@ def main(
     out: Path = Path("build/learned/scores"),
     kitti: Path | None = None,
     kitti_seqs: Sequence[str] = ("00", "02", "06"),
+    part: str = TEST,
     only: str = "",
     verify: bool = False,
 ) -> None:
@@ -72,10 +73,11 @@ def main(
         out: folder of the results.
         kitti: folder of KITTI's images, NN/imgs/*.png with NN/pose.txt.
         kitti_seqs: sequences of KITTI to score on.
+        part: part of `data` to score on. Scores on "train" tell whether a network learned its own recordings.
         only: beginning of the names of the test recordings to score on.
         verify: also score after verification of the nearest places.
     """
-    tests = [one for one in [*_simulated(data), *_kitti(kitti, kitti_seqs)] if one.name.startswith(only)]
+    tests = [one for one in [*_simulated(data, part), *_kitti(kitti, kitti_seqs)] if one.name.startswith(only)]
     for name in entries:
         contender = entry(name, runs)
         for test in tests:
@@ -85,8 +87,8 @@ def main(
                 print(f"{name}, {test.name}: {', '.join(scores)}", flush=True)
 
 
-def _simulated(data: Path) -> Iterator[Test]:
-    for folder in folders(data, TEST):
+def _simulated(data: Path, part: str) -> Iterator[Test]:
+    for folder in folders(data, part):
         names = recording_names(folder)
         if folder.name.startswith("days"):
             first, second = (open_recording(folder, name) for name in names)

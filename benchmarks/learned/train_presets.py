@@ -33,6 +33,7 @@ from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.learned.rate_search import RATES_FILE
 from sglpr_jax.training.learned.run import FIRST_SNAPSHOT
+from sglpr_jax.training.learned.run_files import SCORES_FILE
 from sglpr_jax.training.learned.score import recall_at_1
 from sglpr_jax.training.recipe import WEIGHTS
 
@@ -161,7 +162,7 @@ def _keep(folder: Path, params: sglpr_jax.Params, images: int, seconds: float, h
     sglpr_jax.save(params, folder / f"weights-{images}")
     recall = float(np.mean([_recall(params, recording) for recording in held_out]))
     line = {"images": images, "seconds": round(seconds, 1), "recall_at_1": recall}
-    with (folder / "scores.jsonl").open("a") as file:
+    with (folder / SCORES_FILE).open("a") as file:
         print(json.dumps(line), file=file)
     print(f"{folder}: {line}", file=sys.stderr, flush=True)
 
@@ -173,7 +174,7 @@ def _recall(params: sglpr_jax.Params, recording: Recording) -> float:
 
 
 def _scores(folder: Path) -> list[dict[str, float]]:
-    path = folder / "scores.jsonl"
+    path = folder / SCORES_FILE
     return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
 
 

@@ -45,6 +45,8 @@ def test_all_contenders_are_trained_scored_and_compared(build, tmp_path, monkeyp
     out = printed("learned.score", *entries, *places, "--only", "town-601-00", "--verify")
     assert all(f"{name}, town-601-00-rotated: top1" in out for name in entries)
     assert "verified recall" in out
+    out = printed("learned.score", "thumbnail", *places, "--part", "held-out", "--only", "town-37-00")
+    assert "thumbnail, town-37-00: top1" in out
     printed("learned.cost", "rinet@random:0", "sglpr", "thumbnail", "--data", build, "--out", build / "cost.json")
 
     kept, page, figure = (tmp_path / name for name in ("results.json", "leaderboard.md", "leaderboard.svg"))
