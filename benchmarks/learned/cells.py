@@ -43,6 +43,11 @@ def finals(scores: Mapping[str, Scores]) -> list[str]:
     return [name for name in scores if "/" not in name and "," not in name]
 
 
+def images_of(found: Scores) -> int:
+    """Return the number of images that a contender was trained with."""
+    return next(iter(found.values()))["images"] or 0
+
+
 def mean(found: Scores, column: Column, score: str) -> float | None:
     """Return the mean of a score over recordings, or None if one is missing."""
     values = [found[test]["scores"].get(score) if test in found else None for test in column.tests]
