@@ -64,9 +64,9 @@ LABELS = {
 
 def ours_and_peers(scores: Mapping[str, Scores]) -> Iterator[str]:
     """Yield the tables of each peer beside our network at equal times and at equal numbers of images."""
-    finished = [name for name in finals(scores) if images_of(scores[name]) and not name.startswith(SG_LPR)]
     if OURS not in scores:
         return
+    finished = [name for name in finals(scores) if images_of(scores[name]) and not name.startswith(SG_LPR)]
     yield _beside_ours(
         scores,
         [(name, OURS) for name in finished],
@@ -120,9 +120,9 @@ def baselines(scores: Mapping[str, Scores]) -> str:
             continue
         against = [mean(one, TOWN, "recall") for one in (untrained, scores.get("thumbnail", {}))]
         near += [f"`{name}`"] if any(one is not None and recall < one + FAR for one in against) else []
-        ways = (both(*(_of_test(one, test) for one in (scores[name], untrained))) for test in TOWN.tests)
-        known = (both(*(_of_test(one, test) for one in (scores[name], untrained))) for test in TRAINED_TOWN)
-        rows.append([f"`{name}`", text(recall), *map(text, against), *ways, *known])
+        directions = [Column("", (test,)) for test in (*TOWN.tests, *TRAINED_TOWN)]
+        cells = (both(*(mean(one, column, "recall") for one in (scores[name], untrained))) for column in directions)
+        rows.append([f"`{name}`", text(recall), *map(text, against), *cells])
     about = f"""## Beside untrained networks and the thumbnail
 
 Recall@1 in the unseen town. Then trained / untrained, for revisits in the same and in the opposite direction, in this
@@ -149,10 +149,6 @@ Not above both baselines by {FAR} or more: {", ".join(near) or "none"}.
         "training town, opposite",
     ]
     return section(about, head, rows)
-
-
-def _of_test(found: Scores, test: str) -> float | None:
-    return mean(found, Column("", (test,)), "recall")
 
 
 def labels(scores: Mapping[str, Scores]) -> str:

@@ -73,8 +73,8 @@ def main(
         out: folder of the results.
         kitti: folder of KITTI's images, NN/imgs/*.png with NN/pose.txt.
         kitti_seqs: sequences of KITTI to score on.
-        part: part of `data` to score on. Scores on "train" tell a network that did not learn from one that does not
-            generalise.
+        part: part of `data` to score on. Scores on "train" distinguish networks that did not learn from those that do
+            not generalise.
         only: beginning of the names of the test recordings to score on.
         verify: also score after verification of the nearest places.
     """
