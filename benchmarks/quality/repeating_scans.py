@@ -9,7 +9,8 @@ Each drive becomes a file SCENERY-REVISIT-SENSOR-SEED.npz with these arrays, n s
     scenery, sensor, revisit: names; seed; other_m: frames farther apart than this show different places
     scale: factor for lengths of the images; poses and other_m are in real metres
 
-Files that exist are skipped. The towns are `simulate_recording`'s, on a route that has these revisits.
+A sensor with a plus sign, such as os0-32+backpack, is carried by one of `CARRIERS`. Files that exist are skipped. The
+towns are `simulate_recording`'s, on a route that has these revisits.
 """
 
 import dataclasses
@@ -28,6 +29,7 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.sim.carriers import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.routes import REVISITS, Revisit
@@ -42,6 +44,7 @@ HIDDEN_DEG = (60.0, 300.0, 91.0)
 LIDARS = {
     **{name: SENSORS[name] for name in ("hdl64e", "hdl32e", "vlp16", "os0-32")},
     "hdl64e-120": dataclasses.replace(HDL64E, shadows_deg=(HIDDEN_DEG,)),
+    "os0-32-140": dataclasses.replace(SENSORS["os0-32"], azimuths_deg=(-70.0, 70.0)),
 }
 OTHER_M = 20.0
 """In towns, frames farther apart than this show different places."""
@@ -78,7 +81,7 @@ def main(
     Args:
         sceneries: names of sceneries that repeat, and of towns.
         seeds: one drive for each.
-        sensors: hdl64e, hdl32e, vlp16, os0-32, or hdl64e-120, which sees 120 degrees.
+        sensors: names in `LIDARS`, with a plus sign and a carrier if it is not a vehicle.
         revisits: whether and how the vehicle returns.
         scans: number of scans of each drive.
         azimuth_steps: firings of the sensor per turn.
@@ -124,12 +127,14 @@ def write(drive: Drive, scans: int, azimuth_steps: int, scale: Scale, weights: s
 
 def record(drive: Drive, scans: int, azimuth_steps: int) -> SimulatedRecording:
     """The recording of a drive."""
-    sensor = dataclasses.replace(LIDARS[drive.sensor], azimuth_steps=azimuth_steps)
+    lidar, _, carrier = drive.sensor.partition("+")
+    sensor = dataclasses.replace(LIDARS[lidar], azimuth_steps=azimuth_steps)
+    moved = {"seed": drive.seed, "sensor": sensor, "carrier": CARRIERS[carrier or "vehicle"]}
     if drive.scenery not in SCENERIES:
-        return simulate_repeating(drive.scenery, scans=scans, seed=drive.seed, sensor=sensor, revisit=drive.revisit)
+        return simulate_repeating(drive.scenery, scans=scans, revisit=drive.revisit, **moved)
     routes = ROUTES[drive.revisit]
     route, town = routes[drive.seed % len(routes)], SCENERIES[drive.scenery]
-    return simulate_recording(route, scans=scans, seed=drive.seed, sensor=sensor, scenery=town)
+    return simulate_recording(route, scans=scans, scenery=town, **moved)
 
 
 if __name__ == "__main__":

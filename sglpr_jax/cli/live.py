@@ -88,8 +88,6 @@ class LiveCommand:
     """Height drift of the odometry: one standard deviation, in percent of the travelled distance."""
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a loop."""
-    near_m: float = DetectorConfig.near_m
-    """With odometry, a loop must agree with at least half of the loops within this travelled distance, in metres."""
     keyframe_m: float = DetectorConfig.keyframe_m
     """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
     max_places: int | None = DetectorConfig.max_places
@@ -175,7 +173,7 @@ def _map(command: LiveCommand, report: "Report") -> "LiveMap":
 
     params, config = load(command.weights), command.detector
     found = LiveMap(
-        LoopDetector(params, config=config, time_unit="s"),
+        LoopDetector(params, config=config),
         command.out,
         report=report,
         sensor_height=command.sensor_height,

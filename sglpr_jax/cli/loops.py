@@ -20,7 +20,6 @@ from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_sign
 from sglpr_jax.cli.scan_odometry import AUTO, check_auto, open_with_scan_odometry, remove_odometry
 from sglpr_jax.cli.several_loops import search_several
 from sglpr_jax.data.choices import ScaleChoice
-from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.choices import (
     DRIFT_DEG_PER_100M,
     DRIFT_HEIGHT_PERCENT,
@@ -114,8 +113,6 @@ class LoopsCommand:
     plain walls: `keep` writes these loops with that information matrix, and `drop` rejects them."""
     skip_bad: bool = False
     """Report unreadable scans and skip them."""
-    near_m: float = DetectorConfig.near_m
-    """With odometry, a loop must agree with at least half of the loops within this travelled distance, in metres."""
     keyframe_m: float = DetectorConfig.keyframe_m
     """Minimum distance of a stored scan from the previous one, in metres. 0 stores every scan."""
     max_places: int | None = DetectorConfig.max_places
@@ -191,7 +188,7 @@ def _is_trajectory(path: Path, out: Path) -> bool:
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
-    from sglpr_jax.loops.explanation import why_few_queries, why_none
+    from sglpr_jax.loops.explanation import why_none
     from sglpr_jax.loops.find import can_register, find_loops
     from sglpr_jax.loops.folder import write_found
     from sglpr_jax.loops.optimization import optimize_trajectory
@@ -213,8 +210,6 @@ def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     register = command.register and can_register(recording)
     if command.register and not register:
         print(f"{recording.name}: loops are not registered, {_why_not(recording)}", file=sys.stderr)
-    if too_recent := why_few_queries(recording, config.candidates):
-        warn(f"{recording.name}: {too_recent}")
     with stop_on_signal() as stop, progress_bar(f"loops {recording.name}", len(recording)) as show:
         found = find_loops(
             recording,

@@ -30,7 +30,8 @@ class SimulateCommand:
     scans: int = SCANS
     """Scans of each recording."""
     rate_hz: float | None = None
-    """Scans per second of a route. KITTI's rate is 10. None: 4 in towns, or the rate of the scenery."""
+    """Scans per second of a route. KITTI's rate is 10. None: 4 in towns, elsewhere the rate of the
+    carrier or of the scenery."""
     sensor: str | None = None
     """LiDAR: hdl64e (KITTI's), hdl32e, hdl32e-nclt (NCLT's, upside down), vlp16, xt32, os0-32, os1-64, m1, mid360 or
     avia. None: hdl64e, or hdl32e-nclt for --sessions."""
@@ -41,6 +42,9 @@ class SimulateCommand:
     roads between overgrown hedges; or `gardens`, streets with front gardens, low fences and old trees. Surroundings
     where places repeat, such as `forest`, are possible, too. There, a route stands only for the direction of its
     revisits."""
+    carrier: str = "vehicle"
+    """Carrier of the sensor: `vehicle`, `backpack`, `handheld`, `cart`, or `stop-and-reverse`, a car that sometimes
+    stands or reverses. In towns, only height and sway are those of the carrier. Not with --sessions."""
     submap_m: float = 0.0
     """Travelled distance of submaps, in metres. 0 writes scans."""
     images: bool = False

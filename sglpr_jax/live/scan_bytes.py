@@ -73,12 +73,13 @@ def from_bytes(content: bytes, frame: int, *, source: Path) -> LiveScan:
         about = _about(plain)
         check_about(about, ABOUT, format=FORMAT)
         check_columns(arrays, ARRAYS, n=1)
-        if arrays["pairs"].size and not ((arrays["pairs"][:, 0] == frame) & (arrays["pairs"][:, 1] < frame)).all():
+        fitted = arrays["fitted"]
+        if arrays["counts"][0] != len(fitted) or ((fitted < 0) | (fitted >= frame)).any():
             raise ValueError(f"expected comparisons of frame {frame}, found others")
         mounting = None if about["mounting"] is None else _mounting(about["mounting"])
     except Exception as error:  # another program may have written it
         raise ValueError(f"{source}: expected scan {frame} of a live map, found others ({in_short(error)})") from error
-    (compared,) = compared_of(arrays, [frame])
+    (compared,) = compared_of(arrays)
     seen = Seen(arrays["descriptor"], arrays["image"], mounting)
     known = {name: about[name] for name in ("continues", "name", "stamp", "time", "wall")}
     return LiveScan(seen, compared, arrays.get("pose"), **known)

@@ -14,13 +14,12 @@ SCANS = 12
 
 def warm_up(params: Params, config: DetectorConfig, *, odometry: bool) -> None:
     """Search random scans with the sizes of `config`, with odometry or without it, and forget them."""
-    rules = config.candidates
-    rivals = dataclasses.replace(rules.rivals, age=(0.0, 1e9))
-    anywhere = {"exclude_s": 1e-9, "exclude_frames": 0, "min_travelled_m": 0.0, "good_correlation": 2.0}
-    anything = {"min_coarse_correlation": -1.0, "min_correlation": -1.0, "rivals": rivals}
-    rules = dataclasses.replace(rules, **anywhere, **anything)
+    anything = {"recent_m": 1e-9, "good_correlation": 2.0, "min_coarse_correlation": -1.0, "min_correlation": -1.0}
+    rules = dataclasses.replace(config.candidates, **anything)
     detector = LoopDetector(params, config=dataclasses.replace(config, candidates=rules, max_places=None))
     draw = np.random.default_rng(0)
     for i in range(SCANS):
         points = draw.uniform((-20, -20, -1), (20, 20, 3), (4000, 3)).astype(np.float32)
-        detector.add(points, time=0.7 * i, odometry=np.eye(4) if odometry else None)
+        pose = np.eye(4)
+        pose[0, 3] = 0.01 * i
+        detector.add(points, time=0.7 * i, odometry=pose if odometry else None)

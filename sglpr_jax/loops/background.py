@@ -4,8 +4,10 @@ The background moves with the sensor. Images of different places agree in it bes
 says nothing about the place or the motion.
 """
 
+import functools
+
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int, UInt8
 
 
 class Background:
@@ -26,7 +28,26 @@ class Background:
 
     def without(self, image: UInt8[np.ndarray, "n n"]) -> UInt8[np.ndarray, "n n"]:
         """Returns an image without the background. Square roots are subtracted, as in the comparison."""
-        if not image.size or self._root is None or self.added < self.least:
+        if not image.size:
             return image
-        more = np.maximum(np.sqrt(image, dtype=np.float32) - self._root, 0)
+        root = np.sqrt(image, dtype=np.float32)
+        if self._root is None or self.added < self.least:
+            more = np.maximum(root - ring_medians(root), 0)
+        else:
+            more = np.maximum(root - np.maximum(self._root, ring_medians(root)), 0)
         return np.round(more**2).astype(np.uint8)
+
+
+def ring_medians(image: Float32[np.ndarray, "n n"]) -> Float32[np.ndarray, "n n"]:
+    """Median of the cells of each ring around the sensor. It is above 0 where a flat floor or ceiling is a ring."""
+    order, starts, ring = _rings(len(image))
+    medians = [np.median(part) for part in np.split(image.reshape(-1)[order], starts)]
+    return np.array(medians, np.float32)[ring]
+
+
+@functools.cache
+def _rings(size: int) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " r"], Int[np.ndarray, "n n"]]:
+    """Cells in the order of their rings, the start of each further ring in this order, and the ring of each cell."""
+    axis = np.arange(size) - (size - 1) / 2
+    ring = np.hypot(axis[:, None], axis[None]).astype(int)
+    return np.argsort(ring, axis=None, kind="stable"), np.cumsum(np.bincount(ring.reshape(-1)))[:-1], ring

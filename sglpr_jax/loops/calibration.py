@@ -1,16 +1,16 @@
 """Calibration of loop probabilities on a drive with odometry, without labelled loops.
 
-Negative pairs are farther apart than the odometry can drift. Of these pairs, the ones with the nearest descriptors are
-used. Positive pairs are some metres apart in one pass, with one scan rotated. They are easier than revisits, because
-nothing has moved between the two scans.
+Negative pairs are farther apart than the odometry can drift. Of these pairs, the ones that fit best are used. Positive
+pairs are some metres apart in one pass, with one scan rotated. They are easier than revisits, because nothing has moved
+between the two scans.
 """
 
+import dataclasses
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Complex64, Float, Float32, Int, UInt8
 
 from sglpr_jax.bev import even_cells, rotate_image
 from sglpr_jax.data.record import Record
@@ -18,23 +18,20 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import picture, rotated
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.compared_image import occupied
-from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.driven_path import DrivenPath
+from sglpr_jax.loops.compared_image import within_reach
+from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
+from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.probability import Evidence, LoopModel, default_model, recalibrated
-from sglpr_jax.loops.rivals import distance_share, rival_share
-from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.spectra import query_spectra
-from sglpr_jax.loops.stored_scans import image_spectrum
-from sglpr_jax.loops.transforms import travelled
-from sglpr_jax.loops.verification import refined
+from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.loops.upright import upright_odometry
 from sglpr_jax.models.params import Params
 from sglpr_jax.same_place import NEGATIVE_M
 
 NEAR_M = (2.0, 10.0)
 """Minimum and maximum distance of a positive pair, in metres."""
-RIVALS = 10
-"""Maximum number of rivals of a query."""
 SAME_PASS_M = 50.0
 """Maximum travelled distance between the frames of a positive pair, in metres."""
 
@@ -69,7 +66,7 @@ def calibrated(
     evidence, is_loop = certain_pairs(
         params, recording, odometry, pairs=pairs, seed=seed, config=config, on_progress=on_progress
     )
-    shipped = default_model(CandidateFinder(params).index.weights_hash) if model is None else model
+    shipped = default_model() if model is None else model
     made_with = f"{shipped.made_with}; {is_loop.sum()} loops and {(~is_loop).sum()} others of {recording.name}"
     return recalibrated(shipped, evidence, is_loop, made_with=made_with)
 
@@ -90,16 +87,14 @@ def certain_pairs(
         raise ValueError(
             f"expected odometry of {n} poses, one for each scan of {recording.name}, found {len(odometry)}"
         )
-    places = _Places(params, recording, odometry, config)
+    drive = _Drive(params, recording, odometry, config)
     rng = np.random.default_rng(seed)
     evidence, is_loop = [], []
-    for done, frame in enumerate(rng.permutation(n)[: 2 * pairs]):
-        turned = places.turned(int(frame), rng.uniform(0, 2 * np.pi))
-        near, far = places.near(int(frame)), places.far(int(frame))
-        rows = rng.permutation(np.flatnonzero(near))[:1] if done % 2 else places.nearest(turned.descriptor, far)
-        for row in rows:
-            evidence.append(places.evidence(int(frame), turned, int(row)))
-            is_loop.append(bool(near[row]))
+    for done, frame in enumerate(rng.permutation(n)[: 2 * pairs].tolist()):
+        pair = drive.pair(frame, rng.uniform(0, 2 * np.pi), positive=bool(done % 2))
+        if pair is not None:
+            evidence.append(pair.evidence)
+            is_loop.append(bool(done % 2))
         on_progress(done + 1)
     if not evidence or all(is_loop) or not any(is_loop):
         raise ValueError(
@@ -109,60 +104,67 @@ def certain_pairs(
     return Evidence.stack(evidence), np.array(is_loop)
 
 
-class _Places:
-    """Descriptors, images and odometry of all frames of a drive."""
+@dataclasses.dataclass(frozen=True)
+class _Some:
+    """Stored scans, some of which are ignored."""
+
+    stored: StoredScans
+    kept: Bool[np.ndarray, " n"]
+
+    @property
+    def frames(self) -> Int[np.ndarray, " n"]:
+        return self.stored.frames
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        return self.stored.nearest(descriptor, k, among & self.kept)
+
+    def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
+        return self.stored.image(row)
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        return self.stored.spectra(rows)
+
+
+class _Drive:
+    """Stored scans of a drive, and its odometry with a last frame of unknown pose for queries."""
 
     def __init__(
         self, params: Params, recording: Recording, odometry: Float[np.ndarray, "n 4 4"], config: CandidateConfig
     ):
-        self.finder, self.recording, self.config = CandidateFinder(params, config=config), recording, config
-        self.images: list[UInt8[np.ndarray, "n n"]] = []
-        for _, seen in scan_stream(recording, lambda row, record: self.finder.seen(record)):
+        self.finder, self.recording = CandidateFinder(params, config=config), recording
+        self.motion = Motion.of(upright_odometry(odometry, mountings_of(recording)))
+        self.motion.add(0.0, continues=False)
+        self.stored = StoredScans(self.finder.index, verification=VerificationConfig())
+        for row, seen in scan_stream(recording, lambda row, record: self.finder.seen(record)):
             assert seen is not None  # the stream raises the error of a bad scan
-            self.images.append(seen.image)
-            self.finder.index.add(seen.descriptor)
-        self.positions, self.way, self.path = odometry[:, :3, 3], travelled(odometry), DrivenPath.of(odometry)
+            self.stored.add(row, seen.descriptor, np.asarray(within_reach(seen.image)))
+        nothing = np.zeros((0, 2), np.int64)
+        self.comparer = Comparer(self.motion, DriftModel(), np.eye(3), config, VerificationConfig(), nothing)
 
-    def apart(self, frame: int) -> Float[np.ndarray, " n"]:
-        return np.linalg.norm(self.positions - self.positions[frame], axis=1)
+    def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
+        """Pair of a frame that is rotated by `angle` (radians) and a near or far one, or None."""
+        poses, frames, way_m = self.motion.poses, self.stored.frames, self.motion.way_m(self.stored.frames)
+        apart = np.linalg.norm(poses[frames, :3, 3] - poses[frame, :3, 3], axis=1)
+        far = (apart > NEGATIVE_M) & self.comparer.elsewhere(frames, frame)
+        near = (apart >= NEAR_M[0]) & (apart <= NEAR_M[1])
+        near &= np.abs(way_m - self.motion.way_m(frame)) <= SAME_PASS_M
+        query = self.rotated(frame, angle)
+        scans = _Some(self.stored, far | near if positive else far)
+        fits = self.comparer.compare(query, scans, possible=near if positive else far)
+        matches = np.isin(fits.frames, frames[near if positive else far])
+        found = self.comparer.candidates(query, fits, self.stored.image_of, possible=matches)
+        return found[0] if found else None
 
-    def near(self, frame: int) -> Bool[np.ndarray, " n"]:
-        """Frames that make a positive pair with `frame`."""
-        apart = self.apart(frame)
-        return (apart >= NEAR_M[0]) & (apart <= NEAR_M[1]) & (np.abs(self.way - self.way[frame]) <= SAME_PASS_M)
-
-    def far(self, frame: int) -> Bool[np.ndarray, " n"]:
-        """Frames that certainly show another place than `frame`."""
-        drift = self.finder.drift
-        drifted = self.path.position_deviations(np.arange(len(self.positions)), frame, drift=drift)
-        return self.apart(frame) > NEGATIVE_M + drift.max_deviation * drifted
-
-    def nearest(self, descriptor: Float32[np.ndarray, " d"], among: Bool[np.ndarray, " n"]) -> np.ndarray:
-        """Return the frame with the nearest descriptor among those flagged in `among`, in an array of at most one."""
-        rows = self.finder.index.query(descriptor, exclude=~among).rows
-        return rows[rows >= 0]
-
-    def turned(self, frame: int, angle: float) -> Seen:
-        """Descriptor and image of a frame rotated by `angle` (radians)."""
+    def rotated(self, frame: int, angle: float) -> Query:
+        """A frame rotated by `angle` (radians), as a query of unknown pose."""
         record = self.recording.record(frame, labels=False)
         if record.points is not None:
-            return self.finder.seen(Record(points=rotated(record.upright_points, angle)))
-        whole = even_cells(jnp.asarray(picture(record, None)[0]))
-        return self.finder.seen(Record(image=np.asarray(rotate_image(whole, jnp.float32(angle)))))
-
-    def evidence(self, frame: int, query: Seen, row: int) -> Evidence:
-        """Evidence of a pair. Its rivals are the frames with the nearest descriptors that show neither place."""
-        finder = self.finder
-        elsewhere = self.far(frame) & (self.apart(row) > NEGATIVE_M)
-        found = finder.index.query(query.descriptor, RIVALS, exclude=~elsewhere).rows
-        rows = [row, *found[found >= 0].tolist()]
-        spectra = query_spectra(query.image, config=finder.verification)
-        peaks = finder.comparer.search(spectra, [image_spectrum(self.images[k], finder.verification) for k in rows])
-        peak = peaks.one(0)
-        share = rival_share(peaks.some(slice(1, None)), float(peak.correlation), [])
-        fitted = jax.device_get(refined(query.image, self.images[row], peak, config=finder.verification))
-        distance = float(np.linalg.norm(finder.index.descriptors[row].astype(np.float64) - query.descriptor))
-        apart = np.linalg.norm(finder.index.descriptors[rows[1:]] - query.descriptor, axis=1)
-        nearest = distance_share(distance, apart, [])
-        cells = min(occupied(image, finder.verification) for image in (query.image, self.images[row]))
-        return Evidence.of(distance, nearest, fitted.correlation, fitted.second, share, cells)
+            turned = Record(points=rotated(record.upright_points, angle))
+        else:
+            whole = even_cells(jnp.asarray(picture(record, None)[0]))
+            turned = Record(image=np.asarray(rotate_image(whole, jnp.float32(angle))))
+        seen = self.finder.seen(turned)
+        image = np.asarray(within_reach(seen.image))
+        return Query(len(self.motion) - 1, seen.descriptor, image, query_spectra(image))

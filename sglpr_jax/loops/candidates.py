@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.background import Background
 from sglpr_jax.loops.compared_image import within_reach
-from sglpr_jax.loops.comparison import Candidate, Comparer
-from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
+from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
+from sglpr_jax.loops.config import MOTION_DRIFT, CandidateConfig, DriftModel, VerificationConfig
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
@@ -20,18 +20,21 @@ from sglpr_jax.loops.pose_search import Peak, search_near
 from sglpr_jax.loops.seen import Seen, described
 from sglpr_jax.loops.spectra import query_spectra
 from sglpr_jax.loops.stored_scans import StoredScans, image_spectrum
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.revisits import are_recent
+
+FLAT_M = 1e-6
+"""Maximum difference in height of odometry that does not measure height, in metres."""
 
 
 class Compared(NamedTuple):
     """The results of all image comparisons of a frame."""
 
-    candidates: list[Candidate]
-    """The candidate of the frame, or an empty list."""
+    fits: Fits
+    """Fits with earlier scans, from which the candidate is chosen."""
     link: Peak | None
     """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
@@ -50,6 +53,7 @@ class CandidateFinder:
         config: CandidateConfig = CandidateConfig(),
         verification: VerificationConfig = VerificationConfig(),
         drift: DriftModel = DriftModel(),
+        motion_drift: DriftModel = MOTION_DRIFT,
         keyframe_m: float = 0.0,
         max_places: int | None = None,
     ):
@@ -57,11 +61,12 @@ class CandidateFinder:
         check_is(params, Params, by="load")
         if params.config.categories_read:
             raise ValueError("expected a model that describes images alone, found one that reads labels too")
-        self.params, self.config, self.verification, self.drift = params, config, verification, drift
+        self.params, self.config, self.verification = params, config, verification
+        self.drift, self.motion_drift = drift, motion_drift
         index = Index.empty(params.config.head.descriptor_size, weights_hash=weights_hash(params))
         self.stored = StoredScans(index, verification=verification, keyframe_m=keyframe_m, max_places=max_places)
         """Descriptors, and centres of the images without the background, for comparison."""
-        self.compared = Compared([], None)
+        self.compared = Compared(NO_FITS, None)
         """Comparisons of the last frame."""
         self.has_odometry = False
         """Whether the frames have poses from odometry. If so, `motion` holds them."""
@@ -69,13 +74,14 @@ class CandidateFinder:
         """Mounting of the sensor at each frame."""
         self._empty = GrowingArray(np.empty(0, bool))
         self.motion = Motion(config.motion)
-        self.comparer = Comparer(self.stored, self.motion, config, verification, drift)
+        self._joined = GrowingArray(np.empty((0, 2), np.int64))
         self.background = Background(frames=config.background_frames, least=config.min_background_frames)
         self.missing: list[int] = []
         """Frames whose scans cannot be read."""
         self._times = GrowingArray(np.empty(0))
-        self._keyframe = np.zeros((0, 0), np.complex64)
-        """Spectrum of the image of the motion's keyframe, as in `stored`."""
+        self._keyframe: tuple[int, UInt8[np.ndarray, "m m"]] | None = None
+        self._last: tuple[int, UInt8[np.ndarray, "m m"]] | None = None
+        """Number and image of the motion's keyframe and of the last frame, as in `stored`. None for empty images."""
 
     def __len__(self) -> int:
         """Number of added frames."""
@@ -145,41 +151,62 @@ class CandidateFinder:
             self.missing.append(frame)
             seen = Seen(np.zeros(self.index.width, np.float32), np.zeros((0, 0), np.uint8), self._last_mounting)
         pose = None if odometry is None else np.asarray(odometry, np.float64)
-        clock = frame * self.config.exclude_s / max(self.config.exclude_frames, 1) if time is None else time
+        clock = float(frame) if time is None else time
         upright = None if pose is None else pose @ inverse(upright_from_lidar(seen.mounting))
         middle = np.asarray(within_reach(seen.image, self.verification)) if seen.image.size else seen.image
         empty = self.is_empty(seen.image)
         if not empty:
             self.stored.check(frame, middle)
         detail, keyframe = self.background.without(middle), self.motion.keyframe
+        spectra = None if empty or compared is not None else query_spectra(detail, config=self.verification)
+        query = None if empty else Query(frame, seen.descriptor, detail, spectra)
+        self.has_odometry = pose is not None
+        link = self._link(query, clock) if compared is None and pose is None and continues else None
+        link = link if compared is None else compared.link
+        self.motion.add(clock, pose=upright, link=link, continues=continues)
+        self.mountings.append(seen.mounting)
+        comparer = self.comparer
         if compared is None:
-            compared = self._compared(seen._replace(image=detail), time, upright, clock, continues=continues)
-        else:
-            self.motion.add(clock, pose=upright, link=compared.link, continues=continues)
+            compared = Compared(NO_FITS if query is None else comparer.compare(query, self.stored), link)
+        candidates = [] if query is None else comparer.candidates(query, compared.fits, self.stored.image_of)
         if middle.size and (self.motion.keyframe != keyframe or not frame):
             self.background.add(middle)
+        self._last = None if empty else (frame, detail)
         if self.motion.keyframe == frame:
-            self._keyframe = image_spectrum(detail, self.verification) if not empty else self._keyframe[:0]
-        self._keep(frame, seen, detail, time, empty)
-        self.has_odometry = pose is not None
-        self.compared = compared
-        return compared.candidates
-
-    def _keep(
-        self,
-        frame: int,
-        seen: Seen,
-        detail: UInt8[np.ndarray, "m m"],
-        time: float | None,
-        empty: bool,
-    ) -> None:
-        """Store what later frames need of a frame."""
+            self._keyframe = self._last
         if not empty and self.stored.is_new_place(frame, self.motion):
             self.stored.add(frame, seen.descriptor, detail)
         self._empty.append(empty)
-        self.mountings.append(seen.mounting)
         if time is not None:
             self._times.append(time)
+        self.compared = compared
+        return candidates
+
+    @property
+    def comparer(self) -> Comparer:
+        """Comparison with the stored scans, after the motion so far."""
+        level = self.motion.path.level(self.mountings)
+        return Comparer(self.motion, self.present_drift, level, self.config, self.verification, self.joined)
+
+    @property
+    def joined(self) -> Int[np.ndarray, "l 2"]:
+        """Frames of the query and the match of each accepted loop."""
+        return self._joined.rows
+
+    @property
+    def present_drift(self) -> DriftModel:
+        """Drift of the odometry or, without odometry, of the motion estimated from the images."""
+        return self.drift if self.has_odometry else self.motion_drift
+
+    @property
+    def knows_height(self) -> bool:
+        """Whether the odometry measures height. Wheels do not."""
+        return self.has_odometry and float(np.ptp(self.motion.path.poses[:, 2, 3])) > FLAT_M
+
+    def close_loop(self, query: int, match: int) -> None:
+        """Note an accepted loop between two frames."""
+        self._joined.append((query, match))
+        self.stored.close_loop(query, match)
 
     def seen(self, record: Record) -> Seen:
         """Descriptor and 8-bit density image of a scan or image. Nothing is stored."""
@@ -189,39 +216,40 @@ class CandidateFinder:
         """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
-    def _compared(
-        self,
-        seen: Seen,
-        time: float | None,
-        pose: Float[np.ndarray, "4 4"] | None,
-        clock: float,
-        *,
-        continues: bool,
-    ) -> Compared:
-        """Compare the next frame with its nearest frames and the keyframe, and add it to the motion."""
-        if self.is_empty(seen.image):
-            self.motion.add(clock, pose=pose, continues=continues)
-            return Compared([], None)
-        excluded = self._excluded(time, pose, continues=continues)
-        spectra = query_spectra(seen.image, config=self.verification)
-        link = self._link(spectra, clock) if pose is None and continues else None
-        self.motion.add(clock, pose=pose, link=link, continues=continues)
-        fit = self.comparer.fit if pose is None else self.comparer.fit_on_floor
-        rows, found = self.comparer.compared(seen.descriptor, spectra, excluded, fit=fit)
-        if not len(rows):
-            return Compared([], link)
-        best = int(np.argmax(fit(rows, found)))
-        if found.correlation[best] < self.config.min_correlation:
-            return Compared([], link)
-        return Compared([self.comparer.candidate(len(self), seen, spectra, rows, found, best)], link)
+    def _link(self, query: Query | None, clock: float) -> Peak | None:
+        """Pose of the next frame in the frame of the motion's keyframe, by the image of the keyframe or, if this is
+        ambiguous, by that of the last frame. None if there is no image to compare with."""
+        found = None
+        for frame, image in dict(filter(None, (self._keyframe, self._last))).items():
+            if query is None or query.spectra is None:
+                break
+            prior = self.motion.prior(clock, frame)
+            one = self._linked(query, image, prior)
+            found = one if found is None else found
+            if self.motion.is_trusted(one, prior):
+                return self._from_keyframe(one, frame, image, query.image)
+        return found
 
-    def _link(self, spectra: Complex[Array, "2 s t f"], clock: float) -> Peak | None:
-        """Pose of the next frame in the frame of the motion's keyframe. None if there is no image to compare with."""
-        if not len(self) or self.empty[self.motion.keyframe]:
-            return None
-        prior = self.motion.prior(clock)
-        peaks = jax.device_get(search_near(spectra, self._keyframe, prior, config=self.verification))
-        return self.motion.link(peaks.one(0), peaks.one(1))
+    def _linked(self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]) -> Peak:
+        spectrum = image_spectrum(image, self.verification)
+        peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
+        anywhere, expected = peaks.one(0), peaks.one(1)
+        return anywhere if self.motion.is_trusted(anywhere, prior) else expected
+
+    def _from_keyframe(
+        self, link: Peak, frame: int, image: UInt8[np.ndarray, "m m"], query: UInt8[np.ndarray, "m m"]
+    ) -> Peak:
+        """A link with a frame as pose in the frame of the keyframe. The link to a new keyframe is refined, because the
+        errors of such links add up."""
+        key = self.motion.keyframe
+        if frame != key or self.motion.is_next_keyframe(link):
+            pose = jax.device_get(refined(query, image, link, config=self.verification))
+            link = link._replace(x=pose.x, y=pose.y, yaw=pose.yaw)
+        if frame == key:
+            return link
+        poses = self.motion.poses
+        moved = inverse(poses[key]) @ poses[frame] @ transform(float(link.x), float(link.y), float(link.yaw))
+        return link._replace(x=moved[0, 3], y=moved[1, 3], yaw=yaw_of(moved))
 
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self):
@@ -234,22 +262,3 @@ class CandidateFinder:
                 raise ValueError(f"expected {name} for every frame or for none, found both (frame {len(self)})")
         if time is not None and self.times is not None and time < self.times[-1]:
             raise ValueError(f"expected times that do not decrease, found {time} after {self.times[-1]}")
-
-    def _excluded(
-        self, time: float | None, pose: Float[np.ndarray, "4 4"] | None, *, continues: bool
-    ) -> Bool[np.ndarray, " n"]:
-        """Stored scans that cannot match the next frame: too recent, or too far away by odometry."""
-        config, frames = self.config, self.stored.frames
-        seconds, count = config.exclude_s, config.exclude_frames
-        recent = are_recent(len(self), self.times, time, seconds=seconds, frames=count, rows=frames)
-        if not continues:
-            return recent
-        excluded = recent | self.motion.near_last(config.min_travelled_m, frames)
-        if pose is not None and len(frames):
-            path, position = self.motion.path, pose[:3, 3]
-            drifted = path.position_deviations(frames, len(path) - 1, position, drift=self.drift)
-            apart = np.linalg.norm(path.poses[frames, :3, 3] - position, axis=1)
-            place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
-            far = apart > place_m + self.drift.max_deviation * drifted
-            excluded = excluded | (far & self.motion.same(-1, frames))
-        return excluded

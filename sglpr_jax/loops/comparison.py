@@ -1,28 +1,39 @@
-"""Comparison of a scan with stored scans: the nearest descriptors, and the best fit of the images with its evidence."""
+"""Comparison of a scan with stored scans: the best match, and the evidence that it shows the same place.
+
+The evidence asks the drive itself. The query is also compared with scans that the motion puts elsewhere, or that cannot
+show the place of the match. If one of these distractors fits about as well as the match, the fit proves little. A fit
+is a distractor if its pose contradicts the motion to the query or to the match. Everything is measured in metres of
+travelled distance and in standard deviations of the motion. Times have no influence.
+"""
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int
+from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int, UInt8
 
-from sglpr_jax.loops.compared_image import occupied
 from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
-from sglpr_jax.loops.drift import on_other_floor
+from sglpr_jax.loops.drift import floor_deviations, planar_deviations, planar_spread
 from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.planar import Planar, compose, inverted
 from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, search_spectra
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.rivals import distance_share, expected_poses, rival_share, rivals
-from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.shortlist import coarse_correlations
-from sglpr_jax.loops.stored_scans import StoredScans
-from sglpr_jax.loops.transforms import transform
 from sglpr_jax.loops.verification import Alignment, refined
 
-BATCH, COARSE_BATCH = 10, 30
+BATCH, COARSE_BATCH = 8, 32
 """Number of matches of a batch, of the exact and of the coarse comparison."""
+EVERY = np.array(True)
+LOOKALIKE = 0.6
+"""Correlation of a query with the best other place of an unknown drive. It counts until the drive has other places."""
+SYMMETRIES = 4
+"""Number of rotations at which a lookalike may fit."""
+
+
+Spectra = Complex[Array, "2 s t f"]
+"""Result of `query_spectra`."""
 
 
 class Candidate(NamedTuple):
@@ -36,135 +47,248 @@ class Candidate(NamedTuple):
     evidence: Evidence
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Comparer:
-    """Compares scans with stored scans. The fields are those of the finder, and grow with it."""
+class Fits(NamedTuple):
+    """Fits of a query with other scans, from which its candidate is chosen. They do not depend on any threshold."""
 
-    stored: StoredScans
-    motion: Motion
-    config: CandidateConfig
-    verification: VerificationConfig
-    drift: DriftModel
+    frames: Int[np.ndarray, " k"]
+    """Frames of the other scans."""
+    peaks: Peak
+    """Poses of the query in the frames of the other scans, and correlations."""
 
-    def similar(self, descriptor: Float32[np.ndarray, " d"], excluded: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
-        """Stored scans with the nearest descriptors, and those with the nearest ones at other times than the first."""
-        rows = self.nearest(descriptor, self.config.candidates, excluded)
-        if not len(rows):
-            return rows
-        excluded = excluded | self.about(int(rows[0]))
-        return np.concatenate([rows, self.nearest(descriptor, self.config.elsewhere, excluded)])
 
-    def fit(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
-        """How well each compared scan fits: its correlation."""
-        return np.asarray(found.correlation)
+NO_FITS = Fits(np.zeros(0, np.int64), NO_PEAKS)
 
-    def fit_on_floor(self, rows: Int[np.ndarray, " k"], found: Peak) -> Float[np.ndarray, " k"]:
-        """The correlation, and -2 added on another floor by odometry, because floors of a building look alike."""
-        frames = self.stored.frames[rows]
-        other = on_other_floor(self.motion.path, frames, found, self.drift) & self.motion.same(-1, frames)
-        return np.asarray(found.correlation - 2 * other)
 
-    def compared(
-        self,
-        descriptor: Float32[np.ndarray, " d"],
-        spectra: Complex[Array, "2 s t f"],
-        excluded: Bool[np.ndarray, " n"],
-        *,
-        fit: Callable[[Int[np.ndarray, " k"], Peak], Float[np.ndarray, " k"]],
-    ) -> tuple[Int[np.ndarray, " k"], Peak]:
-        """Stored scans that may show the place of a query, and its peaks over their images.
+class Query(NamedTuple):
+    """A scan that is compared."""
 
-        These are the `similar` ones and, if none of them fits well, the best of `further` ones by a coarse comparison.
-        Scans below `min_coarse_correlation` are left out.
-        """
-        config, similar = self.config, self.similar(descriptor, excluded)
-        rows = self.possible(spectra, similar)
-        found = self.search(spectra, self.stored.spectra(rows))
-        if len(rows) and fit(rows, found).max() >= config.good_correlation:
-            return rows, found
-        pool = self.nearest(descriptor, config.further, excluded)
-        chosen = self.possible(spectra, pool[~np.isin(pool, similar)])[: config.candidates]
-        more = self.search(spectra, self.stored.spectra(chosen))
-        return np.concatenate([rows, chosen]), Peak(*map(np.concatenate, zip(found, more, strict=True)))
+    frame: int
+    """Frame number in the motion."""
+    descriptor: Float32[np.ndarray, " d"]
+    image: UInt8[np.ndarray, "m m"]
+    spectra: Spectra | None
+    """Result of `query_spectra`. None if the scan was already compared."""
 
-    def possible(self, spectra: Complex[Array, "2 s t f"], rows: Int[np.ndarray, " k"]) -> Int[np.ndarray, " j"]:
-        """Those of some stored scans that the coarse comparison does not rule out, the best first."""
-        if not len(rows):
-            return rows
-        matches = batched(self.stored.spectra(rows), COARSE_BATCH)
-        found = np.asarray(coarse_correlations(spectra, matches, len(rows), config=self.verification))[: len(rows)]
-        best = np.argsort(-found, kind="stable")
-        return rows[best[found[best] >= self.config.min_coarse_correlation]]
 
-    def about(self, row: int) -> Bool[np.ndarray, " n"]:
-        """Whether each stored scan was recorded at about the same time as one of them."""
-        frames = self.stored.frames
-        return self.motion.about(int(frames[row]), self.config.rivals.age[0] * self.config.exclude_s, frames)
+@runtime_checkable
+class Stored(Protocol):
+    """Scans that a query is compared with, such as `StoredScans`."""
+
+    @property
+    def frames(self) -> Int[np.ndarray, " n"]:
+        """Frame of each scan in the motion."""
+        ...
 
     def nearest(
-        self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k (0 or more) stored scans with the nearest descriptors, nearest first."""
-        if not k:
-            return np.zeros(0, np.int64)
-        rows = self.stored.index.query(descriptor, k, exclude=excluded).rows
-        return rows[rows >= 0]
+        """Up to k scans with the nearest descriptors, nearest first."""
+        ...
+
+    def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
+        """Image of a scan."""
+        ...
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        """Spectrum of each scan's image (`match_spectra`)."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Comparer:
+    """Compares queries with stored scans."""
+
+    motion: Motion
+    """Motion of all frames. It may grow."""
+    drift: DriftModel
+    """Drift of this motion."""
+    level: Float[np.ndarray, "3 3"]
+    """Rotation that makes the z axis of the motion's world point up."""
+    config: CandidateConfig
+    verification: VerificationConfig
+    joined: Int[np.ndarray, "l 2"]
+    """Frames of the queries and matches of accepted loops, which join passes of one place."""
+
+    def compare(
+        self, query: Query, searched: Stored, *others: Stored, possible: Bool[np.ndarray, " n"] | None = None
+    ) -> Fits:
+        """Compare a query with the scans most like it: possible matches, and scans that show other places.
+
+        Arguments:
+          query: The scan. Its frame is part of the motion.
+          searched: Scans among which the match is sought.
+          others: Further scans that show other places, such as those of the query's own recording.
+          possible: Whether each searched scan may be the match. By default the motion decides.
+        """
+        config = self.config
+        possible = self.possible(searched.frames, query.frame) if possible is None else possible
+        rows = searched.nearest(query.descriptor, config.further, possible)
+        coarse = self.coarse(query.spectra, searched.spectra(rows))
+        rows = rows[np.argsort(-coarse, kind="stable")][: int((coarse >= config.min_coarse_correlation).sum())]
+        first, more = np.split(rows[: 2 * config.candidates], [config.candidates])
+        found = self._compared(query, searched, first)
+        best = self.best(query.frame, found)
+        if best is None or found.peaks.correlation[best] < config.good_correlation:
+            found = _joined(found, self._compared(query, searched, more))
+            best = self._highest(query.frame, found, EVERY) if best is None else best
+        match = query.frame if best is None else int(found.frames[best])
+        return _joined(found, *(self._cohort(query, match, store) for store in (searched, *others)))
+
+    def possible(self, frames: Int[np.ndarray, " k"], query: int) -> Bool[np.ndarray, " k"]:
+        """Whether each frame may show the place of the query: not of the same pass, and not elsewhere."""
+        return (self.way_m(frames, query) >= self.config.recent_m) & ~self.elsewhere(frames, query)
+
+    def best(self, query: int, fits: Fits, possible: Bool[np.ndarray, "*k"] = EVERY) -> int | None:
+        """The fit with the highest correlation among those that the motion allows."""
+        allowed = self._deviations(query, fits) <= self.drift.max_deviation
+        return self._highest(query, fits, allowed & possible)
+
+    def candidates(
+        self,
+        query: Query,
+        fits: Fits,
+        image_of: Callable[[int], UInt8[np.ndarray, "m m"]],
+        *,
+        possible: Bool[np.ndarray, "*k"] = EVERY,
+    ) -> list[Candidate]:
+        """Choose the match of a query, and collect the evidence. The list is empty if nothing fits.
+
+        If another scan fits better, but contradicts the motion, it is a second candidate. It can show that the motion
+        is wrong.
+
+        Arguments:
+          query: The scan.
+          fits: Its fits.
+          image_of: Function that returns the image of a frame.
+          possible: Whether each fit may be a match, beside the scans of the query's own pass.
+        """
+        best, any_best = self.best(query.frame, fits, possible), self._highest(query.frame, fits, possible)
+        chosen = [row for row in dict.fromkeys((best, any_best)) if row is not None]
+        high = [row for row in chosen if fits.peaks.correlation[row] >= self.config.min_correlation]
+        return [self.candidate(query, fits, row, image_of) for row in high]
 
     def candidate(
-        self,
-        query: int,
-        seen: Seen,
-        spectra: Complex[Array, "2 s t f"],
-        compared: Int[np.ndarray, " k"],
-        peaks: Peak,
-        best: int,
+        self, query: Query, fits: Fits, row: int, image_of: Callable[[int], UInt8[np.ndarray, "m m"]]
     ) -> Candidate:
-        """Candidate of frame `query` and the best compared scan. Compared scans that are known to show another place
-        are rivals."""
-        row, peak, stored = int(compared[best]), peaks.one(best), self.stored
-        frames, image = stored.frames, stored.image(row)
-        match = int(frames[row])
-        distance = float(np.linalg.norm(self.stored.index.descriptors[row] - seen.descriptor))
-        alignment = jax.device_get(refined(seen.image, image, peak, config=self.verification))
-        rules, known = self.config.rivals, self.stored.index.descriptors
-        exclude_s = self.config.exclude_s
-        rows = rivals(seen.descriptor, known, frames, match, self.motion, exclude_s=exclude_s, config=rules)
-        found = self.search(spectra, stored.spectra(rows))
-        by_motion = expected_poses(self.motion, query, frames[rows], np.eye(4), config=rules)
-        shares = self.shares(seen, match, distance, peak, rows, found, [by_motion])
-        far = ~self.about(row)[compared] & self.motion.same(match, frames[compared])
-        elsewhere = self.shares(seen, match, distance, peak, compared[far], peaks.some(far), [])
-        shares = np.fmax(shares, elsewhere)
-        cells = min(occupied(one, self.verification) for one in (seen.image, image))
-        evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
-        return Candidate(query, match, alignment, evidence)
+        """Collect the evidence of one fit."""
+        match, peak = int(fits.frames[row]), fits.peaks.one(row)
+        deviation = float(self._deviations(query.frame, fits)[row])
+        distracts = self._excluded(query.frame, match, peak, fits)
+        if deviation <= self.drift.max_deviation:
+            distracts |= self._deviations(query.frame, fits) > self.drift.max_deviation
+        distracts &= fits.frames != match
+        correlations = fits.peaks.correlation[distracts]
+        other = self.elsewhere(fits.frames, query.frame) | self.elsewhere(fits.frames, match)
+        if other.sum() < self.config.exact_cohort:
+            correlations = np.append(correlations, LOOKALIKE)
+        ambiguity = max(correlations, default=0.0) / max(float(peak.correlation), 1e-6)
+        alignment = jax.device_get(refined(query.image, image_of(match), peak, config=self.verification))
+        evidence = Evidence.of(alignment.second, ambiguity, deviation, self.surprise(query.frame, match))
+        return Candidate(query.frame, match, alignment, evidence)
 
-    def shares(
-        self,
-        seen: Seen,
-        match: int,
-        distance: float,
-        peak: Peak,
-        rows: Int[np.ndarray, " k"],
-        found: Peak,
-        expected: Sequence[tuple[Float[np.ndarray, "k 4 4"], Float[np.ndarray, " k"]]],
-    ) -> tuple[float, float]:
-        """`distance_share` and `rival_share` of a match, with the rivals `rows`."""
-        rules, match_from_query = self.config.rivals, transform(float(peak.x), float(peak.y), float(peak.yaw))
-        frames = self.stored.frames[rows]
-        expected = [*expected, expected_poses(self.motion, match, frames, match_from_query, config=rules)]
-        apart = np.linalg.norm(self.stored.index.descriptors[rows] - seen.descriptor, axis=1)
-        return (
-            distance_share(distance, apart, expected, config=rules),
-            rival_share(found, float(peak.correlation), expected, config=rules),
-        )
+    def surprise(self, query: int, match: int) -> float:
+        """Logarithm of the searched poses over those within the uncertainty of the motion.
 
-    def search(self, spectra: Complex[Array, "2 s t f"], matches: Sequence[Complex64[np.ndarray, "s f"]]) -> Peak:
+        A lookalike fits at any pose. Its rotation is one of `SYMMETRIES`, because walls stand at right angles.
+        """
+        rules, area = {"drift": self.drift, "level": self.level}, (2 * self.verification.max_shift_m) ** 2
+        spread = planar_spread(self.motion.path, np.array([query]), np.array([match]), **rules)[0]
+        most = self.drift.max_deviation
+        allowed = np.pi * most**2 * np.sqrt(np.linalg.det(spread[:2, :2]))
+        rotation = max(2 * most * np.sqrt(spread[2, 2]), 2 * np.pi / SYMMETRIES)
+        return float(max(np.log(area / allowed), 0) + max(np.log(2 * np.pi / rotation), 0))
+
+    def _highest(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
+        """The flagged fit with the highest correlation, not of the query's own pass."""
+        flags = allowed & (self.way_m(fits.frames, query) >= self.config.recent_m)
+        return int(np.argmax(np.where(flags, fits.peaks.correlation, -1.0))) if flags.any() else None
+
+    def _deviations(self, query: int, fits: Fits) -> Float[np.ndarray, " k"]:
+        return self.deviations(query, fits.frames, _planar(fits.peaks))
+
+    def way_m(self, frames: Int[np.ndarray, " k"], frame: int) -> Float[np.ndarray, " k"]:
+        """Travelled distance between a frame and each of others, in metres."""
+        return np.abs(self.motion.way_m(frames) - self.motion.way_m(frame))
+
+    def elsewhere(self, frames: Int[np.ndarray, " k"], frame: int) -> Bool[np.ndarray, " k"]:
+        """Whether each of some frames certainly shows another place than a frame, according to the motion."""
+        path = self.motion.path
+        apart = np.linalg.norm(path.poses[frames, :3, 3] - path.poses[frame, :3, 3], axis=1)
+        drifted = path.position_deviations(frames, frame, drift=self.drift)
+        place_m = np.sqrt(2) * self.verification.max_shift_m  # largest shift along x and y
+        return apart > place_m + self.drift.max_deviation * drifted
+
+    def _cohort(self, query: Query, match: int, store: Stored) -> Fits:
+        """Compare a query with the scans most like it that show another place than the query or the match, and with
+        those near enough to contradict the motion by their fit."""
+        config, frames = self.config, store.frames
+        ways = np.stack([self.way_m(frames, frame) for frame in (query.frame, match)])
+        beside = (ways >= config.beside_m).all(axis=0)
+        other = self.elsewhere(frames, query.frame) | self.elsewhere(frames, match)
+        near = (ways < 2 * config.recent_m).any(axis=0) & ~other
+        found = []
+        for count, exact, flags in (
+            (config.cohort, config.exact_cohort, other & beside),
+            (config.near_cohort, config.exact_near_cohort, near & beside),
+        ):
+            rows = store.nearest(query.descriptor, count, flags)
+            order = np.argsort(-self.coarse(query.spectra, store.spectra(rows)), kind="stable")
+            found.append(self._compared(query, store, rows[order[:exact]]))
+        return _joined(*found)
+
+    def _compared(self, query: Query, store: Stored, rows: Int[np.ndarray, " k"]) -> Fits:
+        """Compare the images of a query and of some stored scans at all rotations and shifts."""
+        return Fits(store.frames[rows], self.search(query.spectra, store.spectra(rows)))
+
+    def _excluded(self, query: int, match: int, peak: Peak, fits: Fits) -> Bool[np.ndarray, " k"]:
+        """Whether the motion between the match and each scan excludes that the query fits both."""
+        query_from_match = inverted(np.array([float(peak.x), float(peak.y), float(peak.yaw)]))
+        others = compose(_planar(fits.peaks), query_from_match)
+        excludes = self.deviations(match, fits.frames, others) > self.drift.max_deviation
+        return excludes & ~self.are_joined(match, fits.frames)
+
+    def deviations(
+        self, query: int, matches: Int[np.ndarray, " k"], match_from_query: Planar
+    ) -> Float[np.ndarray, " k"]:
+        """Deviation of poses of a frame in the frames of others from the motion, in standard deviations."""
+        args = self.motion.path, np.full(len(matches), query), matches, match_from_query
+        rules = {"drift": self.drift, "level": self.level}
+        return np.maximum(planar_deviations(*args, **rules), floor_deviations(*args, **rules))
+
+    def are_joined(self, match: int, frames: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+        """Whether an accepted loop joins the surroundings of each frame with those of a match."""
+        found = np.zeros(len(frames), bool)
+        for a, b in (self.joined.T, self.joined.T[::-1]):
+            close = self.way_m(a, match) < self.config.recent_m
+            for end in b[close].tolist():
+                found |= self.way_m(frames, end) < self.config.recent_m
+        return found
+
+    def coarse(
+        self, spectra: Spectra | None, matches: Sequence[Complex64[np.ndarray, "s f"]]
+    ) -> Float[np.ndarray, " k"]:
+        """Highest correlation with each match by the coarse comparison."""
+        if not matches or spectra is None:
+            return np.zeros(0)
+        stacked = batched(matches, COARSE_BATCH)
+        found = coarse_correlations(spectra, stacked, len(matches), config=self.verification)
+        return np.asarray(found)[: len(matches)]
+
+    def search(self, spectra: Spectra | None, matches: Sequence[Complex64[np.ndarray, "s f"]]) -> Peak:
         """Poses of a query in the frames of some matches."""
-        if not matches:
+        if not matches or spectra is None:
             return NO_PEAKS
         found = search_spectra(spectra, batched(matches, BATCH), len(matches), config=self.verification)
         return jax.device_get(found).some(slice(len(matches)))
+
+
+def _planar(found: Peak) -> Planar:
+    return np.stack([np.asarray(values, np.float64) for values in (found.x, found.y, found.yaw)], axis=-1)
+
+
+def _joined(*fits: Fits) -> Fits:
+    frames, peaks = zip(*fits, strict=True)
+    return Fits(np.concatenate(frames), Peak(*map(np.concatenate, zip(*peaks, strict=True))))
 
 
 def batched(matches: Sequence[Complex64[np.ndarray, "s f"]], multiple: int) -> Complex64[np.ndarray, "k s f"]:

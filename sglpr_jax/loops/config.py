@@ -13,7 +13,6 @@ from sglpr_jax.loops.choices import (
     PlaceCount,
     PlaceCountOrNone,
 )
-from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
 
 def _check_probability(name: str, value: float) -> None:
@@ -56,81 +55,70 @@ class DriftModel:
         return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"
 
 
+MOTION_DRIFT = DriftModel(metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5)
+"""Drift of the motion that is used if there is no odometry (`loops.motion`)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class MotionConfig:
     """Thresholds for accepting a registration with the keyframe and for choosing the next keyframe."""
 
-    min_correlation: float = 0.4
+    min_correlation: float = 0.15
     """Minimum correlation of the two images."""
     max_ridge: float = 0.8
     """Maximum ratio of ridge to peak. Above it, the images do not show how far the sensor moved."""
     max_second: float = 0.8
-    max_second_expected: float = 1.5
-    """Maximum second-peak ratio, without and with an expected pose."""
+    max_second_of_jump: float = 0.6
+    max_second_expected: float = 0.95
+    """Maximum second-peak ratio, that of a pose far from the expected one, and that of the expected pose."""
+    expected_m: float = 1.0
+    expected_deg: float = 5.0
+    """Maximum distance of a pose from the expected one, in metres and degrees."""
+    max_jump: float = 2.0
+    """Distance from the expected pose, as a multiple of the last step, beyond which a pose is far from it."""
     max_coasting: int = 3
     """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
     keyframe_m: float = 3.0
     keyframe_deg: float = 20.0
     """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
-    guess_m_per_s: float = 80.0
-    """Length of measured path with the same drift as one second of guessed motion, in metres."""
-    standing_s: float = 5.0
-    """Maximum time that one keyframe adds to the clock, in seconds. A vehicle that stands sees nothing new."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RivalConfig:
-    """Selection of the rivals of a match."""
-
-    of_query: PlaceCountOrNone = 6
-    """Maximum number of rivals before the query."""
-    of_match: PlaceCountOrNone = 4
-    """Maximum number of rivals around the match, half before and half after it."""
-    age: tuple[float, float] = (0.27, 0.97)
-    """Minimum and maximum time between a rival and the query or the match, without standing time, as fractions of the
-    excluded time. The defaults are 8 and 29 s of 30 s."""
-    agree_m: float = 3.0
-    agree_share: float = 0.05
-    """Maximum deviation of a fit that agrees with the motion, in metres and as a fraction of the travelled distance."""
-    agree_deg: float = 20.0
-    """Maximum angle of a fit that agrees with the motion, in degrees."""
-    overlap_m: float = 15.0
-    """Distance below which two scans overlap, in metres."""
-
-    def __post_init__(self):
-        """Raises ValueError if a field has an invalid value."""
-        check_fields(self)
+    guess_factor: float = 1000.0
+    """Length of measured path with the same drift as one metre of guessed motion, in metres."""
+    least_step_m: float = 0.5
+    unknown_step_m: float = 12.0
+    """Minimum length of a guessed step, and its length if the speed was never known, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CandidateConfig:
-    """Selection of candidate matches and of their rivals."""
+    """Selection of the scans that a query is compared with: possible matches, and scans that show other places."""
 
-    candidates: PlaceCount = 3
-    """Number of nearest descriptors whose images are compared."""
-    elsewhere: PlaceCountOrNone = 2
-    """Number of nearest descriptors from other times (`rivals.age`) whose images are compared. The best fit of all
-    compared frames is the candidate."""
+    further: PlaceCount = 32
+    """Number of nearest descriptors among the possible matches whose images are compared on coarse cells."""
+    candidates: PlaceCount = 4
+    """Number of these, the best by the coarse comparison, whose images are compared exactly."""
     good_correlation: float = 0.6
-    further: PlaceCountOrNone = 25
-    """If no compared image has this correlation, more of the nearest descriptors are compared, `further` altogether:
-    first on coarse cells, then the best `candidates` of them like the others."""
+    """If no compared image has this correlation, as many further ones are compared exactly."""
     min_coarse_correlation: float = 0.3
-    """Minimum correlation by the coarse comparison (`loops.shortlist`) of an image that is compared exactly."""
-    exclude_s: float = EXCLUDED_S
-    exclude_frames: int = EXCLUDED_FRAMES
-    """Minimum age of a match in seconds, or in frames if there are no times."""
-    min_travelled_m: float = 10.0
-    """Minimum travelled distance between match and query, in metres, if the motion is known."""
+    """Minimum correlation by the coarse comparison (`loops.shortlist`) of a possible match that is compared exactly."""
+    min_correlation: float = 0.25
+    """Minimum correlation of a candidate. Pairs below it are not loops."""
+    cohort: PlaceCountOrNone = 24
+    """Number of nearest descriptors among the scans that show another place than the query or the match."""
+    near_cohort: PlaceCountOrNone = 8
+    """Number of nearest descriptors among other scans of the same passes, whose fits may contradict the motion."""
+    exact_cohort: PlaceCountOrNone = 6
+    exact_near_cohort: PlaceCountOrNone = 3
+    """Numbers of these scans, the best by the coarse comparison, whose images are compared exactly."""
+    recent_m: Positive = 30.0
+    """Minimum travelled distance between a match and its query, in metres. Nearer scans belong to the same pass."""
+    beside_m: NotNegative = 10.0
+    """Minimum travelled distance from query and match to the scans that show other places, in metres."""
     min_cells: int = 20
     """Minimum number of occupied cells. Images with fewer come from a blocked or failed sensor and are skipped."""
     background_frames: int = 16
     """Number of keyframes in the average image, which is subtracted before comparisons (`loops.background`)."""
     min_background_frames: int = 4
     """Minimum number of keyframes before the average is subtracted."""
-    min_correlation: float = 0.25
-    """Minimum correlation of a candidate. Pairs below it are not loops."""
-    rivals: RivalConfig = RivalConfig()
     motion: MotionConfig = MotionConfig()
 
     def __post_init__(self):
@@ -187,34 +175,16 @@ class ConsistencyConfig:
 class SequenceConfig:
     """Selection and weights of neighbouring frames."""
 
-    frames: int = 30
-    """Number of frames before and after a loop that are considered."""
-    support: int = 2
-    """Minimum number of loops that show the same place, including the loop itself."""
-    independent_m: float = 15.0
-    """Travelled distance after which two frames are nearly independent, in metres."""
-    least_probability: float = 0.2
-    """Minimum probability of a neighbouring pair alone, at most `min_probability` of the detector. The pair counts with
-    the excess of its log odds over those of this probability."""
-    unknown_m: float = 1.0
-    """Assumed distance between consecutive frames if the motion is unknown, in metres."""
-    max_log_odds: float = 4.0
+    window_m: Positive = 50.0
+    """Travelled distance before and after a query within which other queries are its neighbours, in metres."""
+    independent_m: Positive = 25.0
+    """Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
+    max_log_odds: Positive = 4.0
     """Maximum log odds that a neighbour adds or subtracts."""
-    frames_a_frame: float = 3.0
-    """If the motion is unknown, the matches of two queries k frames apart are at most this factor times k + 1 frames
-    apart."""
-    agree_m: float = 2.0
-    agree_share: float = 0.1
-    agree_deg: float = 10.0
-    """Maximum closure error of the cycle of two loops that agree: distance in metres, additional fraction of the
-    travelled distance, and angle in degrees."""
-    guess_share: float = 0.075
-    guess_deg_per_m: float = 0.2
-    """Additional tolerance for each metre of `Motion.guessed_m`, in metres and degrees."""
 
     def __post_init__(self):
-        """Raises ValueError if the probability is outside [0, 1]."""
-        _check_probability("least_probability", self.least_probability)
+        """Raises ValueError if a field has an invalid value."""
+        check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,10 +193,7 @@ class DetectorConfig:
 
     min_probability: float = MIN_PROBABILITY
     """Minimum probability of a returned loop, given its neighbours."""
-    near_m: float = 200.0
-    """With odometry, a loop must be consistent with at least half of the loops within this travelled distance, in
-    metres."""
-    keyframe_m: float = 0.0
+    keyframe_m: float = 0.5
     """Minimum distance of a stored scan from the previous one, in metres. Nearer scans that are turned by less than 20
     degrees are searched for loops, but not stored. 0 stores every scan."""
     max_places: int | None = None
@@ -236,9 +203,7 @@ class DetectorConfig:
     verification: VerificationConfig = VerificationConfig()
     consistency: ConsistencyConfig = ConsistencyConfig()
     sequence: SequenceConfig = SequenceConfig()
-    motion_drift: DriftModel = DriftModel(
-        metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5, max_deviation=3.0
-    )
+    motion_drift: DriftModel = MOTION_DRIFT
     """Drift of the motion that is used if there is no odometry (`loops.motion`)."""
     drift: DriftModel = DriftModel()
     """Drift of the odometry. Loops that contradict it are rejected."""

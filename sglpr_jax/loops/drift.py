@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from sglpr_jax.loops.config import DriftModel
 from sglpr_jax.loops.driven_path import Between, DrivenPath
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.planar import compose, frames_of, planar, planar_loops, wrapped
-from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.planar import Planar, compose, frames_of, planar, planar_loops, wrapped
 from sglpr_jax.loops.transforms import travelled
 from sglpr_jax.loops.upright import upright_poses
 
@@ -57,16 +56,73 @@ def deviations_along(
     """Return `deviations` of each loop from a path. The time is independent of the length of the path."""
     poses, covariances = planar_loops(loops, mounting)
     query, match = frames_of(loops)
-    level = path.level(mounting)
-    start, end = (planar(path.leveled(frames, level)) for frames in (match, query))
-    by_loop = compose(start, poses)
-    error = by_loop - end
-    error[:, 2] = wrapped(error[:, 2])
-    spread = _drifted(path.between(match, query).turned(level[:2]), end[:, :2], drift)
-    spread += _turned(covariances, by_loop[:, 2])
-    spread += np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
-    in_plane = np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+    options = {"drift": drift, "level": path.level(mounting), "covariances": covariances}
+    in_plane = planar_deviations(path, query, match, poses, **options)
     return np.maximum(in_plane, height_deviations(path, loops, drift=drift, mounting=mounting))
+
+
+def planar_deviations(
+    path: DrivenPath,
+    query: Int[np.ndarray, " k"],
+    match: Int[np.ndarray, " k"],
+    match_from_query: Planar,
+    *,
+    drift: DriftModel,
+    level: Float[np.ndarray, "3 3"],
+    covariances: Float[np.ndarray, "k 3 3"] | float = 0.0,
+) -> Float[np.ndarray, " k"]:
+    """Return `deviations` of poses in the plane, without the height.
+
+    Arguments:
+      path: Path of the sensor.
+      query: Frames of the queries.
+      match: Frames of the matches, earlier or later than the queries.
+      match_from_query: Gravity-aligned poses of the queries in the frames of the matches.
+      drift: Drift model of the path.
+      level: Rotation that makes the z axis of the path's world point up (`DrivenPath.level`).
+      covariances: Covariances of the poses, in the frames of the queries.
+    """
+    start, last = (planar(path.leveled(frames, level)) for frames in (match, query))
+    by_loop = compose(start, match_from_query)
+    error = by_loop - last
+    error[:, 2] = wrapped(error[:, 2])
+    spread = planar_spread(path, query, match, drift=drift, level=level)
+    spread += _turned(np.broadcast_to(covariances, spread.shape), by_loop[:, 2])
+    return np.sqrt(np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]))
+
+
+def planar_spread(
+    path: DrivenPath,
+    query: Int[np.ndarray, " k"],
+    match: Int[np.ndarray, " k"],
+    *,
+    drift: DriftModel,
+    level: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "k 3 3"]:
+    """Covariance of x, y, yaw of each query relative to its match by a path. Arguments as in `planar_deviations`."""
+    last = path.leveled(query, level)[:, :2, 3]
+    spread = _drifted(path.between(match, query).turned(level[:2]), last, drift)
+    return spread + np.diag([drift.position_m, drift.position_m, np.radians(drift.yaw_deg)]) ** 2
+
+
+def floor_deviations(
+    path: DrivenPath,
+    query: Int[np.ndarray, " k"],
+    match: Int[np.ndarray, " k"],
+    match_from_query: Planar,
+    *,
+    drift: DriftModel,
+    level: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, " k"]:
+    """Deviation of poses in the plane from a path in height, in standard deviations. Floors of a building look alike.
+
+    The query is assumed in the x-y plane of the match. The arguments are those of `planar_deviations`.
+    """
+    start, end = (path.leveled(frames, level) for frames in (match, query))
+    shifts = np.pad(match_from_query[:, :2], ((0, 0), (0, 1)))
+    heights = np.einsum("kj,kj->k", start[:, 2, :3], shifts) + start[:, 2, 3] - end[:, 2, 3]
+    spread = _height_spread(path.travelled[query] - path.travelled[match], drift)
+    return np.abs(heights) / spread
 
 
 def height_deviations(
@@ -81,24 +137,6 @@ def height_deviations(
     variance = np.array([loop.covariance[2, 2] for loop in loops])
     spread = np.sqrt(_height_spread(path.travelled[query] - path.travelled[match], drift) ** 2 + variance)
     return np.abs(apart) / spread
-
-
-def on_other_floor(
-    path: DrivenPath, frames: Int[np.ndarray, " k"], found: Peak, drift: DriftModel
-) -> Bool[np.ndarray, " k"]:
-    """Whether a path contradicts the pose of the last frame found at each of some other frames, by height alone.
-
-    Arguments:
-      path: Path by odometry. The world may be tilted.
-      frames: The other frames.
-      found: Pose of the last frame in the image of each of them.
-      drift: Drift model.
-    """
-    poses, way = path.poses[frames], path.travelled
-    shifts = np.stack([found.x, found.y, np.zeros_like(found.x)], axis=1)
-    positions = np.einsum("kij,kj->ki", poses[:, :3, :3], shifts) + poses[:, :3, 3]
-    apart = (positions - path.poses[-1, :3, 3]) @ path.up
-    return np.abs(apart) > drift.max_deviation * _height_spread(way[-1] - way[frames], drift)
 
 
 def _height_spread(travelled_m: Float[np.ndarray, " k"], drift: DriftModel) -> Float[np.ndarray, " k"]:

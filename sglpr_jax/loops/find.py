@@ -14,8 +14,6 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
-from sglpr_jax.data.times import doubt
-from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.add_scans import add_scans
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import Candidate
@@ -43,7 +41,7 @@ class FoundLoops:
     """Number of scans that were searched: all, unless the search was stopped."""
     loops: tuple[Loop, ...]
     rejected: tuple[Rejected, ...]
-    """Pairs that looked like loops to the detector and were rejected, each with its reason."""
+    """All other compared pairs, each with the reason for its rejection."""
     odometry: Float[np.ndarray, "n 4 4"] | None
     """Pose of the LiDAR at every scan of the recording."""
     skipped: tuple[str, ...] = ()
@@ -117,7 +115,7 @@ def find_loops(
     """Find the loops of a recording.
 
     Poses are between LiDAR frames, the frames of the points, whatever the mounting of the sensor. Scans that are almost
-    empty have no loops. A warning says if the odometry contradicts most of the loops, or if times are not in seconds.
+    empty have no loops. A warning says if the odometry contradicts most of the loops.
 
     Arguments:
       recording: The scans.
@@ -129,8 +127,8 @@ def find_loops(
       registered: Register the full scans of each loop in 6 degrees of freedom. Loops with little overlap
         are rejected. None registers scans, not images.
       scale: Factor for all lengths during the search, 1, 2 or 4, for places that are small in an image, such as rooms.
-        Results are in metres. Of the settings, `near_m`, `keyframe_m` and `drift` are in metres, and the other lengths
-        are those of the scaled scans.
+        Results are in metres. Of the settings, `keyframe_m` and `drift` are in metres, and the other lengths are those
+        of the scaled scans.
       on_bad_scan: Called with id and error of a scan that cannot be read. The scan is skipped and the other frames keep
         their numbers. Without it the error is raised.
       kept_in: Checkpoint directory. If recording, odometry, weights and settings are the same, the search resumes from
@@ -230,8 +228,6 @@ def _acceptance(detector: LoopDetector) -> str | None:
 
 def prepared(recording: Recording, odometry: ArrayLike | None, config: DetectorConfig, *, registered: bool) -> Search:
     """Check recording and odometry before any work. Return the odometry as an array, and gravity of scans by it."""
-    if recording.times is not None and (doubted := doubt(recording.times)):
-        warn(f"{recording.name}: expected times in seconds, found {doubted}; 30 s decide which frames are recent")
     poses = None if odometry is None else given_poses(odometry, of="odometry")
     if poses is not None and len(poses) != len(recording):
         raise ValueError(
@@ -281,13 +277,12 @@ def _accepted(
     """Joint acceptance of the loops of a detector. Returns accepted and rejected loops, and warns of wrong odometry."""
     config = detector.config
     loops, rejected = settled(
-        recording, detector.supported, odometry, config, registered=registered, should_stop=should_stop
+        recording, detector.loops, odometry, config, registered=registered, should_stop=should_stop
     )
-    supported = {loop.query for loop in detector.supported}  # `settled` accepted or rejected these
-    rejected = _in_order([*rejected, *(one for one in detector.rejected if one.loop.query not in supported)])
+    rejected = _in_order([*rejected, *detector.rejected, *detector.undecided()])
     if odometry is not None:
         name, mounting = recording.name, mountings_of(recording)
-        check_odometry(name, detector.by_scans, loops, rejected, odometry, config, mounting=mounting, scale=scale)
+        check_odometry(name, loops, rejected, odometry, config, mounting=mounting, scale=scale)
     return tuple(loops), rejected
 
 

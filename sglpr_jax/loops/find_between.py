@@ -245,13 +245,16 @@ def between_searches(
 ) -> FoundBetween:
     """Loops and transforms between two recordings, numbers `match` and `query` of the finished searches."""
     found, finders = zip(*(searches[number] for number in (match, query)), strict=True)
-    candidates = candidates_between(finders[1], finders[0], should_stop=should_stop, on_progress=on_progress)
-    motion, offset = Motion.joined([finder.motion for finder in finders]), len(finders[0])
-    model = found[0].model
+    levels = [finder.motion.path.level(finder.mountings) for finder in finders]
+    motion, offset = Motion.joined([finder.motion for finder in finders], levels), len(finders[0])
+    steps = {"should_stop": should_stop, "on_progress": on_progress}
+    candidates = candidates_between(finders[1], finders[0], motion, **steps)
+    model, drift = found[0].model, finders[1].present_drift
     assert model is not None  # the searches have one
-    probable, rejected = probable_loops(candidates, model, motion, offset=offset, config=config)
+    knows_height = all(finder.knows_height for finder in finders)
+    rules = {"drift": drift, "knows_height": knows_height, "config": config}
+    probable, rejected = probable_loops(candidates, model, motion, **rules)
     joined = _joined(found, motion)
-    drift = config.motion_drift if found[0].odometry is None else config.drift
     sets, contradicting = accepted_between(probable, joined, drift=drift, config=config.consistency)
     aligned, loops = [], []
     for upright in sets:

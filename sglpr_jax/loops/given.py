@@ -7,17 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.record import Record
-from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.files import in_short
 from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
 
 MOST_COLUMNS = 8
 """Maximum number of columns of an array of points (x, y, z, intensity and further fields). Wider arrays are images."""
-
-DATES = (datetime.datetime, datetime.timedelta, np.datetime64, np.timedelta64)
-"""Types of times that have a unit."""
 
 
 def check_is(value: Any, kind: type, *, by: str) -> None:
@@ -63,19 +58,19 @@ def given_poses(poses: Any, *, of: str) -> Float[np.ndarray, "n 4 4"]:
     return values
 
 
-def given_time(time: Any, *, unit: TimeUnit = "auto") -> float | None:
-    """Convert a time in this unit, or a date, to seconds. Returns None for None."""
+def given_time(time: Any) -> float | None:
+    """Convert a time to a number, and a date to seconds. Returns None for None."""
     if time is None:
         return None
     if isinstance(time, datetime.datetime):
         time = np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None))
     try:
         if isinstance(time, np.datetime64):
-            return given_time(time - np.datetime64(0, "s"), unit=unit)
+            return given_time(time - np.datetime64(0, "s"))
         if isinstance(time, np.timedelta64 | datetime.timedelta):
             seconds = float(np.timedelta64(time) / np.timedelta64(1, "s"))
         else:
-            seconds = float(time) / PER_SECOND[unit]
+            seconds = float(time)
     except (TypeError, ValueError) as error:
         raise TypeError(f"expected a time in seconds, found {_said(time)}") from error
     if not np.isfinite(seconds):

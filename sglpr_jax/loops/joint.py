@@ -1,7 +1,7 @@
 """Joint acceptance of the loops of a whole drive, given the odometry and the full scans."""
 
 import dataclasses
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -70,7 +70,6 @@ def stretches(
 
 def check_odometry(
     name: str,
-    by_scans: Collection[int],
     loops: Sequence[Loop],
     rejected: Sequence[Rejected],
     odometry: Float[np.ndarray, "n 4 4"],
@@ -84,7 +83,6 @@ def check_odometry(
 
     Arguments:
       name: Name of the recording.
-      by_scans: Frames whose scans alone support a loop.
       loops: Accepted loops.
       rejected: Rejected loops.
       odometry: Pose of the LiDAR at each frame.
@@ -93,16 +91,13 @@ def check_odometry(
       scale: Factor by which loops, odometry and settings were multiplied.
     """
     against = [one.loop for one in rejected if one.reason == "contradicts the odometry"]
-    agreeing = {one.query for one in loops} | {one.loop.query for one in rejected} - {one.query for one in against}
-    frames = set(by_scans) | {loop.query for loop in against} | agreeing
-    contrary = len(frames - agreeing)
-    if contrary < FEWEST_AGAINST or 2 * contrary <= len(frames):
+    agreeing = {one.query for one in loops}
+    contrary = {one.query for one in against} - agreeing
+    frames = contrary | agreeing
+    if len(contrary) < FEWEST_AGAINST or 2 * len(contrary) <= len(frames):
         return
-    said = (
-        f"{name}: the odometry contradicts the loops of {contrary} of {len(frames)} frames; these loops are rejected."
-    )
-    if against:
-        said += f" {_readings(against, odometry, config, mounting, scale)}"
+    said = f"{name}: the odometry contradicts the loops of {len(contrary)} of {len(frames)} frames, which are rejected."
+    said += f" {_readings(against, odometry, config, mounting, scale)}"
     warn(f"{said} Check also that the poses belong to these scans and use these axes: {AXES}")
 
 

@@ -14,6 +14,7 @@ from sglpr_jax.loops.upright import lidar_pose
 from sglpr_jax.loops.verification import Alignment
 
 Reason = Literal[
+    "little similarity",
     "repeats",
     "too few neighbours",
     "contradicts the motion",
@@ -30,6 +31,8 @@ position, and an increase per metre between them. They hold for vehicles, in sim
 KITTI."""
 GROUND_HEIGHT_PER_M, GROUND_TILT_DEG_PER_M = 0.008, 0.03
 """Increase of these standard deviations per metre between two scans whose mountings were estimated from the scans."""
+UNKNOWN_HEIGHT_M = 10.0
+"""Standard deviation of the height of a loop if nothing measures height: the scans may be on two storeys."""
 DEGENERATE_M = 1.0
 """Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
 
@@ -142,6 +145,7 @@ def planar_loop(
     alignment: Alignment,
     *,
     probability: float,
+    knows_height: bool = True,
     query_mounting: Mounting | None = None,
     match_mounting: Mounting | None = None,
 ) -> Loop:
@@ -152,11 +156,13 @@ def planar_loop(
       match: Frame of the match.
       alignment: Pose of the query's image in the match's image, and its covariance.
       probability: Probability that both frames show one place.
+      knows_height: Whether the odometry measures height. If not, the storey is unknown.
       query_mounting: Mounting of the query's sensor. Its points were gravity-aligned for the image.
       match_mounting: Mounting of the match's sensor.
     """
     upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
     covariance = unseen_covariance(upright, query_mounting, match_mounting)
+    covariance[2, 2] += 0.0 if knows_height else UNKNOWN_HEIGHT_M**2
     seen = np.array([0, 1, 5])
     to_query = np.eye(3)
     to_query[:2, :2] = upright[:2, :2].T  # the alignment's covariance is in the match's frame

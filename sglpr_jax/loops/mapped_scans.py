@@ -17,6 +17,7 @@ from sglpr_jax.data.scan_stream import OnBadScan
 from sglpr_jax.loops.add_scans import add_scans
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.choices import SPACING_M
+from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.given import given_poses
 from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.place_names import place_names
@@ -71,7 +72,7 @@ def map_scans(
 
     def add(seen: Seen | None, compared: Compared | None) -> None:
         seen_scans.append(seen)
-        finder.add_seen(seen, compared=Compared([], None))
+        finder.add_seen(seen, compared=Compared(NO_FITS, None))
 
     add_scans(
         scaled(recording, scale),

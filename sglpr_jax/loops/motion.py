@@ -1,12 +1,13 @@
 """Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
 
-The test for repeating places needs to know which earlier scans resemble the query because they show the same place. The
-motion is accurate enough for this purpose over some tens of metres. It does not replace odometry. Where the
-surroundings do not show how the sensor moved, as in a tunnel, the motion is unknown and a new segment begins. Its pose
-is extrapolated at the last known velocity, and its drift grows fast.
+The decision about a loop needs to know which scans show other places. The motion is accurate enough for this purpose
+over some hundred metres. It does not replace odometry. Where the surroundings do not show how the sensor moved, as in a
+tunnel, the motion is unknown and a new segment begins. Its pose is extrapolated at the last known velocity, and its
+drift grows fast. Only ratios of times count, so a drive at another speed has the same motion.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,13 +16,13 @@ from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import MotionConfig
 from sglpr_jax.loops.driven_path import DrivenPath
 from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.transforms import inverse, transform, travelled, yaw_of
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
 UNKNOWN_M = 1e6
 """Length of measured path with the same drift as an unknown motion, in metres: the sensor may be anywhere."""
-NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8"), ("clock", "f8")]
+NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8")]
 """Numbers of a frame beside its pose."""
 
 
@@ -35,22 +36,39 @@ class Motion:
         """Planar poses of all added frames or, with odometry, its gravity-aligned poses."""
         self._numbers = GrowingArray(np.empty(0, NUMBERS))
         self._coasted = 0
-        self._m_per_s = 0.0
-        """Last known forward speed, in metres per second."""
+        self._m_per_s: float | None = None
+        """Last known forward speed, in metres per second. None while it was never known."""
 
     def __len__(self) -> int:
         return len(self.path)
 
     @classmethod
-    def joined(cls, motions: "Sequence[Motion]") -> "Motion":
-        """Motion of several recordings, one after the other. Poses between two recordings are unknown."""
+    def of(cls, poses: Float[np.ndarray, "n 4 4"]) -> "Motion":
+        """Motion along known poses, such as those of the places of a map."""
+        found, numbers = cls(), np.zeros(len(poses), NUMBERS)
+        numbers["travelled"] = travelled(poses) if len(poses) else 0.0
+        found._numbers.extend(numbers)
+        found.path.extend(poses, np.zeros(len(poses)))
+        return found
+
+    @classmethod
+    def joined(cls, motions: "Sequence[Motion]", levels: Sequence[Float[np.ndarray, "3 3"]]) -> "Motion":
+        """Motion of several recordings, one after the other, in worlds whose z axes point up.
+
+        Poses between two recordings are unknown.
+
+        Arguments:
+          motions: Motions of the recordings.
+          levels: Rotations that make the z axes of their worlds point up (`DrivenPath.level`).
+        """
         found = cls()
-        for one in motions:
+        for one, level in zip(motions, levels, strict=True):
             numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
-            for name in ("segment", "travelled", "guessed_m", "clock") if len(last) else ():
+            numbers["guessed_m"] += UNKNOWN_M * len(last)
+            for name in ("segment", "travelled", "guessed_m") if len(last) else ():
                 numbers[name] += last[name] + (name == "segment")
             found._numbers.extend(numbers)
-            found.path.extend(one.poses, numbers["guessed_m"])
+            found.path.extend(one.path.leveled(np.arange(len(one)), level), numbers["guessed_m"])
         return found
 
     @property
@@ -74,11 +92,6 @@ class Motion:
         return self._numbers.rows["guessed_m"]
 
     @property
-    def clock(self) -> Float[np.ndarray, " n"]:
-        """Time at each frame without the time in which the sensor stood still, in seconds."""
-        return self._numbers.rows["clock"]
-
-    @property
     def nbytes(self) -> int:
         """Number of bytes that the arrays hold."""
         return self.path.nbytes + self._numbers.nbytes
@@ -98,41 +111,38 @@ class Motion:
         if len(self) and not continues:
             return self._begin(time, self.poses[-1] if pose is None else pose)
         key, coasts = self.keyframe, False
-        if (
-            pose is None
-            and link is not None
-            and self._is_trusted(link, expected=bool(np.isfinite(self.prior(time)).all()))
-        ):
+        if pose is None and link is not None and self.is_trusted(link, self.prior(time, key)):
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < self.config.max_coasting:
             pose, coasts = self._expected(time), True
         self._coasted = self._coasted + 1 if coasts else 0
         if not len(self):
-            self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, clock=0.0, guessed_m=0.0)
+            self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, guessed_m=0.0)
         elif pose is None:
             self._guess(time)
         else:
             moved, rotation = self.moved(key, pose)
-            clock = self.clock[key] + min(time - self._times[key], self.config.standing_s)
             travelled = self.travelled[key] + moved
             guessed_m = self._drifted_m(time) if coasts else self.guessed_m[key]
-            self._append(
-                time, pose, segment=int(self.segments[key]), travelled=travelled, clock=clock, guessed_m=guessed_m
-            )
-            if moved <= self.config.keyframe_m and rotation <= np.radians(self.config.keyframe_deg) and not coasts:
+            self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
+            if not self._is_far(moved, rotation) and not coasts:
                 return
         self.keyframe = len(self) - 1
 
-    def link(self, anywhere: Peak, expected: Peak) -> Peak:
-        """Choose between the best peak over the keyframe, if it is accepted, and the best peak near the prior."""
-        return anywhere if self._is_trusted(anywhere, expected=False) else expected
+    def is_next_keyframe(self, link: Peak) -> bool:
+        """Whether a frame with this pose in the frame of the keyframe is far enough to become the next keyframe."""
+        yaw = float(link.yaw)
+        return self._is_far(float(np.hypot(link.x, link.y)), abs((yaw + np.pi) % (2 * np.pi) - np.pi))
 
-    def prior(self, time: float) -> Float[np.ndarray, " 3"]:
-        """Expected x, y and yaw in the frame of the keyframe, at constant velocity. NaN if unknown."""
+    def _is_far(self, metres: float, radians: float) -> bool:
+        return metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg)
+
+    def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
+        """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
         expected = self._expected(time)
         if expected is None:
             return np.full(3, np.nan)
-        moved = inverse(self.poses[self.keyframe]) @ expected
+        moved = inverse(self.poses[frame]) @ expected
         return np.array([moved[0, 3], moved[1, 3], yaw_of(moved)])
 
     def _expected(self, time: float) -> Float[np.ndarray, "4 4"] | None:
@@ -152,23 +162,30 @@ class Motion:
             self._m_per_s = float(step[0, 3]) / (self._times[-1] - self._times[-2])
         self._append(
             time,
-            self.poses[-1] @ transform(self._m_per_s * seconds, 0.0, 0.0),
+            self.poses[-1] @ transform((self._m_per_s or 0.0) * seconds, 0.0, 0.0),
             segment=int(self.segments[-1]) + 1,
             travelled=self.travelled[-1],
-            clock=self.clock[-1] + seconds,
             guessed_m=self._drifted_m(time),
         )
 
     def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
         """Add the first frame after an unknown motion."""
-        clock = self.clock[-1] + time - self._times[-1]
         segment, guessed_m = int(self.segments[-1]) + 1, self.guessed_m[-1] + UNKNOWN_M
-        self._append(time, pose, segment=segment, travelled=self.travelled[-1], clock=clock, guessed_m=guessed_m)
-        self._coasted, self._m_per_s, self.keyframe = 0, 0.0, len(self) - 1
+        self._append(time, pose, segment=segment, travelled=self.travelled[-1], guessed_m=guessed_m)
+        self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
 
     def _drifted_m(self, time: float) -> float:
         """Next value of `guessed_m`, if the motion since the last frame is a guess."""
-        return self.guessed_m[-1] + self.config.guess_m_per_s * (time - self._times[-1])
+        config, step_m = self.config, self.config.unknown_step_m
+        if len(self) > 1 and self.segments[-1] == self.segments[-2]:
+            step_m = self._last_step_m
+        elif self._m_per_s is not None:
+            step_m = abs(self._m_per_s) * (time - self._times[-1])
+        return self.guessed_m[-1] + config.guess_factor * max(step_m, config.least_step_m)
+
+    @property
+    def _last_step_m(self) -> float:
+        return self.moved(len(self) - 2, self.poses[-1])[0] if len(self) > 1 else 0.0
 
     def _append(
         self,
@@ -177,37 +194,36 @@ class Motion:
         *,
         segment: int,
         travelled: float,
-        clock: float,
         guessed_m: float,
     ) -> None:
         self.path.add(pose, guessed_m=guessed_m)
-        self._numbers.append((time, segment, travelled, guessed_m, clock))
+        self._numbers.append((time, segment, travelled, guessed_m))
 
     @property
     def _times(self) -> Float[np.ndarray, " n"]:
         return self._numbers.rows["time"]
 
-    def from_frame(self, frame: int, rows: np.ndarray) -> tuple[Float[np.ndarray, "k 4 4"], Bool[np.ndarray, " k"]]:
-        """Poses of `frame` in the frames of `rows`, and whether each is known."""
-        return inverse(self.poses[rows]) @ self.poses[frame], self.same(frame, rows)
-
-    def about(self, frame: int, seconds: float, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
-        """Whether each of `rows` is less than `seconds` before or after `frame`, without standing time."""
-        return np.abs(self.clock[rows] - self.clock[frame]) < seconds
+    def way_m(self, frames: Any) -> Any:
+        """Travelled distance at one or more frames, in metres, with the guessed motion."""
+        return self.travelled[frames] + self.guessed_m[frames] / self.config.guess_factor
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return self.segments[rows] == self.segments[frame]
 
-    def near_last(self, travelled_m: float, rows: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
-        """Whether each of `rows` is known to be less than `travelled_m` (metres) before the last frame."""
-        if not len(self):
-            return np.zeros(0, bool)
-        return self.same(-1, rows) & (self.travelled[-1] - self.travelled[rows] < travelled_m)
+    def is_trusted(self, link: Peak, prior: Float[np.ndarray, " 3"]) -> bool:
+        """Whether a link shows how the sensor moved: no other pose, and no pose along a ridge, fits about as well.
 
-    def _is_trusted(self, link: Peak, *, expected: bool) -> bool:
+        A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
+        """
         best, config = float(link.correlation), self.config
-        most = config.max_second_expected if expected else config.max_second
+        apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
+        turned = abs((float(link.yaw) - prior[2] + np.pi) % (2 * np.pi) - np.pi)
+        most = config.max_second
+        if apart > config.max_jump * self._last_step_m + 1.0:
+            most = config.max_second_of_jump
+        elif apart <= config.expected_m and turned <= np.radians(config.expected_deg):
+            most = config.max_second_expected
         fits = best >= config.min_correlation and float(link.second) <= most * best
         return fits and float(link.ridge) <= config.max_ridge * best
 

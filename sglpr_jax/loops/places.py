@@ -1,12 +1,12 @@
 """Maps of places for relocalisation: an index of descriptors, with an image and a pose for each place."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int, UInt8
+from jaxtyping import Bool, Complex64, Float, Float32, Int, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.choices import Scale
@@ -18,26 +18,29 @@ from sglpr_jax.data.scaled import scaled_poses, scaled_record
 from sglpr_jax.fields import check_value
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.choices import CANDIDATES, SPACING_M, PlaceCount
-from sglpr_jax.loops.compared_image import occupied, within_reach
-from sglpr_jax.loops.config import CandidateConfig, RivalConfig
+from sglpr_jax.loops.compared_image import within_reach
+from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
 from sglpr_jax.loops.given import check_is, given_record
 from sglpr_jax.loops.loop import planar_loop
 from sglpr_jax.loops.mapped_scans import map_scans
+from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import upright_from_lidar
 from sglpr_jax.loops.place_file import REQUIRED, read_places, write_places
 from sglpr_jax.loops.place_names import Content, free_names
-from sglpr_jax.loops.pose_search import Peak, search_spectra
-from sglpr_jax.loops.probability import Evidence, LoopModel, default_model
+from sglpr_jax.loops.probability import LoopModel, default_model
 from sglpr_jax.loops.relocated import Relocated, with_shared_probability
-from sglpr_jax.loops.rivals import MAP_RIVALS, distance_share, rival_places, rival_share
 from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.shortlist import coarse_correlations
-from sglpr_jax.loops.spectra import match_spectra, query_spectra
-from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.verification import refined
+from sglpr_jax.loops.spectra import query_spectra
+from sglpr_jax.loops.stored_scans import image_spectrum
+from sglpr_jax.loops.transforms import inverse
 from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.retrieval.index_rows import check_scale
+from sglpr_jax.retrieval.index_rows import check_scale, check_weights
+
+NO_DRIFT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0, height_per_metre=0.0)
+"""Drift of the poses of a map."""
+NO_LOOPS = np.zeros((0, 2), np.int64)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -197,23 +200,49 @@ class PlaceMap:
           model: Model of the probabilities, by default the one shipped for the weights.
           candidates: Maximum number of poses.
         """
+        check_weights(self.index.weights_hash, weights_hash)
         image = seen.image
         if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
             raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
-        exclude = np.full(len(self), np.count_nonzero(image) < CandidateConfig().min_cells)
-        nearest = max(candidates, CandidateConfig().further)
-        found = self.index.query(seen.descriptor, nearest, exclude=exclude, weights_hash=weights_hash)
-        rows, distances = (values[found.rows >= 0] for values in found)
-        if not len(rows):
+        if not len(self) or np.count_nonzero(image) < CandidateConfig().min_cells:
             return []
-        model = default_model(self.index.weights_hash) if model is None else model
-        spectra, scaled_map = query_spectra(image), self._scaled()
-        chosen, peaks = self._compared(spectra, rows, candidates)
-        answers = [
-            scaled_map._answer(seen, spectra, int(rows[k]), float(distances[k]), peaks.one(i), model)
-            for i, k in enumerate(chosen.tolist())
-        ]
-        return [one.divided(self.scale) for one in with_shared_probability(answers)[:candidates]]
+        model, scaled_map = default_model() if model is None else model, self._scaled()
+        config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
+        query = Query(len(self), seen.descriptor, image, query_spectra(image))
+        comparer = Comparer(scaled_map._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
+        fits = comparer.compare(query, scaled_map)
+        best = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")[:candidates].tolist()
+        found = [comparer.candidate(query, fits, row, self.image) for row in best]
+        answers = [scaled_map._answer(one, seen, float(model.probability(one.evidence))) for one in found]
+        return [one.divided(self.scale) for one in with_shared_probability(answers)]
+
+    @property
+    def frames(self) -> Int[np.ndarray, " n"]:
+        """Number of each place."""
+        return np.arange(len(self))
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        """Up to k (0 or more) places with the nearest descriptors among those with a flag, nearest first."""
+        rows = self.index.query(descriptor, k, exclude=~among).rows if k else np.zeros(0, np.int64)
+        return rows[rows >= 0]
+
+    def image(self, row: int) -> UInt8[np.ndarray, "h h"]:
+        """Image of a place."""
+        return self.images[row]
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        """Spectrum of each place's image (`match_spectra`)."""
+        return [image_spectrum(self.images[row], VerificationConfig()) for row in rows.tolist()]
+
+    @functools.cached_property
+    def _motion(self) -> Motion:
+        """Poses of the places, and a last frame of unknown pose for queries. The world is level."""
+        uprights = np.array([upright_from_lidar(self.mounting(row)) for row in range(len(self))]).reshape(-1, 4, 4)
+        found = Motion.of(self.world_from_place @ inverse(uprights))
+        found.add(0.0, continues=False)
+        return found
 
     def seen(self, row: int) -> Seen:
         """Description of the scaled scan at a place."""
@@ -270,50 +299,8 @@ class PlaceMap:
         for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
             yield descriptor.tobytes(), pose.tobytes()
 
-    def _compared(
-        self, spectra: Complex[Array, "2 s t f"], rows: Int[np.ndarray, " n"], count: int
-    ) -> tuple[Int[np.ndarray, " k"], Peak]:
-        """Indices of the compared places in `rows`, the nearest first, and their peaks. If none of the first `count`
-        fits well, as many others are chosen by a coarse comparison."""
-        first, others = np.arange(len(rows))[:count], np.arange(len(rows))[count:]
-        matches = match_spectra(self.images[rows])
-        peaks = jax.device_get(search_spectra(spectra, matches[:count]))
-        if not len(others) or peaks.correlation.max() >= CandidateConfig().good_correlation:
-            return first, peaks
-        more = others[np.argsort(-np.asarray(coarse_correlations(spectra, matches[count:])), kind="stable")[:count]]
-        found = jax.device_get(search_spectra(spectra, matches[more]))
-        return np.concatenate([first, more]), Peak(*map(np.concatenate, zip(peaks, found, strict=True)))
-
-    def _answer(
-        self, seen: Seen, spectra: Complex[Array, "2 s t f"], row: int, distance: float, peak: Peak, model: LoopModel
-    ) -> Relocated:
-        """Pose of a query by the place `row`."""
-        alignment = jax.device_get(refined(seen.image, self.images[row], peak))
-        shares = self._rival_shares(seen.descriptor, spectra, row, distance, peak)
-        cells = min(occupied(seen.image), occupied(self.images[row]))
-        evidence = Evidence.of(distance, shares[0], alignment.correlation, alignment.second, shares[1], cells)
-        mountings = {"query_mounting": seen.mounting, "match_mounting": self.mounting(row)}
-        probability = float(model.probability(evidence))
-        loop = planar_loop(len(self), row, alignment, probability=probability, **mountings)
-        return Relocated(self.index.ids[row], self.world_from_place[row] @ loop.match_from_query, loop)
-
-    def _rival_shares(
-        self,
-        descriptor: Float[np.ndarray, " d"],
-        spectra: Complex[Array, "2 s t f"],
-        match: int,
-        distance: float,
-        peak: Peak,
-    ) -> tuple[float, float]:
-        """`distance_share` and `rival_share` of a match, with other places of the map as rivals."""
-        apart = np.linalg.norm(self.index.descriptors - descriptor, axis=1)
-        rows = rival_places(apart, self.world_from_place[:, :3, 3], match)
-        if peak.correlation < CandidateConfig().min_correlation or not len(rows):
-            return np.nan, np.nan
-        rivals = match_spectra(self.images[np.resize(rows, MAP_RIVALS)])
-        found = jax.device_get(search_spectra(spectra, rivals)).some(slice(len(rows)))
-        of_place = np.array([upright_from_lidar(self.mounting(row)) for row in (match, *rows.tolist())])
-        upright = self.world_from_place[[match, *rows.tolist()]] @ inverse(of_place)
-        query = upright[0] @ transform(float(peak.x), float(peak.y), float(peak.yaw))
-        expected = [(inverse(upright[1:]) @ query, np.full(len(rows), RivalConfig().agree_m))]
-        return distance_share(distance, apart[rows], expected), rival_share(found, float(peak.correlation), expected)
+    def _answer(self, one: Candidate, seen: Seen, probability: float) -> Relocated:
+        """Pose of a query by a place."""
+        mountings = {"query_mounting": seen.mounting, "match_mounting": self.mounting(one.match)}
+        loop = planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
+        return Relocated(self.index.ids[one.match], self.world_from_place[one.match] @ loop.match_from_query, loop)

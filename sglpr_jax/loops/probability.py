@@ -1,7 +1,7 @@
-"""Probability that two scans show one place: a monotone additive model of retrieval, comparison and repetition.
+"""Probability that two scans show one place: a monotone additive model of the evidence.
 
 The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. The functions are monotone and
-bounded. Therefore a perfect fit of descriptors and images cannot outweigh other places that fit as well.
+bounded. Therefore a perfect fit of the images cannot outweigh other places that fit as well.
 """
 
 import dataclasses
@@ -15,46 +15,37 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-DEFAULTS = Path(__file__).with_name("probability.json")
-"""File of models fitted in the simulator, by the hash of the weights. "" is the model for all other weights. See
-docs/decisions/loops.md."""
+DEFAULT = Path(__file__).with_name("probability.json")
+"""File of the model fitted in the simulator. See docs/decisions/loops.md."""
 KNOTS: Mapping[str, tuple[float, ...]] = {
-    "distance": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
-    "distance_share": (0.3, 0.5, 0.7, 0.9, 1.1),
-    "correlation": (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
-    "second": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
-    "rival": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
-    "cells": (100.0, 200.0, 400.0, 800.0, 1200.0, 1600.0),
+    "peak_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    "ambiguity_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    "deviation": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0),
+    "surprise": (0.0, 1.0, 2.0, 3.0, 4.0, 6.0),
 }
 """Knots of the piecewise linear functions. Outside the knots they are constant."""
-RISING = ("correlation", "cells")
+RISING = ("surprise",)
 """Fields whose functions rise. The other functions fall."""
 RIDGE = 0.02
 """Weight of the penalty on squared steps between knots. It keeps the functions finite and smooth."""
 
 
 class Evidence(NamedTuple):
-    """Evidence for pairs of scans, one number of each kind for each pair."""
+    """Evidence for pairs of scans, one number of each kind for each pair (`Comparer`)."""
 
-    distance: Float[np.ndarray, "*n"]
-    """Distance between the descriptors."""
-    distance_share: Float[np.ndarray, "*n"]
-    """Descriptor distance divided by the distance to the nearest rival (`loops.rivals`). NaN without rivals."""
-    correlation: Float[np.ndarray, "*n"]
-    """Correlation of the images."""
-    second: Float[np.ndarray, "*n"]
-    """Second-peak ratio of the correlation."""
-    rival: Float[np.ndarray, "*n"]
-    """Correlation with the best rival, divided by the correlation with the match. NaN without rivals."""
-    cells: Float[np.ndarray, "*n"]
-    """Number of occupied cells of the image that has fewer. Images of few walls fit many places."""
+    peak_ratio: Float[np.ndarray, "*n"]
+    """Correlation at the second-best pose of the two images, divided by that at the best pose."""
+    ambiguity_ratio: Float[np.ndarray, "*n"]
+    """Correlation with the best other place, divided by the correlation with the match."""
+    deviation: Float[np.ndarray, "*n"]
+    """Deviation of the pose from the motion, in standard deviations."""
+    surprise: Float[np.ndarray, "*n"]
+    """Logarithm of the searched poses over those that the motion allows. 0 if the motion says nothing."""
 
     @classmethod
-    def of(
-        cls, distance: float, distance_share: float, correlation: Any, second: Any, rival: float, cells: float
-    ) -> "Evidence":
+    def of(cls, peak_ratio: Any, ambiguity_ratio: Any, deviation: Any, surprise: Any) -> "Evidence":
         """Create the evidence of one pair."""
-        values = (distance, distance_share, correlation, second, rival, cells)
+        values = (peak_ratio, ambiguity_ratio, deviation, surprise)
         return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
@@ -64,11 +55,8 @@ class Evidence(NamedTuple):
 
 
 ALL = Evidence._fields
-OF_IMAGES = ("correlation", "second", "rival", "cells")
-"""Fields that do not depend on the weights of the descriptors."""
-
-OF_REPETITION = ("distance_share", "second", "rival")
-"""Fields that compare the match with other poses and places."""
+OF_PAIR = ("peak_ratio", "ambiguity_ratio")
+"""Fields that count for each of several neighbouring pairs. The motion between two passes is common to all of them."""
 
 
 class Curve(NamedTuple):
@@ -78,8 +66,8 @@ class Curve(NamedTuple):
     values: tuple[float, ...]
 
     def __call__(self, numbers: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Evaluate the function. NaN gets the lowest value."""
-        return np.where(np.isnan(numbers), min(self.values), np.interp(numbers, self.knots, self.values))
+        """Evaluate the function."""
+        return np.interp(numbers, self.knots, self.values)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,11 +93,16 @@ class LoopModel:
         values = evidence._asdict()
         return {name: curve(np.asarray(values[name], np.float64)) for name, curve in self.curves.items()}
 
-    def but_for_repetition(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
+    def log_odds_without_ambiguity(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """Log odds if no other pose and place fitted as well as the match."""
         parts = self.contributions(evidence)
-        best = {name: max(self.curves[name].values) for name in OF_REPETITION if name in parts}
+        best = {name: max(self.curves[name].values) for name in OF_PAIR if name in parts}
         return np.asarray(self.bias + sum((parts | best).values()))
+
+    def log_odds_of_images(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
+        """Log odds if the motion says nothing: a pose of one standard deviation, without surprise."""
+        nothing = {"deviation": np.ones_like(evidence.deviation), "surprise": np.zeros_like(evidence.surprise)}
+        return self.log_odds(evidence._replace(**nothing))
 
     def to_json(self) -> dict[str, Any]:
         """Convert to a JSON value for `from_json`."""
@@ -190,7 +183,7 @@ def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k
     """
     knots = np.array(KNOTS[name])
     made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
-    return np.nan_to_num(made if name in RISING else 1 - made, nan=0.0)
+    return made if name in RISING else 1 - made
 
 
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
@@ -212,13 +205,8 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
     return LoopModel(curves, float(gain * model.bias + shift), made_with)
 
 
-def default_model(weights_hash: str, *, path: Path = DEFAULTS) -> LoopModel:
-    """Return the model shipped for these weights. For other weights it is a model that uses only the images."""
-    return models(path).get(weights_hash) or models(path)[""]
-
-
-def models(path: Path) -> dict[str, LoopModel]:
-    """Read models by the hash of their weights from a JSON file.
+def default_model(path: Path = DEFAULT) -> LoopModel:
+    """Read the shipped model, or that of another file.
 
     Raises:
       FileNotFoundError: If the file does not exist.
@@ -228,6 +216,4 @@ def models(path: Path) -> dict[str, LoopModel]:
         found = json.loads(path.read_text())
     except ValueError as error:
         raise ValueError(f"{path}: expected JSON ({error})") from error
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: expected models by the hash of their weights, found {type(found).__name__}")
-    return {name: LoopModel.from_json(value, source=str(path)) for name, value in found.items()}
+    return LoopModel.from_json(found, source=str(path))

@@ -34,7 +34,6 @@ def scaled_config(config: DetectorConfig, scale: Scale) -> DetectorConfig:
     """Settings for scaled scans. Settings that do not belong to the images are in real metres, and are scaled."""
     return dataclasses.replace(
         config,
-        near_m=config.near_m * scale,
         keyframe_m=config.keyframe_m * scale,
         drift=scaled_drift(config.drift, float(scale)),
     )

@@ -1,93 +1,103 @@
-"""Sequential test: the log odds of neighbouring frames are added or subtracted.
+"""Sequential test: the evidence of neighbouring frames is added or subtracted.
 
-The log odds of neighbouring frames are added if their matches move as their queries do, and subtracted if they match
+The log odds of neighbouring pairs are added if their matches move as their queries do, and subtracted if they match
 elsewhere. Neighbours that see the same walls are not independent, so the weight of a frame depends on the distance
-travelled since the previous one.
+travelled since the previous one. The motion between the two passes is common to all neighbours, and counts once.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import logit
 
-from sglpr_jax.loops.config import SequenceConfig
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.config import ConsistencyConfig, DriftModel, SequenceConfig
+from sglpr_jax.loops.consistency import agree_along
+from sglpr_jax.loops.driven_path import DrivenPath
+from sglpr_jax.loops.loop import Loop, Reason
 from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.planar import Planar, compose, frames_of, inverted, planar, planar_loops, wrapped
+from sglpr_jax.loops.probability import Evidence, LoopModel
+
+BLOCK = 64
+"""Number of pairs that are tested at a time, to limit memory."""
 
 
-def agree_in_order(loops: Sequence[Loop], *, config: SequenceConfig = SequenceConfig()) -> Bool[np.ndarray, "n n"]:
-    """Whether each pair of loops agrees by frame numbers: the match moves as the query does, in either direction."""
-    query, match = frames_of(loops)
-    on = np.abs(query[:, None] - query[None])
-    return np.abs(match[:, None] - match[None]) <= config.frames_a_frame * (on + 1)
+class Pair(NamedTuple):
+    """Two frames that may be a loop."""
+
+    loop: Loop
+    """The pair with its probability alone."""
+    evidence: Evidence
+    way_m: float
+    """Travelled distance at the query, in metres."""
 
 
-def agree_in_motion(
-    loops: Sequence[Loop], motion: Motion, mounting: AnyMounting, *, config: SequenceConfig = SequenceConfig()
-) -> Bool[np.ndarray, "n n"]:
-    """Whether each pair of loops agrees with the motion of the sensor and, if it is a guess, in frame numbers."""
-    query, match = frames_of(loops)
-    segment = motion.segments
-    known = segment[query][:, None] == segment[query][None]
-    known = known & (segment[match][:, None] == segment[match][None])
-    fitted, _ = planar_loops(loops, mounting)
-    poses = planar(motion.poses[np.concatenate([query, match])])
-    expected = _moved(fitted, poses[: len(loops)], poses[len(loops) :])
-    apart = compose(inverted(expected), np.broadcast_to(fitted[None], expected.shape))
-    length, guess = (
-        sum(np.abs(way[frames][:, None] - way[frames][None]) for frames in (query, match))
-        for way in (motion.travelled, motion.guessed_m)
-    )
-    metres = config.agree_m + config.agree_share * length + config.guess_share * guess
-    close = np.hypot(apart[..., 0], apart[..., 1]) <= metres
-    degrees = config.agree_deg + config.guess_deg_per_m * guess
-    close = close & (np.abs(wrapped(apart[..., 2])) <= np.radians(degrees))
-    return close & (known | agree_in_order(loops, config=config))
+def tested_log_odds(
+    pairs: Sequence[Pair],
+    model: LoopModel,
+    path: DrivenPath,
+    *,
+    mounting: AnyMounting,
+    drift: DriftModel,
+    consistency: ConsistencyConfig = ConsistencyConfig(),
+    config: SequenceConfig = SequenceConfig(),
+) -> Float[np.ndarray, " n"]:
+    """Log odds of pairs, given their neighbours and the motion.
 
-
-def _moved(fitted: Planar, query: Planar, match: Planar) -> Planar:
-    """Pose of each loop j predicted from loop i and the motion: (i, j) is match_j_from_query_j via loop i."""
-    query_from_query = compose(inverted(query)[:, None], query[None])
-    match_from_match = compose(inverted(match)[None], match[:, None])
-    return compose(match_from_match, compose(fitted[:, None], query_from_query))
+    Arguments:
+      pairs: Pairs in the order of their queries.
+      model: Model of the probabilities.
+      path: Path of all frames.
+      mounting: Mounting of the sensor, or that at each frame.
+      drift: Drift model of the path.
+      consistency: Thresholds of the agreement of two pairs.
+      config: Selection and weights of neighbours.
+    """
+    if not pairs:
+        return np.zeros(0)
+    evidence = Evidence.stack([one.evidence for one in pairs])
+    own, found = model.log_odds_of_images(evidence), np.empty(len(pairs))
+    loops, way_m = [one.loop for one in pairs], np.maximum.accumulate([one.way_m for one in pairs])
+    for start in range(0, len(pairs), BLOCK):
+        end = min(start + BLOCK, len(pairs))
+        first = int(np.searchsorted(way_m, way_m[start] - config.window_m))
+        last = int(np.searchsorted(way_m, way_m[end - 1] + config.window_m, side="right"))
+        options = {"mounting": mounting, "drift": drift, "config": consistency}
+        agreeing = agree_along(path, loops[start:end], loops[first:last], **options)
+        rows = np.arange(start, end) - first
+        found[start:end] = added_log_odds(own[first:last], agreeing, way_m[first:last], rows, config=config)
+    return model.log_odds(evidence) + found
 
 
 def added_log_odds(
-    loops: Sequence[Loop],
     log_odds: Float[np.ndarray, " n"],
-    agreeing: Bool[np.ndarray, "n n"],
-    motion: Motion,
+    agreeing: Bool[np.ndarray, "k n"],
+    way_m: Float[np.ndarray, " n"],
+    rows: np.ndarray,
     *,
     config: SequenceConfig = SequenceConfig(),
-) -> Float[np.ndarray, " n"]:
-    """Log odds of each loop, given its neighbours.
+) -> Float[np.ndarray, " k"]:
+    """Log odds that the neighbours of some pairs add to these.
 
     Arguments:
-      loops: Loops in the order of their queries.
-      log_odds: Log odds of each loop alone.
-      agreeing: Whether each pair of loops agrees.
-      motion: Motion of all frames.
+      log_odds: Log odds of each pair alone, without the motion.
+      agreeing: Whether each of `rows` agrees with each pair: their matches move as their queries do.
+      way_m: Travelled distance at each query, in metres, in increasing order.
+      rows: The k pairs whose log odds are computed.
       config: Selection and weights of neighbours.
     """
-    query, _ = frames_of(loops)
-    gaps = _gaps(query, motion, config)
-    counted = np.clip(log_odds - logit(config.least_probability), 0, config.max_log_odds)
-    fresh = 1 - np.exp(-gaps / config.independent_m)
-    towards = np.sign(np.arange(len(loops))[:, None] - np.arange(len(loops))[None])  # direction from j to i
-    weight = np.where(towards > 0, fresh[None, 1:], np.where(towards < 0, fresh[None, :-1], 0.0))
-    weight = weight * (np.abs(query[:, None] - query[None]) <= config.frames)
-    return log_odds + (np.where(agreeing, 1.0, -1.0) * weight) @ counted
+    counted = np.clip(log_odds, 0, config.max_log_odds)
+    fresh = 1 - np.exp(-np.concatenate([[0.0], np.diff(way_m), [0.0]]) / config.independent_m)
+    before = rows[:, None] > np.arange(len(way_m))[None]
+    weight = np.where(before, fresh[None, 1:], fresh[None, :-1]) * (rows[:, None] != np.arange(len(way_m))[None])
+    weight = weight * (np.abs(way_m[rows][:, None] - way_m[None]) <= config.window_m)
+    return (np.where(agreeing, 1.0, -1.0) * weight) @ counted
 
 
-def _gaps(query: np.ndarray, motion: Motion, config: SequenceConfig) -> Float[np.ndarray, " m"]:
-    """Distance travelled before each query, and after the last one. There is one more than queries."""
-    between = [
-        abs(motion.travelled[b] - motion.travelled[a])
-        if motion.segments[a] == motion.segments[b]
-        else config.unknown_m * (b - a)
-        for a, b in zip(query[:-1].tolist(), query[1:].tolist(), strict=True)
-    ]
-    return np.array([0.0, *between, 0.0])
+def verdict(pair: Pair, model: LoopModel, min_probability: float) -> Reason:
+    """Reason why a pair is no loop that the motion allows and the sequential test rejects."""
+    if float(model.log_odds(pair.evidence)) > 0:
+        return "too few neighbours"
+    repeats = float(model.log_odds_without_ambiguity(pair.evidence)) >= logit(min_probability)
+    return "repeats" if repeats else "little similarity"

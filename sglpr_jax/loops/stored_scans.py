@@ -1,10 +1,11 @@
 """Descriptors and images of the earlier scans that a query is compared with."""
 
+import copy
 import zlib
 from collections import OrderedDict
 
 import numpy as np
-from jaxtyping import Complex64, Float32, Int, UInt8
+from jaxtyping import Bool, Complex64, Float32, Int, UInt8
 
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import VerificationConfig
@@ -35,6 +36,7 @@ class StoredScans:
     ):
         """Start with an index without places. The limits are those of `DetectorConfig`."""
         self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
+        self._first = 0
         self._frames = GrowingArray(np.empty(0, np.int64))
         self._repeated = GrowingArray(np.empty(0, bool))
         """Whether each scan has a loop to a newer stored scan."""
@@ -49,7 +51,22 @@ class StoredScans:
     @property
     def frames(self) -> Int[np.ndarray, " n"]:
         """Frame number of each scan, in increasing order."""
-        return self._frames.rows
+        return self._frames.rows + self._first
+
+    def shifted(self, first: int) -> "StoredScans":
+        """The same scans with frame numbers that begin at `first`. The scans are shared."""
+        found = copy.copy(self)
+        found._first = first
+        return found
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        """Up to k (0 or more) scans with the nearest descriptors among those with a flag, nearest first."""
+        if not k:
+            return np.zeros(0, np.int64)
+        rows = self.index.query(descriptor, k, exclude=~among).rows
+        return rows[rows >= 0]
 
     @property
     def nbytes(self) -> int:
@@ -103,6 +120,10 @@ class StoredScans:
         """Image of a scan."""
         return np.frombuffer(zlib.decompress(self._packed[row]), np.uint8).reshape(self._shape)
 
+    def image_of(self, frame: int) -> UInt8[np.ndarray, "m m"]:
+        """Image of the scan of a frame."""
+        return self.image(int(np.searchsorted(self.frames, frame)))
+
     def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
         """Spectrum of each scan's image (`match_spectra`)."""
         found = [self._spectrum(row) for row in rows.tolist()]
@@ -111,7 +132,7 @@ class StoredScans:
         return found
 
     def _spectrum(self, row: int) -> Complex64[np.ndarray, "s f"]:
-        frame = int(self.frames[row])
+        frame = int(self._frames.rows[row])
         if frame not in self._spectra:
             self._spectra[frame] = image_spectrum(self.image(row), self.verification)
         self._spectra.move_to_end(frame)

@@ -22,33 +22,29 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import alone_in, read_json, replacing, write_json, writing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.reuse import each_mounting, fingerprint
 from sglpr_jax.schema import Column, check_columns
 
 KIND = "sglpr-jax unfinished loops"
-FORMAT = f"{KIND} 4"
+FORMAT = f"{KIND} 5"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
 OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
 """Names of files of frames, and of temporary files of `files.replacing`."""
-ALIGNMENT_NUMBERS = 14
-"""Numbers of an alignment: x, y, yaw, 9 of the covariance, correlation and second-peak ratio."""
 COLUMNS = {
     "made_from": Column("uint8", (32,)),
     "shown": Column("int64", ("seen",)),
     "images": Column("uint8", ("seen", "h", "h")),
-    "pairs": Column("int64", ("candidates", 2)),
-    "alignments": Column("float64", ("candidates", ALIGNMENT_NUMBERS)),
-    "evidence": Column("float64", ("candidates", len(Evidence._fields)), finite=False),
+    "counts": Column("int64", ("n",)),
+    "fitted": Column("int64", ("fits",)),
+    "fits": Column("float64", ("fits", len(Peak._fields))),
     "links": Column("float64", ("n", len(Peak._fields)), finite=False),
 }
-"""Arrays of a file of frames. NaN in the evidence is a missing value, and a row of NaN in the links a missing link."""
+"""Arrays of a file of frames: `counts` fits a frame. A row of NaN in the links is a missing link."""
 FRAMES = 50
 """Number of frames in a file."""
 
@@ -67,7 +63,7 @@ def settings(
         "times": _digest(recording.times),
         "weights": finder.index.weights_hash,
         "candidates": dataclasses.asdict(finder.config),
-        "drift": dataclasses.asdict(finder.drift),
+        "drift": [dataclasses.asdict(one) for one in (finder.drift, finder.motion_drift)],
         "verification": dataclasses.asdict(finder.verification),
         **{name: _digest(value) if isinstance(value, np.ndarray) else value for name, value in given.items()},
     }
@@ -155,7 +151,7 @@ class Unfinished:
                 return
             shown, images = set(more["shown"].tolist()), iter(more["images"])
             rows = range(self.kept, self.kept + len(frames))
-            for row, descriptor, compared in zip(rows, frames.descriptors, compared_of(more, rows), strict=True):
+            for row, descriptor, compared in zip(rows, frames.descriptors, compared_of(more), strict=True):
                 seen = Seen(np.array(descriptor), next(images), mounting_of(row)) if row in shown else None
                 if seen is None and not missing:
                     return
@@ -190,9 +186,15 @@ class Unfinished:
         if not len(frames) or frames.width != width or not np.array_equal(more["made_from"], self._made_from):
             raise ValueError("expected frames of this recording and these settings, found others")
         first, end = self.kept, self.kept + len(frames)
-        query, match = more["pairs"].T
+        counts, query = more["counts"], np.repeat(np.arange(first, end), np.maximum(more["counts"], 0))
         shown_rises = np.all(np.diff(more["shown"], prepend=first - 1, append=end) > 0)
-        if not shown_rises or np.any((query < first) | (query >= end) | (match < 0) | (match >= query)):
+        fitted = more["fitted"]
+        if (
+            not shown_rises
+            or (counts < 0).any()
+            or len(query) != len(fitted)
+            or np.any((fitted < 0) | (fitted >= query))
+        ):
             raise ValueError(f"expected frames {first} to {end - 1} and matches before them, found others")
         if not np.all(np.isfinite(more["links"]).all(axis=1) | np.isnan(more["links"]).all(axis=1)):
             raise ValueError("expected finite links, found others")
@@ -276,25 +278,23 @@ def _is_own(path: Path) -> bool:
 
 
 def columns(compared: Sequence[Compared]) -> dict[str, np.ndarray]:
-    """Convert the comparisons of some frames to arrays: their candidates, in order, and the link of each frame."""
-    candidates = [one for frame in compared for one in frame.candidates]
-    alignments = [np.concatenate([np.reshape(value, -1) for value in one.alignment]) for one in candidates]
-    links = [[np.nan] * len(Peak._fields) if link is None else [float(value) for value in link] for _, link in compared]
+    """Convert the comparisons of some frames to arrays: their fits, in order, and the link of each frame."""
+    counts = [len(one.fits.frames) for one in compared]
+    links = [[np.nan] * len(Peak._fields) if one.link is None else [float(v) for v in one.link] for one in compared]
+    fits = [np.stack(one.fits.peaks, axis=1) for one in compared]
     return {
-        "pairs": np.array([(one.query, one.match) for one in candidates], np.int64).reshape(-1, 2),
-        "alignments": np.array(alignments, np.float64).reshape(-1, ALIGNMENT_NUMBERS),
-        "evidence": np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(Evidence._fields)),
-        "links": np.array(links),
+        "counts": np.array(counts, np.int64),
+        "fitted": np.concatenate([np.zeros(0, np.int64), *(one.fits.frames for one in compared)]),
+        "fits": np.concatenate([np.zeros((0, len(Peak._fields))), *fits]),
+        "links": np.array(links).reshape(-1, len(Peak._fields)),
     }
 
 
-def compared_of(columns: dict[str, np.ndarray], rows: Sequence[int]) -> list[Compared]:
-    """Convert arrays of `columns` to the comparisons of the frames `rows`."""
-    found: dict[int, list[Candidate]] = {row: [] for row in rows}
-    for (query, match), values, evidence in zip(
-        columns["pairs"].tolist(), columns["alignments"], columns["evidence"], strict=True
-    ):
-        fields: list[Any] = [*values[:3], values[3:12].reshape(3, 3), *values[12:]]
-        found[query].append(Candidate(query, match, Alignment(*fields), Evidence(*map(np.asarray, evidence))))
-    links = [None if np.isnan(link).all() else Peak(*link) for link in columns["links"]]
-    return [Compared(found[row], link) for row, link in zip(rows, links, strict=True)]
+def compared_of(columns: dict[str, np.ndarray]) -> list[Compared]:
+    """Convert arrays of `columns` to the comparisons of the frames."""
+    ends = np.cumsum(columns["counts"])[:-1]
+    parts = zip(np.split(columns["fitted"], ends), np.split(columns["fits"], ends), columns["links"], strict=True)
+    return [
+        Compared(Fits(frames, Peak(*fits.T)), None if np.isnan(link).all() else Peak(*link))
+        for frames, fits, link in parts
+    ]

@@ -4,6 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sglpr_jax.sim.carriers import CARRIERS, Carrier
     from sglpr_jax.sim.dataset import write_dataset, write_sessions
     from sglpr_jax.sim.drive import PlanarPath, TimedPoses, plan_scan_path, poses_on, read_path
     from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from sglpr_jax.sim.world import World, build_world
 
 _HOME_OF = {
+    "CARRIERS": "carriers",
+    "Carrier": "carriers",
     "SENSORS": "sensor",
     "PlanarPath": "drive",
     "Sensor": "sensor",
@@ -45,7 +48,9 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "CARRIERS",
     "SENSORS",
+    "Carrier",
     "PlanarPath",
     "Sensor",
     "Session",

@@ -10,11 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from sglpr_jax.files import read_json, replacing
+from sglpr_jax.sim.carriers import VEHICLE, Carrier
 from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import check_drawing, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, with_submaps
-from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.repeating import default_rate, simulate_repeating
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.scenery import TOWN, Scenery
@@ -42,6 +43,7 @@ def write_dataset(
     seed: int = 0,
     rate_hz: float | None = None,
     scenery: Scenery | str = TOWN,
+    carrier: Carrier = VEHICLE,
     submap_m: float = 0.0,
     layout: str = "scans",
     progress: Progress | None = None,
@@ -61,8 +63,10 @@ def write_dataset(
       scans: Number of scans of each drive. Along a pose file it is the maximum, see `simulate_recording`.
       sensor: LiDAR.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, or the rate of the scenery.
+      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, elsewhere the rate
+        of the carrier or of the scenery.
       scenery: Scenery of the towns, or a name from `REPEATING`.
+      carrier: Carrier of the sensor. In towns, only its height and sway are used.
       submap_m: Travelled distance of submaps, in metres (`sglpr_jax.submaps`). 0 writes scans.
       layout: "scans", "images" or "varied", see `LAYOUTS`.
       progress: Function that is called as `progress(name, done, scans)` whenever scans are done.
@@ -77,7 +81,7 @@ def write_dataset(
         routes have revisits in the same direction.
       OSError: A file cannot be read or written. The message names the file.
     """
-    rate_hz = _checked_rate(scenery, names, along, rate_hz)
+    rate_hz = _checked_rate(scenery, names, along, rate_hz, carrier)
     check_drawing(rate_hz, seed)
     if not 0 <= submap_m < math.inf:
         raise ValueError(f"submap_m: expected metres, at least 0, found {submap_m}")
@@ -92,8 +96,8 @@ def write_dataset(
     what = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
     ways = {f"drive {name}": _fingerprint(file) for name, file in files.items()}
     lengths = {"submap_m": submap_m} if submap_m else {}
-    _claim(root, {"layout": layout, **what, **lengths, **_settings(sensor, scenery)}, ways)
-    options = {"sensor": sensor, "scenery": scenery, "submap_m": submap_m, **what}
+    _claim(root, {"layout": layout, **what, **lengths, **_settings(sensor, scenery, carrier)}, ways)
+    options = {"sensor": sensor, "scenery": scenery, "carrier": carrier, "submap_m": submap_m, **what}
     for name, file in files.items():
         count = scans if file is None else len(thinned(read_path(file), scans).times)
         simulate = functools.partial(_recording, name, along=file, **options)
@@ -103,7 +107,9 @@ def write_dataset(
     return root
 
 
-def _checked_rate(scenery: Scenery | str, names: Sequence[str], along: Sequence[Path], rate_hz: float | None) -> float:
+def _checked_rate(
+    scenery: Scenery | str, names: Sequence[str], along: Sequence[Path], rate_hz: float | None, carrier: Carrier
+) -> float:
     """Scans per second, after a check that the scenery has the drives."""
     if isinstance(scenery, Scenery):
         return RATE_HZ if rate_hz is None else rate_hz
@@ -113,7 +119,7 @@ def _checked_rate(scenery: Scenery | str, names: Sequence[str], along: Sequence[
     if along or len(set(revisits)) < len(revisits):
         expected = "no pose files and routes with different revisits, such as 01 06 08"
         raise ValueError(f"scenery {scenery}: expected {expected}, found {' '.join([*names, *map(str, along)])}")
-    return REPEATING[scenery].rate_hz if rate_hz is None else rate_hz
+    return default_rate(REPEATING[scenery], carrier) if rate_hz is None else rate_hz
 
 
 def _recording(
@@ -153,10 +159,11 @@ def write_sessions(
     return root
 
 
-def _settings(sensor: Sensor, scenery: Scenery | str) -> dict:
+def _settings(sensor: Sensor, scenery: Scenery | str, carrier: Carrier = VEHICLE) -> dict:
     """Settings that are stored with every dataset."""
     surroundings = {"repeating": scenery} if isinstance(scenery, str) else dataclasses.asdict(scenery)
-    return {"version": VERSION, "sensor": dataclasses.asdict(sensor), "scenery": surroundings}
+    sensed = {"sensor": dataclasses.asdict(sensor), "carrier": dataclasses.asdict(carrier)}
+    return {"version": VERSION, "scenery": surroundings, **sensed}
 
 
 def _fingerprint(file: Path | None) -> str:
@@ -186,7 +193,10 @@ def _claim(root: Path, settings: dict, ways: dict[str, str]) -> None:
 
 
 def _read_settings(path: Path) -> dict:
-    """Stored settings with the current field names. Older datasets have `TOWN`, and sensors that repeat their rings."""
+    """Stored settings with the current field names.
+
+    Older datasets have `TOWN`, sensors that repeat their rings, and a vehicle.
+    """
     settings = read_json(path)
     scenery = settings.get("scenery", dataclasses.asdict(TOWN)) if isinstance(settings, dict) else None
     if not isinstance(scenery, dict):
@@ -195,7 +205,8 @@ def _read_settings(path: Path) -> dict:
     sensor = settings.get("sensor")
     rings = {name: getattr(Sensor, name) for name in ("azimuths_deg", "pattern")}
     sensor = {**rings, **sensor} if isinstance(sensor, dict) else sensor
-    return {**settings, "sensor": json.loads(json.dumps(sensor)), "scenery": json.loads(json.dumps(scenery))}
+    carrier = settings.get("carrier", dataclasses.asdict(VEHICLE))
+    return {**settings, **json.loads(json.dumps({"carrier": carrier, "sensor": sensor, "scenery": scenery}))}
 
 
 def _write_drive(

@@ -31,16 +31,6 @@ STEERING_M = 3.0
 LATERAL_ACCELERATION = 2.0
 ACCELERATION = 1.5
 """Maximum lateral and longitudinal acceleration, in m/s^2. They limit speed in corners and changes of speed."""
-TILT_DEG = 0.6
-"""Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
-TILT_S = 0.5
-"""Approximate duration of a tilt, in seconds."""
-HAND_HEIGHT_M, HAND_BOB_M = 1.4, 0.04
-"""Mean height of a hand-held sensor above the ground, and amplitude of its vertical motion, in metres."""
-HAND_TILT_DEG = 15.0
-"""Maximum pitch and roll of a hand-held sensor, in degrees."""
-STEPS_HZ = 2.0
-"""Steps of a walking person per second."""
 FREE_SPEED = 1.35
 """Speed on a free street, as a multiple of the mean speed."""
 
@@ -141,8 +131,10 @@ def every_kth(path: PlanarPath, scans: int) -> slice:
 
 
 def speeds(path: PlanarPath) -> Float[np.ndarray, " n"]:
-    """Speed of the vehicle at each pose, in m/s."""
-    return np.linalg.norm(np.gradient(path.xy, path.times, axis=0), axis=1)
+    """Speed of the vehicle at each pose, in m/s. It is negative where the vehicle reverses."""
+    velocity = np.gradient(path.xy, path.times, axis=0)
+    forward = velocity[:, 0] * np.cos(path.yaw) + velocity[:, 1] * np.sin(path.yaw)
+    return np.where(forward < 0, -1, 1) * np.linalg.norm(velocity, axis=1)
 
 
 def check_drawing(rate_hz: float, seed: int) -> None:
@@ -158,33 +150,6 @@ def drive_seed(seed: int, name: str) -> tuple[int, int]:
     return seed, int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little")
 
 
-def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Draws pitch and roll of the vehicle's body relative to the ground at `times`, in radians."""
-    steps = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
-    width = TILT_S * PATH_HZ
-    noise = gaussian_filter1d(rng.normal(size=(len(steps), 2)), width, axis=0, mode="wrap")
-    noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # undoes the loss of variance in the filter
-    return np.stack([np.interp(times, steps, axis) for axis in noise.T], axis=1)
-
-
-def hand_motion(
-    rng: np.random.Generator, times: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Draws the motion of a hand-held sensor at `times`.
-
-    Pitch and roll oscillate with the steps, around directions that change over some seconds.
-
-    Returns:
-      Pitch and roll relative to the ground, in radians, and height above the ground, in metres.
-    """
-    steps = np.pi * STEPS_HZ * times[:, None] * rng.uniform(0.97, 1.03, 2)  # the body sways once every two steps
-    sway = np.sin(steps * [2, 1] + rng.uniform(0, 2 * np.pi, 2))
-    seconds = rng.uniform(3, 8, 2)
-    drift = np.sin(2 * np.pi * times[:, None] / seconds + rng.uniform(0, 2 * np.pi, 2))
-    tilt = np.radians(HAND_TILT_DEG) * (0.6 * sway + 0.4 * drift)
-    return tilt, HAND_HEIGHT_M + HAND_BOB_M * np.sin(2 * steps[:, 0])
-
-
 def poses_on(
     relief: Relief,
     xy: Float[np.ndarray, "n 2"],
@@ -193,12 +158,30 @@ def poses_on(
     height_m: float | Float[np.ndarray, " n"],
     tilt: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Returns world_from_lidar of a vehicle on hills: x points forward, z along the normal of the ground.
+    """Returns the poses of `poses_over` for a vehicle on hills."""
+    ground, slope = relief_height(relief, xy), relief_gradient(relief, xy)
+    return poses_over(ground, slope, xy, yaw, height_m=height_m, tilt=tilt)
 
-    The LiDAR is `height_m` above the ground along the normal, one value or one for each pose. `tilt` is pitch and roll
-    relative to the ground, in radians, see `body_tilt`.
+
+def poses_over(
+    ground: Float[np.ndarray, " n"],
+    slope: Float[np.ndarray, "n 2"],
+    xy: Float[np.ndarray, "n 2"],
+    yaw: Float[np.ndarray, " n"],
+    *,
+    height_m: float | Float[np.ndarray, " n"],
+    tilt: Float[np.ndarray, "n 2"] | None = None,
+) -> Float[np.ndarray, "n 4 4"]:
+    """Returns world_from_lidar of a vehicle on the ground: x points forward, z along the normal of the ground.
+
+    Arguments:
+      ground: Height of the ground, in metres.
+      slope: Slope of the ground along x and y.
+      xy: Position of the LiDAR, in metres.
+      yaw: Heading of the vehicle, in radians.
+      height_m: Height of the LiDAR above the ground along the normal, one value or one for each pose.
+      tilt: Pitch and roll relative to the ground, in radians, see `Carrier.motion`.
     """
-    slope = relief_gradient(relief, xy)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     x_axis = np.concatenate([forward, (forward * slope).sum(axis=1, keepdims=True)], axis=1)
     z_axis = np.concatenate([-slope, np.ones((len(yaw), 1))], axis=1)
@@ -208,7 +191,7 @@ def poses_on(
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
     poses[:, :3, :3] = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=2)
     poses[:, :2, 3] = xy
-    poses[:, 2, 3] = relief_height(relief, xy) + height_m * steepness  # `height_m` along the normal
+    poses[:, 2, 3] = ground + height_m * steepness  # `height_m` along the normal
     if tilt is not None:
         poses[:, :3, :3] @= Rotation.from_euler("yx", tilt).as_matrix()
     return poses

@@ -14,19 +14,18 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.record import Record
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.submap import submaps
+from sglpr_jax.sim.carriers import HANDHELD, VEHICLE, Carrier, Motion
 from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.drive import (
-    HAND_HEIGHT_M,
     PlanarPath,
     TimedPoses,
-    body_tilt,
     check_drawing,
     drive_seed,
     every_kth,
-    hand_motion,
     name_of_path,
     plan_path,
     poses_on,
+    poses_over,
     read_path,
     speeds,
 )
@@ -60,6 +59,7 @@ def simulate_recording(
     seed: int = 0,
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
+    carrier: Carrier = VEHICLE,
     handheld: bool = False,
 ) -> SimulatedRecording:
     """Builds the town around a drive and returns the recording of the drive.
@@ -75,8 +75,9 @@ def simulate_recording(
       seed: Seed of the town, at least 0.
       rate_hz: Scans per second of a route. Not used along a pose file.
       scenery: Scenery of the town.
-      handheld: Whether a person carries the sensor, at the height and with the tilt of `hand_motion`. The speed is that
-        of the vehicle.
+      carrier: Carrier of the sensor. Only its height and sway are used: speed and rate are those of the route, and the
+        carrier does not halt.
+      handheld: Whether the carrier is `HANDHELD`.
 
     Raises:
       ValueError: The route is unknown, `rate_hz` is not positive, `seed` is negative, or the pose file is malformed.
@@ -102,7 +103,7 @@ def simulate_recording(
         sensor=sensor,
         key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
         rng=np.random.default_rng((*seeds, 2)),
-        handheld=handheld,
+        carrier=HANDHELD if handheld else carrier,
     )
 
 
@@ -135,7 +136,7 @@ def drive_through(
     sensor: Sensor,
     key: PRNGKeyArray,
     rng: np.random.Generator,
-    handheld: bool = False,
+    carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
     """Returns the recording of a drive through a town.
 
@@ -148,18 +149,19 @@ def drive_through(
       times: Times of the scans in the recording, in seconds. They may differ from the times of the town.
       sensor: LiDAR.
       key: Random key of the measurements.
-      rng: Random generator of the tilt of the vehicle's body or of the hand.
-      handheld: Whether a person carries the sensor (`hand_motion`).
+      rng: Random generator of the sway of the carrier.
+      carrier: Carrier of the sensor, which follows `path`. Its height and sway are used.
     """
-    xy, yaw, clock = (values[rows] for values in path)
-    tilt, height_m = hand_motion(rng, clock) if handheld else (body_tilt(rng, clock), sensor.height_m)
-    poses = TimedPoses(poses_on(world.ground.relief, xy, yaw, height_m=height_m, tilt=tilt), times)
+    clock = path.times[rows]
+    motion = carrier.motion(rng, clock, height_m=sensor.height_m)
+    in_world, of_lidar = _poses(world, path, rows, motion)
+    poses = TimedPoses(of_lidar, times)
     speed = speeds(path)[rows]
     row_of = {scan_id: i for i, scan_id in enumerate(ids)}
 
     @functools.lru_cache(maxsize=KEPT_SCANS)
     def render(i: int) -> tuple[np.ndarray, np.ndarray]:
-        pose, velocity = poses.world_from_lidar[i], np.array([speed[i], 0, 0])
+        pose, velocity = in_world[i], np.array([speed[i], 0, 0])
         return scan(jax.random.fold_in(key, i), world, pose, sensor=sensor, time=float(clock[i]), velocity=velocity)
 
     def read(path: Path, label_path: Path | None, lasers: bool) -> Record:
@@ -176,8 +178,23 @@ def drive_through(
         paths=names,
         label_paths=names,
         read=read,
-        mounting=_mounting(HAND_HEIGHT_M if handheld else sensor.height_m),
+        mounting=_mounting(sensor.height_m if carrier.height_m is None else carrier.height_m),
         on_disk=False,
         poses=poses,
         render=render,
     )
+
+
+def _poses(
+    world: World, path: PlanarPath, rows: Int[np.ndarray, " n"], motion: Motion
+) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
+    """Poses of the LiDAR in the world that is rendered, and true poses. They differ on storeys above one another."""
+    yaw = path.yaw[rows]
+    aside = np.reshape(motion.left, (-1, 1)) * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    sway = {"height_m": motion.height, "tilt": motion.tilt}
+    if world.levels is None:
+        poses = poses_on(world.ground.relief, path.xy[rows] + aside, yaw, **sway)
+        return poses, poses
+    there, ground, slope = (values[rows] for values in world.levels.along(path.xy))
+    in_world = poses_on(world.ground.relief, there + aside, yaw, **sway)
+    return in_world, poses_over(ground, slope, path.xy[rows] + aside, yaw, **sway)

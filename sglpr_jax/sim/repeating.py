@@ -5,12 +5,13 @@ import dataclasses
 import jax
 import numpy as np
 
+from sglpr_jax.sim.carriers import VEHICLE, Carrier
 from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
 from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING, Repeating
-from sglpr_jax.sim.sceneries.site import build
-from sglpr_jax.sim.sceneries.ways import LAPS, way
+from sglpr_jax.sim.sceneries.site import Site, build
+from sglpr_jax.sim.sceneries.ways import LAPS, Line, way
 from sglpr_jax.sim.sensor import HDL64E, Sensor
 from sglpr_jax.sim.world import World
 
@@ -28,6 +29,7 @@ def simulate_repeating(
     sensor: Sensor = HDL64E,
     revisit: Revisit = "none",
     rate_hz: float | None = None,
+    carrier: Carrier = VEHICLE,
 ) -> SimulatedRecording:
     """Returns the recording of a drive through surroundings where places repeat.
 
@@ -37,23 +39,26 @@ def simulate_repeating(
       seed: Seed of the scenery and the drive, at least 0.
       sensor: LiDAR. In sceneries of small robots it is mounted lower and has a minimum range of at most 0.5 m.
       revisit: "none" never returns to a place: frames 30 s apart are more than `other_m` apart. "opposite" drives to
-        the end and returns. "same" drives one and a half laps along a closed path.
-      rate_hz: Scans per second. None uses the rate of the scenery.
+        the end and returns on the same way. "same" drives one and a half laps along a closed path.
+      rate_hz: Scans per second. None uses the rate of the carrier or of the scenery.
+      carrier: Carrier of the sensor, such as one of `CARRIERS`. Halts make the drive longer, so its scans are farther
+        apart in time. With revisit "none", a carrier that stands or is slower than the scenery's may have frames 30 s
+        apart that are within `other_m`.
 
     Raises:
       ValueError: The name or `revisit` is unknown, `rate_hz` is not positive, or `seed` is negative.
 
     Example:
-      drive = simulate_repeating("tunnel", seed=1, revisit="opposite")
+      drive = simulate_repeating("yard", seed=1, revisit="same", carrier=CARRIERS["backpack"])
     """
     if name not in REPEATING:
         raise ValueError(f"expected a scenery among {', '.join(REPEATING)}, found {name!r}")
     if revisit not in REVISITS:
         raise ValueError(f"revisit: expected one of {', '.join(REVISITS)}, found {revisit!r}")
     scenery = REPEATING[name]
-    check_drawing(rate_hz := scenery.rate_hz if rate_hz is None else rate_hz, seed)
+    check_drawing(rate_hz := default_rate(scenery, carrier) if rate_hz is None else rate_hz, seed)
     seeds = drive_seed(seed, f"{name} {revisit}")
-    world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz)
+    world, path = plan_drive(scenery, seeds, scans=scans, revisit=revisit, rate_hz=rate_hz, carrier=carrier)
     rows = np.arange(scans) * (len(path.times) // scans)
     return drive_through(
         world,
@@ -62,27 +67,48 @@ def simulate_repeating(
         name=f"{name}-{revisit}",
         ids=tuple(f"{i:06d}" for i in range(scans)),
         times=path.times[rows],
-        sensor=mounted(sensor, scenery),
+        sensor=mounted(sensor, scenery, carrier),
         key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
         rng=np.random.default_rng((*seeds, 2)),
+        carrier=carrier,
     )
 
 
 def plan_drive(
-    scenery: Repeating, seeds: tuple[int, ...], *, scans: int, revisit: Revisit, rate_hz: float
+    scenery: Repeating,
+    seeds: tuple[int, ...],
+    *,
+    scans: int,
+    revisit: Revisit,
+    rate_hz: float,
+    carrier: Carrier = VEHICLE,
 ) -> tuple[World, PlanarPath]:
     """Draws a scenery and the drive through it. The number of poses is a multiple of `scans`."""
     rng = np.random.default_rng((*seeds, 1))
-    speed = rng.uniform(*scenery.speed_mps)
+    speed = rng.uniform(*(carrier.speed_mps or scenery.speed_mps))
     length = max(scans / rate_hz, SHORTEST_S) * speed / {"none": 1, "opposite": 2, "same": LAPS}[revisit]
-    site = scenery.site(rng, length, revisit == "same")
-    line = way(rng, site.line, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
-    return build(site, line, clearance_m=scenery.clearance_m), timed(rng, line, free_mps=speed, poses=scans)
+    if revisit == "same":  # a lap has room for the scenery even if the carrier is slow
+        length = max(length, SHORTEST_S * scenery.speed_mps[0] / LAPS)
+    site = scenery.site(rng, length, scenery.is_closed(revisit))
+    line = driven_line(rng, site, scenery, revisit)
+    world = build(site, line, clearance_m=scenery.clearance_m)
+    return world, carrier.halted(rng, timed(rng, line, free_mps=speed, poses=scans), poses=scans)
 
 
-def mounted(sensor: Sensor, scenery: Repeating) -> Sensor:
-    """`sensor` with the height and minimum range for the scenery's vehicle."""
-    if scenery.height_m is None:
+def driven_line(rng: np.random.Generator, site: Site, scenery: Repeating, revisit: Revisit) -> Line:
+    """Path along the line of a site."""
+    laps = "none" if site.returns and revisit == "same" else revisit
+    return way(rng, site.line, laps, right_m=scenery.right_m, sway_m=scenery.sway_m)
+
+
+def default_rate(scenery: Repeating, carrier: Carrier) -> float:
+    """Scans per second of the carrier, or of the scenery if the carrier has no rate."""
+    return scenery.rate_hz if carrier.rate_hz is None else carrier.rate_hz
+
+
+def mounted(sensor: Sensor, scenery: Repeating, carrier: Carrier = VEHICLE) -> Sensor:
+    """`sensor` with the height and minimum range for the carrier, or for the scenery's vehicle."""
+    height_m = scenery.height_m if carrier.height_m is None else carrier.height_m
+    if height_m is None:
         return sensor
-    least = min(LEAST_RANGE_M, sensor.min_range_m)
-    return dataclasses.replace(sensor, height_m=scenery.height_m, min_range_m=least)
+    return dataclasses.replace(sensor, height_m=height_m, min_range_m=min(LEAST_RANGE_M, sensor.min_range_m))

@@ -23,6 +23,7 @@ EDGE_JUMP_M = 2.0
 
 _REFLECTIVITY = np.full(260, 0.35, np.float32)
 for _id, _value in {
+    raw_ids.NO_RETURN: 0.0,
     raw_ids.ROAD: 0.25,
     raw_ids.PARKING: 0.25,
     raw_ids.LANE_MARKING: 0.6,

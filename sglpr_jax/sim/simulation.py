@@ -5,6 +5,7 @@ import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from sglpr_jax.sim.carriers import CARRIERS
 from sglpr_jax.sim.choices import RATE_HZ, SCANS
 from sglpr_jax.sim.dataset import VERSION, write_dataset, write_sessions
 from sglpr_jax.sim.drive import name_of_path
@@ -70,6 +71,7 @@ def simulate(
     seed: int = 0,
     rate_hz: float | None = None,
     scenery: str = "town",
+    carrier: str = "vehicle",
     submap_m: float = 0.0,
     images: bool = False,
     vary: bool = False,
@@ -91,9 +93,10 @@ def simulate(
       sensor: Name from `SENSORS`. None is hdl64e, or hdl32e-nclt with `sessions`.
       azimuth_steps: Firings per revolution. None is the sensor's own number.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route. None is 4 in towns, or the rate of the scenery.
+      rate_hz: Scans per second of a route. None is 4 in towns, elsewhere the rate of the carrier or of the scenery.
       scenery: Name from `SCENERIES` (towns), or from `REPEATING`. In the latter, a route stands only for the direction
         of its revisits.
+      carrier: Name from `CARRIERS`. In towns, only its height and sway are used. `sessions` need a vehicle.
       submap_m: Travelled distance of submaps, in metres. 0 writes scans.
       images: Whether to write density images with label images instead of scans.
       vary: Whether the images show scans that are rotated about z, some of them with lost points. See `sim.variety`.
@@ -104,8 +107,8 @@ def simulate(
       Description of the dataset.
 
     Raises:
-      ValueError: A route, the sensor or the scenery is unknown, a pose file is malformed, or arguments contradict each
-        other. Or `out` holds another dataset.
+      ValueError: A route, the sensor, the scenery or the carrier is unknown, a pose file is malformed, or arguments
+        contradict each other. Or `out` holds another dataset.
       OSError: A file cannot be read or written.
 
     Example:
@@ -118,6 +121,10 @@ def simulate(
     known = SCENERIES if sessions else {**SCENERIES, **REPEATING}
     if scenery not in known:
         raise ValueError(f"expected a scenery among {', '.join(known)}, found {scenery!r}")
+    if carrier not in CARRIERS:
+        raise ValueError(f"expected a carrier among {', '.join(CARRIERS)}, found {carrier!r}")
+    if sessions and carrier != "vehicle":
+        raise ValueError(f"with sessions, expected the carrier vehicle, found {carrier!r}")
     if sessions and submap_m:
         raise ValueError(f"with sessions, expected no submaps, found submaps of {submap_m:g} m")
     chosen = (
@@ -142,6 +149,7 @@ def simulate(
         write_sessions(out, dates=sessions, route=next(iter(chosen), "00"), rate_hz=rate_hz, scenery=town, **options)
     else:
         options |= {"rate_hz": rate_hz, "scenery": SCENERIES.get(scenery, scenery), "submap_m": submap_m}
+        options |= {"carrier": CARRIERS[carrier]}
         write_dataset(out, names=chosen, along=along, layout=layout, **options)
     return dataset
 

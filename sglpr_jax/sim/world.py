@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.sim.ground import Ground, draw_relief
+from sglpr_jax.sim.levels import Levels
 from sglpr_jax.sim.paving import paint_ground
 from sglpr_jax.sim.placing import furnish, join, plant_islands, select, to_scene
 from sglpr_jax.sim.plants import bush
@@ -23,6 +24,8 @@ class World(NamedTuple):
 
     scene: Scene
     ground: Ground
+    levels: Levels | None = None
+    """Storeys above one another, which the scene holds side by side."""
 
 
 def build_world(

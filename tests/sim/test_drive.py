@@ -8,11 +8,6 @@ from hypothesis import strategies as st
 from sglpr_jax.poses import distances
 from sglpr_jax.sim import plan_scan_path, poses_on, read_path
 from sglpr_jax.sim.drive import (
-    HAND_TILT_DEG,
-    STEPS_HZ,
-    TILT_DEG,
-    body_tilt,
-    hand_motion,
     name_of_path,
     plan_path,
     speeds,
@@ -143,31 +138,6 @@ PLAIN = Relief(np.zeros(1), np.ones((1, 2)), np.zeros(1))
 def test_poses_on_a_plain_are_level():
     (pose,) = poses_on(PLAIN, np.array([[3.0, 4.0]]), np.array([np.pi / 2]), height_m=2.0)
     np.testing.assert_allclose(pose, [[0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 2], [0, 0, 0, 1]], atol=1e-15)
-
-
-def test_the_body_tilts_on_the_spot():
-    times = np.linspace(0, 400, 2000)
-    tilt = body_tilt(np.random.default_rng(0), times)
-    np.testing.assert_allclose(np.degrees(tilt.std(axis=0)), TILT_DEG, rtol=0.2)
-    assert np.abs(np.diff(tilt, axis=0)).max() < np.abs(tilt).max() / 4  # it takes about a second
-    xy, yaw = np.zeros((2000, 2)), np.full(2000, 0.7)
-    level, tilted = (poses_on(PLAIN, xy, yaw, height_m=2.0, tilt=t) for t in (None, tilt))
-    np.testing.assert_array_equal(level[:, :3, 3], tilted[:, :3, 3])
-    turn = level[:, :3, :3].transpose(0, 2, 1) @ tilted[:, :3, :3]
-    np.testing.assert_allclose(turn[:, 0, 2], tilt[:, 0], atol=1e-3)  # nose down lifts what lies ahead
-    np.testing.assert_allclose(turn[:, 2, 1], tilt[:, 1], atol=1e-3)
-
-
-def test_a_hand_tilts_and_bobs_with_its_steps():
-    times = np.linspace(0, 60, 1200)
-    tilt, height_m = hand_motion(np.random.default_rng(0), times)
-    degrees = np.degrees(np.abs(tilt))
-    assert 11 < degrees.max() <= HAND_TILT_DEG and (degrees.max(axis=1) > 5).mean() > 0.5
-    np.testing.assert_allclose(np.quantile(height_m, [0, 0.5, 1]), [1.36, 1.4, 1.44], atol=0.01)
-    sways = np.diff(np.sign(height_m - 1.4)) > 0
-    assert abs(sways.sum() / 60 - STEPS_HZ) < 0.2
-    poses = poses_on(PLAIN, np.zeros((1200, 2)), np.zeros(1200), height_m=height_m, tilt=tilt)
-    np.testing.assert_allclose(poses[:, 2, 3], height_m)
 
 
 def pose_file(path, xy, yaw):

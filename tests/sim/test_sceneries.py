@@ -1,18 +1,22 @@
 """Sceneries where places repeat: drives, revisits, and the space around the vehicle."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from sglpr_jax.sim.drive import drive_seed, speeds
 from sglpr_jax.sim.ground import relief_height
 from sglpr_jax.sim.placing import footprint_distance
-from sglpr_jax.sim.raw_ids import BUILDING, FENCE, POLE
-from sglpr_jax.sim.repeating import mounted, plan_drive, simulate_repeating
+from sglpr_jax.sim.raw_ids import BUILDING, FENCE, NO_RETURN, POLE
+from sglpr_jax.sim.repeating import driven_line, mounted, plan_drive, simulate_repeating
 from sglpr_jax.sim.routes import REVISITS
 from sglpr_jax.sim.sceneries import REPEATING
 from sglpr_jax.sim.sceneries.site import HEAD_ROOM_M, build, distances, striped_ground
 from sglpr_jax.sim.sceneries.site import Strip as GroundStrip
-from sglpr_jax.sim.sceneries.ways import STEP_M, ring, road, rows, way
+from sglpr_jax.sim.sceneries.solar import solar
+from sglpr_jax.sim.sceneries.terminal import HIGH_M, terminal
+from sglpr_jax.sim.sceneries.ways import STEP_M, ring, road, rows
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.shapes import Shapes
 
@@ -76,11 +80,25 @@ def test_with_revisits_part_of_the_way_is_driven_again(name, revisit):
 
 
 @names
+def test_poses_are_rigid_and_continuous(name):
+    recording = simulate_repeating(name, scans=400, seed=6, sensor=SENSOR, revisit="opposite")
+    poses = recording.poses.world_from_lidar
+    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    seconds = np.diff(recording.times)
+    assert np.isfinite(poses).all() and np.all(seconds > 0)
+    assert np.max(step_m / seconds) < 1.5 * REPEATING[name].speed_mps[1]
+    np.testing.assert_allclose(
+        poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (400, 1, 1)), atol=1e-9
+    )
+
+
+@names
 @revisits
 def test_the_vehicle_keeps_clear_of_what_stands(name, revisit):
     scenery = REPEATING[name]
     world, path = plan_drive(scenery, drive_seed(1, name), scans=SCANS, revisit=revisit, rate_hz=scenery.rate_hz)
-    assert distances(low_shapes(world), path.xy).min() > 0.9 * scenery.clearance_m
+    driven = path.xy if world.levels is None else world.levels.along(path.xy).xy
+    assert distances(low_shapes(world), driven).min() > 0.9 * scenery.clearance_m
     assert speeds(path).max() < 2 * scenery.speed_mps[1]
 
 
@@ -88,8 +106,8 @@ def test_the_vehicle_keeps_clear_of_what_stands(name, revisit):
 @revisits
 def test_no_wall_is_left_out(name, revisit):
     scenery, rng = REPEATING[name], np.random.default_rng(8)
-    site = scenery.site(rng, 75 * scenery.speed_mps[0] / 1.5, revisit == "same")
-    line = way(rng, site.line, revisit, right_m=scenery.right_m, sway_m=scenery.sway_m)
+    site = scenery.site(rng, 75 * scenery.speed_mps[0] / 1.5, scenery.is_closed(revisit))
+    line = driven_line(rng, site, scenery, revisit)
     counts = [
         np.isin(build(site, line, clearance_m=clearance).scene.boxes.label, (BUILDING, FENCE)).sum()
         for clearance in (0.0, scenery.clearance_m)
@@ -120,6 +138,52 @@ def test_a_small_robot_carries_its_sensor_low_and_sees_near_walls():
 def test_the_tunnel_has_a_ceiling():
     points, _ = drive("tunnel").render(3)
     assert points[:, 2].max() > 2
+
+
+def test_a_scan_in_a_yard_shows_all_of_it():
+    scenery = REPEATING["yard"]
+    world, _ = plan_drive(scenery, drive_seed(1, "yard"), scans=SCANS, revisit="same", rate_hz=2.0)
+    walls = np.array(world.scene.boxes.label) == BUILDING
+    width = 2 * world.scene.boxes.half[walls].max(axis=0)[:2]
+    assert np.all(width > 15) and np.all(width < 24.5)
+    points, labels = drive("yard", "same").render(10)
+    bearings = np.degrees(np.arctan2(points[:, 1], points[:, 0]))[labels == BUILDING]
+    assert np.histogram(bearings, bins=8, range=(-180, 180))[0].min() > 0
+    assert np.linalg.norm(points[:, :2], axis=1).max() < 36
+
+
+@pytest.mark.parametrize("revisit", ("same", "opposite"))
+@pytest.mark.parametrize("name", ("yard", "hall"))
+def test_a_closed_way_in_a_yard_or_hall_crosses_itself(name, revisit):
+    xy = drive(name, revisit).positions[:, :2]
+    extent = np.ptp(xy, axis=0)
+    assert extent.min() > 6 and extent.max() < 60
+    assert np.linalg.norm(np.diff(xy, axis=0), axis=1).sum() > 2 * extent.max()
+
+
+def test_stacks_in_a_terminal_have_one_to_five_containers():
+    site = terminal(np.random.default_rng(0), 300.0, False)
+    heights = [spot.thing[0].size[2] / HIGH_M for spot in site.spots if spot.thing[0].kind == "box"]
+    np.testing.assert_allclose(np.unique(np.round(heights, 6)), [1, 2, 3, 4, 5])
+
+
+def test_panels_of_a_solar_farm_rise_along_y():
+    thing = solar(np.random.default_rng(0), 300.0, False).spots[0].thing
+    slats = [part for part in thing if part.kind == "box"]
+    rise = np.degrees(np.arctan2(slats[-1].bottom - slats[0].bottom, slats[-1].y - slats[0].y))
+    assert 15 < rise < 30
+    for low, high in pairwise(slats):
+        assert low.bottom + low.size[2] >= high.bottom  # no gap between two slats
+
+
+def test_rays_beyond_the_deck_of_a_bridge_do_not_return():
+    recording = drive("bridge")
+    for i in (10, 30):
+        points, labels = recording.render(i)
+        assert NO_RETURN not in labels
+        aside = np.abs(points[:, 1])[(np.abs(points[:, 0]) < 15) & (labels != BUILDING)]
+        assert aside.max() < 12
+    assert np.linalg.norm(np.diff(recording.positions, axis=0), axis=1).sum() > 500
 
 
 def test_a_ring_closes():

@@ -8,7 +8,7 @@ import pytest
 
 from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.data.submap import submaps
-from sglpr_jax.sim import SENSORS, simulate, simulate_repeating
+from sglpr_jax.sim import CARRIERS, SENSORS, simulate, simulate_repeating
 from sglpr_jax.sim.simulation import default_dataset, default_sessions
 
 THIN = {"scans": 3, "azimuth_steps": 40, "sensor": "vlp16"}
@@ -43,6 +43,16 @@ def test_submaps_of_a_scenery_where_places_repeat(tmp_path):
         simulate(tmp_path, routes=["08"], **{**options, "submap_m": 10.0})
 
 
+def test_a_carrier_of_the_sensor_is_part_of_the_dataset(tmp_path):
+    options = {"scans": 3, "azimuth_steps": 40, "sensor": "vlp16", "scenery": "tunnel", "routes": ["01"]}
+    found = simulate(tmp_path, **options, carrier="cart")
+    drive = open_recording(found.root, "01", sensor_height=0.6)
+    expected = simulate_repeating("tunnel", scans=3, sensor=SENSORS["vlp16"], carrier=CARRIERS["cart"])
+    assert drive.positions == pytest.approx(expected.positions, abs=1e-5)
+    with pytest.raises(ValueError, match="another simulated dataset; expected carrier"):
+        simulate(tmp_path, **options)
+
+
 @pytest.mark.slow
 def test_days_of_one_town(tmp_path):
     found = simulate(tmp_path, sessions=["2012-01-15", "2012-02-04"], **THIN)
@@ -70,6 +80,8 @@ def test_what_does_not_go_together_is_refused(tmp_path):
         ({"sessions": ["2012-01-15"], "submap_m": 5.0}, "expected no submaps"),
         ({"scenery": "forest", "routes": ["00", "05"]}, "different revisits"),
         ({"scenery": "wood"}, "found 'wood'"),
+        ({"carrier": "horse"}, "expected a carrier among vehicle, .* found 'horse'"),
+        ({"sessions": ["2012-01-15"], "carrier": "cart"}, "expected the carrier vehicle"),
     ],
 )
 def test_nothing_is_told_of_a_dataset_that_cannot_be(tmp_path, changes, error):

@@ -3,9 +3,10 @@
 import numpy as np
 
 from sglpr_jax.sim.raw_ids import BUILDING, PARKING
+from sglpr_jax.sim.sceneries.enclosed import wall
 from sglpr_jax.sim.sceneries.site import Site, Spot, block, even_ground, grid, jittered
 from sglpr_jax.sim.sceneries.ways import rows
-from sglpr_jax.sim.things import Part, Thing
+from sglpr_jax.sim.things import Thing
 from sglpr_jax.sim.vehicles import car
 
 PITCH_M = 11.5
@@ -14,7 +15,6 @@ HALF_M = 8.8
 """Distance from the aisle of a floor to the walls along the floor, in metres."""
 TURN_M = 5.0
 """Space for turning at the ends of floors and ramps, in metres."""
-THICK_M = 0.3
 
 
 def garage(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
@@ -45,19 +45,13 @@ def _shell(count: int, run_m: float, height: float, closed: bool) -> Thing:
     for k in range(count - 1):
         y = (k + k % 2) * PITCH_M + (HALF_M if k % 2 == 0 else -HALF_M)
         first, last = ((left, run_m - TURN_M), (TURN_M, right))[k % 2]
-        walls.append(_wall((first, y), (last, y), height))
+        walls.append(wall((first, y), (last, y), height))
     if closed:  # a ramp from the last row to the first
-        walls.append(_wall((left, 4.0), (left, (count - 1) * PITCH_M - 4.0), height))
+        walls.append(wall((left, 4.0), (left, (count - 1) * PITCH_M - 4.0), height))
         left -= 8.0
     corners = [(left, low), (right, low), (right, high), (left, high)]
-    walls += [_wall(corners[i - 1], corners[i], height) for i in range(4)]
+    walls += [wall(corners[i - 1], corners[i], height) for i in range(4)]
     ceiling = block(
         BUILDING, right - left, high - low, 0.3, (left + right) / 2, (low + high) / 2, bottom=height, roughness=0.02
     )
     return *walls, ceiling
-
-
-def _wall(start: tuple[float, float], stop: tuple[float, float], height: float) -> Part:
-    """Wall along x or y."""
-    long, wide = (abs(b - a) + THICK_M for a, b in zip(start, stop, strict=True))
-    return block(BUILDING, long, wide, height, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)

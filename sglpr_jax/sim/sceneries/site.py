@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
+from sglpr_jax.sim.levels import Levels
 from sglpr_jax.sim.placing import Anchors, footprint_distance, place, select, to_scene
 from sglpr_jax.sim.sceneries.ways import STEP_M, Line, shifted
 from sglpr_jax.sim.scenery import TOWN
@@ -44,6 +45,10 @@ class Site(NamedTuple):
     line: Line
     spots: list[Spot]
     ground: Ground
+    levels: Levels | None = None
+    """Storeys above one another. `line` lies in them, and `spots` in the world that holds them side by side."""
+    returns: bool = False
+    """Whether the line itself returns to its places, for revisits in the same direction."""
 
 
 class Strip(NamedTuple):
@@ -133,10 +138,11 @@ def build(site: Site, driven: Line, *, clearance_m: float) -> World:
     )[owner].T
     shapes = place(parts, Anchors(np.stack([x, y], axis=1), heading, side, since, until), site.ground)
     shapes = shapes._replace(velocity=np.stack([vx, vy], axis=1))
+    driven = driven if site.levels is None else site.levels.along(driven).xy
     low = np.array([part.bottom < HEAD_ROOM_M for part in parts]) & (vx == 0) & (vy == 0)
     bad = low & (distances(shapes, driven) < clearance_m)
     keep = ~np.isin(owner, owner[bad])
-    return World(to_scene(select(shapes, keep), [parts[i] for i in np.flatnonzero(keep)]), site.ground)
+    return World(to_scene(select(shapes, keep), [parts[i] for i in np.flatnonzero(keep)]), site.ground, site.levels)
 
 
 def distances(shapes: Shapes, line: Line, *, reach_m: float = 3.0) -> Float[np.ndarray, " n"]:
