@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from benchmarks.quality.loops import drifted
 from sglpr_jax.data.record import Record
@@ -20,10 +20,15 @@ from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.transforms import inverse, yaw_of
 from sglpr_jax.loops.unfinished import columns, compared_of
 from sglpr_jax.models.params import Params
 
 Odometry = Literal["none", "exact", "drifting"]
+RIGHT, WRONG = (1.5, 6.0), (3.0, 15.0)
+"""Largest errors of a right pose, and smallest errors of a wrong one, in metres and degrees."""
+STOREY_M, SLOPE = 1.6, 0.3
+"""Difference in height of scans on different storeys, in metres, and steepest slope between scans of one place."""
 
 
 class RenderedDrive(NamedTuple):
@@ -68,24 +73,27 @@ def read(path: Path, params: Params | None = None) -> RenderedDrive:
 
 
 def compared(
-    drive: RenderedDrive, finder: CandidateFinder, folder: Path, *, odometry: Odometry = "none"
+    drive: RenderedDrive, finder: CandidateFinder, folder: Path, *, odometry: Odometry = "none", breaks: bool = False
 ) -> list[Compared]:
-    """What a finder, an empty one, makes of each scan; read from the folder where it is kept."""
-    path = folder / f"{drive.name}-{_settings(finder, odometry)}.npz"
+    """What a finder, an empty one, makes of each scan; read from the folder where it is kept.
+
+    With `breaks`, the motion is unknown in the middle of the drive.
+    """
+    path = folder / f"{drive.name}-{_settings(finder, odometry)}{'-broken' * breaks}.npz"
     if path.exists():
         with np.load(path) as file:
-            return compared_of(dict(file), range(len(drive.seen)))
+            return compared_of(dict(file))
     poses = drive.odometry(odometry)
     found = []
     for i, (seen, time) in enumerate(zip(drive.seen, drive.times.tolist(), strict=True)):
         pose = None if poses is None else poses[i]
-        finder.add_seen(seen, time=time, odometry=pose)
+        finder.add_seen(seen, time=time, odometry=pose, continues=not (breaks and i == len(drive.seen) // 2))
         found.append(finder.compared)
     kept = columns(found)
     path.parent.mkdir(exist_ok=True, parents=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **kept)
-    return compared_of(kept, range(len(drive.seen)))
+    return compared_of(kept)
 
 
 def distances(pairs: Sequence[tuple[int, int]], poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " k"]:
@@ -94,8 +102,44 @@ def distances(pairs: Sequence[tuple[int, int]], poses: Float[np.ndarray, "n 4 4"
     return np.linalg.norm(poses[frames[:, 0], :3, 3] - poses[frames[:, 1], :3, 3], axis=1)
 
 
+class PoseErrors(NamedTuple):
+    """Errors of pairs against the true poses, one number for each pair."""
+
+    metres: Float[np.ndarray, " k"]
+    """In the plane of the match."""
+    degrees: Float[np.ndarray, " k"]
+    """Of the heading."""
+    storey_m: Float[np.ndarray, " k"]
+    """Difference in height between the scans, as far as it exceeds a slope of `SLOPE` between them."""
+
+    @property
+    def right(self) -> Bool[np.ndarray, " k"]:
+        """Whether each pose is right."""
+        return (self.metres <= RIGHT[0]) & (self.degrees <= RIGHT[1]) & (self.storey_m <= STOREY_M)
+
+    @property
+    def wrong(self) -> Bool[np.ndarray, " k"]:
+        """Whether each pose is certainly wrong. Poses between right and wrong are neither."""
+        return (self.metres > WRONG[0]) | (self.degrees > WRONG[1]) | (self.storey_m > STOREY_M)
+
+
+def pose_errors(
+    pairs: Sequence[tuple[int, int]],
+    match_from_query: Float[np.ndarray, "k 4 4"],
+    world_from_lidar: Float[np.ndarray, "n 4 4"],
+) -> PoseErrors:
+    """Errors of the poses of pairs (query, match)."""
+    frames = np.array(pairs, np.int64).reshape(-1, 2)
+    query, match = world_from_lidar[frames[:, 0]], world_from_lidar[frames[:, 1]]
+    true, found = inverse(match) @ query, np.reshape(match_from_query, (-1, 4, 4))
+    apart = np.linalg.norm((found - true)[:, :2, 3], axis=1)
+    turned = np.degrees(np.abs((yaw_of(found) - yaw_of(true) + np.pi) % (2 * np.pi) - np.pi))
+    up = np.abs(query[:, 2, 3] - match[:, 2, 3]) - SLOPE * np.linalg.norm((query - match)[:, :2, 3], axis=1)
+    return PoseErrors(apart, turned, up)
+
+
 def _settings(finder: CandidateFinder, odometry: Odometry) -> str:
     """A name for all that decides the comparisons."""
-    parts = [finder.config, finder.verification, *([] if odometry == "none" else [finder.drift])]
+    parts = [finder.config, finder.verification, finder.motion_drift if odometry == "none" else finder.drift]
     about = json.dumps([finder.index.weights_hash, odometry, *map(dataclasses.asdict, parts)])
     return hashlib.sha256(about.encode()).hexdigest()[:16]

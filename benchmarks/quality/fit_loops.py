@@ -1,16 +1,18 @@
-"""Fit the models of loops that ship with the package: how probable it is that two scans show one place.
+"""Fit the model of loops that ships with the package: how probable it is that two scans show one place.
 
-    python -m benchmarks.quality.repeating_scans --seeds 1 2 --out build/fit
-    python -m benchmarks.quality.fit_loops build/fit --weights sglpr circular
+    python -m benchmarks.quality.repeating_scans --seeds 1 --out build/fit
+    python -m benchmarks.quality.fit_loops build/fit
 
-Every drive is searched by the loop detector's finder, one candidate a scan. A pair is a loop if its scans are at most
-half as far apart as frames of other places (`other_m`, at most 10 m), and none beyond that. All sceneries count alike,
-so that the towns do not drown the tunnels, and so do drives without revisits, in the same and in the opposite
-direction. The drives of a few sceneries are left out, to judge the model by them.
+Every drive is searched by the loop detector's finder without odometry, once as it is and once with a break of the
+motion in its middle, and every third drive with odometry that drifts. A pair is a loop if its pose is right within
+1.5 m and 6 degrees on the same storey, and none if it is wrong by more than 3 m or 15 degrees, or, with odometry, on
+another storey. All kinds of drives count alike. Each scenery is judged by a model that was fitted to the others: the
+table has its pairs, with neighbours and alone, the share of right pairs above two probabilities, and the wrong pairs.
 """
 
 import functools
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -19,80 +21,136 @@ from typing import NamedTuple
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.table import Table
+from scipy.special import expit
 
 import sglpr_jax
-from benchmarks.quality.drives import compared, distances, read
+from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.probability import ALL, DEFAULTS, OF_IMAGES, Evidence, fit
-from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.consistency import agree_along
+from sglpr_jax.loops.loop import planar_loop
+from sglpr_jax.loops.probability import ALL, DEFAULT, Evidence, LoopModel, fit
+from sglpr_jax.loops.reliability import reliability
+from sglpr_jax.loops.sequence import neighbour_weights
+from sglpr_jax.loops.transforms import transform
 
-LEFT_OUT = ("garage", "highway", "rooms_equal", "vineyard", "warehouse", "gardens", "lanes")
-"""Sceneries that have no part in the fit."""
-LOOP_M = 10.0
-PAIRS = 600.0
-"""The drives of a scenery with one kind of revisits count as this number of pairs."""
+PAIRS = 300.0
+"""The drives of a scenery with one kind of revisits and odometry count as this number of pairs."""
+DRIFTING = 3
+"""One of this number of drives is also searched with odometry."""
+SURE = 0.99
+KEYFRAME_M = DetectorConfig.keyframe_m
 
 
 class Pairs(NamedTuple):
-    """Candidates of one drive that are known to be loops or not."""
+    """Candidates of one drive that the motion allows."""
 
-    evidence: Float[np.ndarray, "n k"]
+    evidence: Evidence
+    """Evidence of each pair alone."""
+    neighbours: Float[np.ndarray, "n n"]
+    """Weight of each pair as neighbour of another one, negative if they disagree."""
     is_loop: Bool[np.ndarray, " n"]
+    is_known: Bool[np.ndarray, " n"]
+    """Whether a pair is certainly a loop or certainly none."""
+
+    def log_odds(self, model: LoopModel) -> Float[np.ndarray, " n"]:
+        """Log odds of each pair, with its neighbours."""
+        return model.log_odds(self.evidence) + self.neighbours @ model.strength(self.evidence)
 
 
-def main(
-    drives: tyro.conf.Positional[Path],
-    *,
-    weights: tuple[str, ...] = ("sglpr", "circular"),
-    left_out: tuple[str, ...] = LEFT_OUT,
-    workers: int = 1,
-    out: Path = DEFAULTS,
-) -> None:
-    """Fit and write the models.
+def main(drives: tyro.conf.Positional[Path], *, weights: str = "sglpr", workers: int = 1, out: Path = DEFAULT) -> None:
+    """Fit and write the model.
 
     Args:
-        drives: folder of `repeating_scans.py`, described by `sglpr`.
-        weights: a model of all evidence for each; the first one's pairs make that of the images alone too.
-        left_out: sceneries that have no part in the fit.
+        drives: folder of `repeating_scans.py`.
+        weights: the model that describes the scans.
         workers: number of processes.
         out: the file to write.
     """
-    files = [path for path in sorted(drives.glob("*.npz")) if path.stem.split("-")[0] not in left_out]
-    models = {}
-    for name in weights:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            found = list(pool.map(functools.partial(pairs, weights=name), files))
-        evidence = Evidence(*np.concatenate([one.evidence for one in found]).T)
-        is_loop = np.concatenate([one.is_loop for one in found])
-        kinds = [tuple(path.stem.split("-")[:2]) for path in files]
-        counts = Counter[tuple[str, ...]]()
-        for kind, one in zip(kinds, found, strict=True):
-            counts[kind] += len(one.is_loop)
-        shares = np.concatenate(
-            [np.full(len(one.is_loop), PAIRS / counts[kind]) for kind, one in zip(kinds, found, strict=True)]
-        )
-        sceneries = ", ".join(dict.fromkeys(path.stem.split("-")[0] for path in files))
-        about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(files)} simulated drives ({sceneries})"
-        made_with = f"{about}; benchmarks/quality/fit_loops.py --weights {name}"
-        if not models:
-            models[""] = fit(evidence, is_loop, names=OF_IMAGES, weights=shares, made_with=made_with)
-        key = weights_hash(sglpr_jax.load(name))
-        models[key] = fit(evidence, is_loop, weights=shares, made_with=made_with)
-        print(f"{name}: {models[key]}")
-    write_json(out, {name: model.to_json() for name, model in models.items()})
+    files = sorted(drives.glob("*.npz"))
+    works = [(path, "none", False) for path in files] + [(path, "none", True) for path in files]
+    works += [(path, "drifting", False) for path in files[::DRIFTING]]
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(functools.partial(pairs, weights=weights), *zip(*works, strict=True)))
+    sceneries = [path.stem.split("-")[0] for path, _, _ in works]
+    kinds = ["-".join([*path.stem.split("-")[:2], odometry]) for path, odometry, _ in works]
+    table = Table("scenery", "right", f">= {SURE}", ">= 0.5", "wrong", f">= {SURE}", ">= 0.5")
+    held_out = []
+    for scenery in dict.fromkeys(sceneries):
+        others = [row for row, one in enumerate(sceneries) if one != scenery]
+        model = fitted([found[row] for row in others], [kinds[row] for row in others])
+        own = [found[row] for row, one in enumerate(sceneries) if one == scenery]
+        chosen = np.concatenate([one.is_known for one in own])
+        is_loop = np.concatenate([one.is_loop for one in own])[chosen]
+        for title, log_odds in (
+            (scenery, [one.log_odds(model) for one in own]),
+            (f"{scenery}, alone", [model.log_odds(one.evidence) for one in own]),
+        ):
+            probability = expit(np.concatenate(log_odds)[chosen])
+            table.add_row(title, *_row(probability, is_loop))
+            held_out += [(probability, is_loop)] if title == scenery else []
+    probability, is_loop = (np.concatenate(values) for values in zip(*held_out, strict=True))
+    table.add_row("all", *_row(probability, is_loop))
+    Console().print(table)
+    for one in reliability(probability, is_loop):
+        print(f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.said:.3f}, {one.share:.3f} are loops")
+    everything = fitted(found, kinds)
+    write_json(out, everything.to_json())
+    print(everything)
 
 
-def pairs(path: Path, *, weights: str) -> Pairs:
-    """The evidence of the candidates of one drive, and which are loops."""
-    params = sglpr_jax.load(weights)
-    drive = read(path, None if weights == "sglpr" else params)
-    frames = compared(drive, CandidateFinder(params), path.parent / "compared")
-    candidates = [one for frame in frames for one in frame.candidates]
-    apart = distances([(one.query, one.match) for one in candidates], drive.world_from_lidar)
-    evidence = np.array([one.evidence for one in candidates], np.float64).reshape(-1, len(ALL))
-    loop, other = apart <= min(LOOP_M, drive.other_m / 2), apart > drive.other_m
-    return Pairs(evidence[loop | other], loop[loop | other])
+def _row(probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"]) -> list[str]:
+    """Counts of right and wrong pairs, with the shares of the right and the numbers of the wrong ones above limits."""
+    right, wrong = probability[is_loop], probability[~is_loop]
+    shares = [f"{(right >= limit).mean():.2f}" if len(right) else "" for limit in (SURE, 0.5)]
+    return [str(len(right)), *shares, str(len(wrong)), *(str((wrong >= limit).sum()) for limit in (SURE, 0.5))]
+
+
+def known(found: Sequence[Pairs]) -> tuple[Evidence, Bool[np.ndarray, " n"]]:
+    """Evidence of the pairs of several drives that are certainly loops or none, and which are loops."""
+    evidence = Evidence(*map(np.concatenate, zip(*(one.evidence for one in found), strict=True)))
+    chosen = np.concatenate([one.is_known for one in found])
+    is_loop = np.concatenate([one.is_loop for one in found])
+    return Evidence(*(values[chosen] for values in evidence)), is_loop[chosen]
+
+
+def fitted(found: Sequence[Pairs], kinds: Sequence[str]) -> LoopModel:
+    """Model of some drives, of which each kind counts alike."""
+    counts = Counter[str]()
+    for kind, one in zip(kinds, found, strict=True):
+        counts[kind] += int(one.is_known.sum())
+    each = zip(kinds, found, strict=True)
+    shares = np.concatenate([np.full(one.is_known.sum(), PAIRS / max(counts[kind], 1)) for kind, one in each])
+    sceneries = ", ".join(dict.fromkeys(kind.split("-")[0] for kind in kinds))
+    evidence, is_loop = known(found)
+    about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(found)} simulated drives ({sceneries})"
+    return fit(evidence, is_loop, weights=shares, made_with=f"{about}; benchmarks/quality/fit_loops.py")
+
+
+def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pairs:
+    """The candidates of one drive that the motion allows. With `breaks`, the motion is unknown in the middle."""
+    drive, params = read(path), sglpr_jax.load(weights)
+    finder = CandidateFinder(params, keyframe_m=KEYFRAME_M)
+    empty = CandidateFinder(params, keyframe_m=KEYFRAME_M)
+    frames = compared(drive, empty, path.parent / "compared", odometry=odometry, breaks=breaks)
+    poses, found = drive.odometry(odometry), []
+    for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
+        pose = None if poses is None else poses[i]
+        continues = not (breaks and i == len(frames) // 2)
+        found += finder.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame, continues=continues)
+    found = [one for one in found if one.evidence.deviation <= finder.present_drift.max_deviation]
+    fits = [transform(*(float(value) for value in one.alignment[:3])) for one in found]
+    errors = pose_errors([(one.query, one.match) for one in found], np.array(fits), drive.world_from_lidar)
+    evidence = np.array([one.evidence for one in found], np.float64).reshape(-1, len(ALL))
+    loops = [planar_loop(one.query, one.match, one.alignment, probability=0.5) for one in found]
+    way_m = np.maximum.accumulate([float(finder.motion.way_m(one.query)) for one in found])
+    agreeing = agree_along(finder.motion.path, loops, loops, drift=finder.present_drift)
+    neighbours = neighbour_weights(way_m, np.arange(len(found))) * np.where(agreeing, 1.0, -1.0)
+    wrong = errors.wrong if odometry != "none" else errors.wrong & (errors.storey_m <= STOREY_M)
+    return Pairs(Evidence(*evidence.T), neighbours, errors.right, errors.right | wrong)
 
 
 if __name__ == "__main__":

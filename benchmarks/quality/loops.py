@@ -27,6 +27,7 @@ from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
 from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import settled
@@ -78,7 +79,7 @@ class Simulated:
             poses = drive.poses.world_from_lidar
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(drive, params, odometry, f"town {town}")
-            kept, rejected = settled(drive, detector.supported, odometry, DetectorConfig(), registered=self.registered)
+            kept, rejected = settled(drive, detector.loops, odometry, DetectorConfig(), registered=self.registered)
             rejected = [*detector.rejected, *rejected]
             sure[f"town {town}"] = report(f"town {town}", drive, poses, detector, kept, rejected, seconds)
             if self.optimized and odometry is not None:
@@ -109,7 +110,7 @@ class Images:
             poses[:, :3] = read_poses(self.data / name / "pose.txt")[[int(frame) for frame in recording.ids]]
             odometry = drifted(poses, seed=self.seed) if self.odometry else None
             detector, seconds = detect(recording, params, odometry, name)
-            kept, rejected = settled(recording, detector.supported, odometry, DetectorConfig(), registered=False)
+            kept, rejected = settled(recording, detector.loops, odometry, DetectorConfig(), registered=False)
             rejected = [*detector.rejected, *rejected]
             sure[name] = report(name, recording, poses, detector, kept, rejected, seconds)
             log_odds = detector.model.log_odds(Evidence.stack([one.evidence for one in detector.candidates]))
@@ -144,20 +145,22 @@ class Speed:
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         image = finder.seen(records[0]).image
         for frame, row in enumerate(rows):
-            finder.add_seen(Seen(row, image, records[0].mounting), time=frame / 10, compared=Compared([], None))
+            finder.add_seen(Seen(row, image, records[0].mounting), time=frame / 10, compared=Compared(NO_FITS, None))
         clock = iter(np.arange(1_000.0, 1_000.0 + 2 * self.repeats))
-        rules = finder.config.rivals
-        rivals, further = rules.of_query + rules.of_match, np.arange(finder.config.further)
+        rules, nearest = finder.config, np.zeros(finder.config.further, int)
+        others = rules.exact_cohort + rules.exact_near_cohort
+        cohort = np.zeros(rules.cohort + rules.near_cohort, int)
         spectra, there = query_spectra(image), finder.stored.spectra(np.zeros(1, int))
         peak = finder.comparer.search(spectra, there).one(0)
         for name, work in (
             ("image and descriptor", lambda i: finder.seen(records[i % 20])),
-            ("query", lambda i: finder.index.query(rows[i], 3, exclude=finder._excluded(500.0, None, continues=True))),
+            ("query", lambda i: finder.index.query(rows[i], rules.further)),
             ("rotations", lambda i: jax.block_until_ready(query_spectra(image))),
-            ("coarse comparison", lambda i: finder.comparer.possible(spectra, further)),
-            ("comparison", lambda i: finder.comparer.search(spectra, there * finder.config.candidates)),
+            ("coarse comparison", lambda i: finder.comparer.coarse(spectra, finder.stored.spectra(nearest))),
+            ("comparison", lambda i: finder.comparer.search(spectra, there * rules.candidates)),
             ("refinement", lambda i: jax.block_until_ready(refined(image, image, peak))),
-            ("rivals", lambda i: finder.comparer.search(spectra, there * rivals)),
+            ("other places, coarse", lambda i: finder.comparer.coarse(spectra, finder.stored.spectra(cohort))),
+            ("other places", lambda i: finder.comparer.search(spectra, there * others)),
             ("all of it", lambda i: detector.add(records[i % 20], time=float(next(clock)))),
         ):
             for i in range(self.repeats):  # compiles all programs, some of which only later frames use

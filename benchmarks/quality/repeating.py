@@ -5,10 +5,10 @@
     python -m benchmarks.quality.repeating build/test --odometry drifting --sensors vlp16
     python -m benchmarks.quality.repeating build/test --odometry exact --sceneries rooms corridor car_park --optimized
 
-Reads the drives that `repeating_scans.py` has rendered. A loop is wrong if its scans are farther apart than the
-scenery's `other_m`: 20 m outdoors, 4 to 9 m indoors. Revisits are scans within half of that (at most 5 m) of one
-that is 30 s older. Odometry is the true poses, exact or with drift (`loops.drifted`). Results are kept beside the
-drives, in `found-ODOMETRY.jsonl`; with the same model and settings, a drive is searched once.
+Reads the drives that `repeating_scans.py` has rendered. A loop is wrong if its pose is wrong (`drives.PoseErrors`).
+Revisits are scans within 3 m of one on the same storey from which at least 30 m were travelled. Odometry is the true
+poses, exact or with drift (`loops.drifted`). Results are kept beside the drives, in `found-ODOMETRY.jsonl`; with the
+same model and settings, a drive is searched once.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from benchmarks.quality.drives import Odometry, compared, distances, read
+from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
 from sglpr_jax.loops import optimization
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
@@ -36,8 +36,7 @@ from sglpr_jax.loops.joint import accepted
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.optimization import trajectory_error
 
-REVISIT_M, AGE_S = 5.0, 30.0
-SURE = 0.99
+REVISIT_M, WAY_M = 3.0, 30.0
 
 
 def main(
@@ -101,31 +100,31 @@ def _rows(path: Path) -> Iterator[dict[str, Any]]:
 def searched(path: Path, *, odometry: Odometry, optimized: bool, weights: str) -> dict[str, Any]:
     """The loops of one drive, judged by the true poses."""
     params, drive = sglpr_jax.load(weights), read(path)
-    poses, times, other_m = drive.world_from_lidar, drive.times, drive.other_m
+    poses, times = drive.world_from_lidar, drive.times
     given = drive.odometry(odometry)
     detector = LoopDetector(params)
     frames = compared(drive, CandidateFinder(params), path.parent / "compared", odometry=odometry)
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if given is None else given[i]
         detector.add_seen(seen, time=float(times[i]), odometry=pose, compared=frame)
-    loops = detector.loops if given is None else accepted(detector.supported, given)[0]
-    revisited = revisits(poses[:, :3, 3], times, min(REVISIT_M * drive.scale, other_m / 2))
-    apart = distances([(loop.query, loop.match) for loop in loops], poses)
-    right = {loop.query for loop, metres in zip(loops, apart, strict=True) if metres <= other_m}
-    pairs = distances([(one.query, one.match) for one in detector.candidates], poses)
-    sure = np.array([float(detector.model.probability(one.evidence)) >= SURE for one in detector.candidates], bool)
+    drift = detector.finder.present_drift
+    loops = detector.loops if given is None else accepted(detector.loops, given, drift=drift)[0]
+    revisited = revisits(poses[:, :3, 3], REVISIT_M * drive.scale, WAY_M * drive.scale)
+    errors = pose_errors(
+        [(one.query, one.match) for one in loops], np.array([one.match_from_query for one in loops]), poses
+    )
+    right = {loop.query for loop, ok in zip(loops, errors.right, strict=True) if ok}
     moved = _moved(given, loops, poses) if optimized and given is not None else {}
     return {
         "drive": path.stem,
         **drive.about,
         "scans": len(poses),
         "loops": len(loops),
-        "wrong": int((apart > other_m).sum()),
-        "sure_of_wrong": _surest(loops, apart > other_m),
+        "wrong": int(errors.wrong.sum()),
+        "in_plane": int((errors.wrong & (errors.storey_m <= STOREY_M)).sum()),
+        "sure_of_wrong": _surest(loops, errors.wrong),
         "revisits": int(revisited.sum()),
         "found": int(sum(frame in right for frame in np.flatnonzero(revisited))),
-        "sure_pairs": int((sure & ((pairs <= other_m / 2) | (pairs > other_m))).sum()),
-        "sure_loops": int((sure & (pairs <= other_m / 2)).sum()),
         **moved,
     }
 
@@ -143,11 +142,12 @@ def _surest(loops: Sequence[Loop], wrong: Bool[np.ndarray, " n"]) -> float:
     return max((loop.probability for loop, is_wrong in zip(loops, wrong, strict=True) if is_wrong), default=0.0)
 
 
-def revisits(positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " n"], near_m: float) -> np.ndarray:
-    """Which scans come near one that is `AGE_S` older."""
+def revisits(positions: Float[np.ndarray, "n 3"], near_m: float, way_m: float) -> Bool[np.ndarray, " n"]:
+    """Which scans come near an earlier one after at least `way_m` metres of travelled distance."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     found = np.zeros(len(positions), bool)
-    for i, (position, time) in enumerate(zip(positions, times, strict=True)):
-        old = positions[times <= time - AGE_S]
+    for i, position in enumerate(positions):
+        old = positions[way <= way[i] - way_m]
         found[i] = len(old) > 0 and np.linalg.norm(old - position, axis=1).min() < near_m
     return found
 
@@ -155,15 +155,13 @@ def revisits(positions: Float[np.ndarray, "n 3"], times: Float[np.ndarray, " n"]
 def report(rows: Sequence[dict[str, Any]]) -> None:
     """Print a table by scenery for each kind of drive, and what it comes to."""
     for revisit in dict.fromkeys(row["revisit"] for row in rows):
-        table = Table(
-            "scenery", "scans", "loops", "wrong", "recall", f"pairs >= {SURE}", "of which loops", title=revisit
-        )
+        table = Table("scenery", "scans", "loops", "wrong", "of these in the plane", "recall", title=revisit)
         chosen = [row for row in rows if row["revisit"] == revisit]
         for scenery in (*dict.fromkeys(row["scenery"] for row in chosen), "all"):
             some = [row for row in chosen if scenery in ("all", row["scenery"])]
             total = {name: sum(row[name] for row in some) for name in some[0] if isinstance(some[0][name], int)}
             recall = f"{total['found'] / total['revisits']:.3f}" if total["revisits"] else ""
-            counts = (total["scans"], total["loops"], total["wrong"], recall, total["sure_pairs"], total["sure_loops"])
+            counts = (total["scans"], total["loops"], total["wrong"], total["in_plane"], recall)
             table.add_row(scenery, *map(str, counts))
         Console().print(table)
     for row in rows:

@@ -25,12 +25,10 @@ from rich.table import Table
 import sglpr_jax
 from benchmarks.quality.drives import distances
 from benchmarks.quality.map_closures import peer_python, run_peer
-from benchmarks.quality.repeating import REVISIT_M, revisits
+from benchmarks.quality.repeating import REVISIT_M, WAY_M, revisits
 from sglpr_jax.data.record import Record
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.comparison import Comparer
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.probability import DEFAULTS, models
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.stored_scans import StoredScans
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
@@ -49,15 +47,15 @@ DRIVES = tuple(
 )
 
 
-class ByScanContext(Comparer):
-    """Comparison with the nearest scans by Scan Context."""
+class ByScanContext(StoredScans):
+    """Stored scans whose nearest ones are those by Scan Context."""
 
     def nearest(
-        self, descriptor: Float32[np.ndarray, " d"], k: int, excluded: Bool[np.ndarray, " n"]
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
     ) -> Int[np.ndarray, " j"]:
-        """Up to k frames that are nearest over all rotations, in order."""
-        allowed = np.flatnonzero(~excluded)
-        apart = scan_context_distance(descriptor[None], self.stored.index.descriptors[allowed])[0]
+        """Up to k scans that are nearest over all rotations, in order."""
+        allowed = np.flatnonzero(among)
+        apart = scan_context_distance(descriptor[None], self.index.descriptors[allowed])[0]
         return allowed[np.argsort(apart, kind="stable")[:k]]
 
 
@@ -66,9 +64,7 @@ class ScanContextFinder(CandidateFinder):
 
     def __init__(self, params: Params):
         super().__init__(params)
-        self.stored = StoredScans(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
-        known = self.comparer
-        self.comparer = ByScanContext(self.stored, self.motion, known.config, known.verification, known.drift)
+        self.stored = ByScanContext(Index.empty(NUMBERS, weights_hash=self.index.weights_hash))
 
     def seen(self, record: Record) -> Seen:
         """The matrix of Scan Context in place of the descriptor."""
@@ -113,7 +109,7 @@ def main(
             scenery, scans=scans, seed=int(seed), sensor=sensor, revisit=revisit, rate_hz=10.0
         )
         other_m = REPEATING[scenery].other_m
-        context = LoopDetector(params, model=models(DEFAULTS)[""])
+        context = LoopDetector(params)
         context.finder = ScanContextFinder(params)
         rows = {
             "ours": detected(LoopDetector(params), recording, other_m),
@@ -158,7 +154,7 @@ def _counts(
     loops: int, wrong: int, found: set[int], recording: SimulatedRecording, other_m: float, seconds: float
 ) -> Counts:
     positions: Float[np.ndarray, "n 3"] = recording.poses.world_from_lidar[:, :3, 3]
-    revisited = np.flatnonzero(revisits(positions, recording.poses.times, min(REVISIT_M, other_m / 2)))
+    revisited = np.flatnonzero(revisits(positions, min(REVISIT_M, other_m / 2), WAY_M))
     right = sum(frame in found for frame in revisited.tolist())
     return Counts(loops, wrong, right, len(revisited), seconds / len(recording))
 

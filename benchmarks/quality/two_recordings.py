@@ -98,7 +98,7 @@ def searched(params: Params, content: dict[str, np.ndarray], name: str, odometry
         paths=tuple(Path(f"{i}") for i in range(len(times))),
         read=lambda path, labels, lasers: Record(),
     )
-    loops, rejected = settled(recording, detector.supported, given, detector.config, registered=False)
+    loops, rejected = settled(recording, detector.loops, given, detector.config, registered=False)
     found = FoundLoops(recording, len(times), tuple(loops), tuple(rejected), given, model=detector.model)
     return found, detector.finder
 

@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 import sglpr_jax
-from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query, Stored
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.pose_search import Peak
@@ -107,6 +107,26 @@ class Drive:
         return Seen((drawn / np.linalg.norm(drawn)).astype(np.float32), self._images[frame % IMAGES].copy(), None)
 
 
+class _ByTruePose(Comparer):
+    """Comparison of which the nearest scan is the result, at its true pose."""
+
+    def __init__(self, known: Comparer, drive: Drive):
+        vars(self).update(vars(known))
+        self.__dict__["drive"] = drive
+
+    def compare(self, query: Query, searched: Stored, *others: Stored, possible: Any = None) -> Fits:
+        rows = searched.nearest(query.descriptor, 3, self.possible(searched.frames, query.frame))
+        if not len(rows) or not self.drive.closes:
+            return NO_FITS
+        match = int(searched.frames[rows[0]])
+        return Fits(np.array([match]), Peak(*(values[None] for values in peak(self.drive, query.frame, match))))
+
+    def candidate(self, query: Query, fits: Fits, row: int, image_of: Any) -> Candidate:
+        one = fits.peaks.one(row)
+        values: Any = (one.x, one.y, one.yaw, np.diag([0.05, 0.05, 0.005]) ** 2, 0.9, 0.3)
+        return Candidate(query.frame, int(fits.frames[row]), Alignment(*values), Evidence.of(0.3, 0.3, 0.5, 2.0))
+
+
 class WithoutImages(CandidateFinder):
     """A finder whose image comparisons give the true pose at once."""
 
@@ -114,22 +134,18 @@ class WithoutImages(CandidateFinder):
         vars(self).update(vars(finder))
         self._drive = drive
 
-    def _compared(self, seen, time, pose, clock, *, continues) -> Compared:
-        query = len(self)
-        rows = self.comparer.similar(seen.descriptor, self._excluded(time, pose, continues=continues))
-        link = None if pose is not None or not query else self._peak(query, self.motion.keyframe)
-        self.motion.add(clock, pose=pose, link=link)
-        if not len(rows) or not self._drive.closes:
-            return Compared([], link)
-        match = int(self.stored.frames[rows[0]])
-        peak = self._peak(query, match)
-        values: Any = (peak.x, peak.y, peak.yaw, np.diag([0.05, 0.05, 0.005]) ** 2, 0.9, 0.3)
-        return Compared([Candidate(query, match, Alignment(*values), Evidence.of(0.2, 0.3, 0.9, 0.3, 0.3, 1e3))], link)
+    @property
+    def comparer(self) -> Comparer:
+        return _ByTruePose(super().comparer, self._drive)
 
-    def _peak(self, query: int, match: int) -> Peak:
-        """The pose of a query in the frame of its match."""
-        moved = inverse(self._drive.pose(match)) @ self._drive.pose(query)
-        return Peak(*map(np.asarray, (moved[0, 3], moved[1, 3], yaw_of(moved), 0.9, 0.3, 0.2)))
+    def _link(self, query: Query | None, clock: float) -> Peak | None:
+        return peak(self._drive, len(self), self.motion.keyframe) if len(self) else None
+
+
+def peak(drive: Drive, query: int, match: int) -> Peak:
+    """The pose of a query in the frame of its match."""
+    moved = inverse(drive.pose(match)) @ drive.pose(query)
+    return Peak(*map(np.asarray, (moved[0, 3], moved[1, 3], yaw_of(moved), 0.9, 0.3, 0.2)))
 
 
 def measured(

@@ -17,14 +17,14 @@ from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.unfinished import COLUMNS, columns, compared_of
 from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax live scan 1"
+FORMAT = "sglpr-jax live scan 2"
 ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "continues": bool, "mounting": dict | None}
 """JSON values of each scan."""
 ARRAYS = {
     "descriptor": Column("float32", ("d",)),
     "image": Column("uint8", ("h", "h")),
     "pose": Column("float64", (4, 4), optional=True),
-    **{name: COLUMNS[name] for name in ("pairs", "alignments", "evidence", "links")},
+    **{name: COLUMNS[name] for name in ("counts", "fitted", "fits", "links")},
 }
 """Arrays of each scan."""
 

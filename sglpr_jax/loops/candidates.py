@@ -16,6 +16,7 @@ from sglpr_jax.loops.config import MOTION_DRIFT, CandidateConfig, DriftModel, Ve
 from sglpr_jax.loops.given import check_is
 from sglpr_jax.loops.motion import Motion
 from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
+from sglpr_jax.loops.odometry_check import OdometryCheck
 from sglpr_jax.loops.pose_search import Peak, search_near
 from sglpr_jax.loops.seen import Seen, described
 from sglpr_jax.loops.spectra import query_spectra
@@ -30,6 +31,10 @@ FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""
 
 
+AGREE_M, AGREE_DEG = 0.8, 6.0
+"""Maximum distance and angle between two poses that agree, in metres and degrees."""
+
+
 class Compared(NamedTuple):
     """The results of all image comparisons of a frame."""
 
@@ -37,6 +42,12 @@ class Compared(NamedTuple):
     """Fits with earlier scans, from which the candidate is chosen."""
     link: Peak | None
     """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
+
+
+def agree(first: Peak, second: Peak) -> bool:
+    """Whether two poses of a scan in one frame agree."""
+    turned = abs((float(first.yaw) - float(second.yaw) + np.pi) % (2 * np.pi) - np.pi)
+    return bool(np.hypot(first.x - second.x, first.y - second.y) <= AGREE_M and turned <= np.radians(AGREE_DEG))
 
 
 class CandidateFinder:
@@ -80,6 +91,9 @@ class CandidateFinder:
         """Frames whose scans cannot be read."""
         self._times = GrowingArray(np.empty(0))
         self._keyframe: tuple[int, UInt8[np.ndarray, "m m"]] | None = None
+        self.odometry_check = OdometryCheck()
+        self._checked: UInt8[np.ndarray, "m m"] | None = None
+        """Image of the last scan with which the odometry was checked."""
         self._last: tuple[int, UInt8[np.ndarray, "m m"]] | None = None
         """Number and image of the motion's keyframe and of the last frame, as in `stored`. None for empty images."""
 
@@ -161,8 +175,13 @@ class CandidateFinder:
         spectra = None if empty or compared is not None else query_spectra(detail, config=self.verification)
         query = None if empty else Query(frame, seen.descriptor, detail, spectra)
         self.has_odometry = pose is not None
-        link = self._link(query, clock) if compared is None and pose is None and continues else None
-        link = link if compared is None else compared.link
+        link = None if compared is None else compared.link
+        if not continues:
+            self.odometry_check.restart()
+        if upright is not None:
+            link = self._check_odometry(query, upright, link, known=compared is not None)
+        elif compared is None and continues:
+            link = self._link(query, clock)
         self.motion.add(clock, pose=upright, link=link, continues=continues)
         self.mountings.append(seen.mounting)
         comparer = self.comparer
@@ -196,7 +215,7 @@ class CandidateFinder:
     @property
     def present_drift(self) -> DriftModel:
         """Drift of the odometry or, without odometry, of the motion estimated from the images."""
-        return self.drift if self.has_odometry else self.motion_drift
+        return self.odometry_check.drift(self.drift) if self.has_odometry else self.motion_drift
 
     @property
     def knows_height(self) -> bool:
@@ -217,18 +236,36 @@ class CandidateFinder:
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
     def _link(self, query: Query | None, clock: float) -> Peak | None:
-        """Pose of the next frame in the frame of the motion's keyframe, by the image of the keyframe or, if this is
-        ambiguous, by that of the last frame. None if there is no image to compare with."""
-        found = None
+        """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
+
+        The image is compared with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
+        ambiguous poses that agree are trusted, too.
+        """
+        found: list[Peak] = []
         for frame, image in dict(filter(None, (self._keyframe, self._last))).items():
-            if query is None or query.spectra is None:
+            if query is None:
                 break
             prior = self.motion.prior(clock, frame)
             one = self._linked(query, image, prior)
-            found = one if found is None else found
-            if self.motion.is_trusted(one, prior):
-                return self._from_keyframe(one, frame, image, query.image)
-        return found
+            trusted = self.motion.is_trusted(one, prior)
+            found.append(self._from_keyframe(one, frame, image, query.image))
+            if trusted:
+                return found[-1]
+        return found[0] if len(found) > 1 and agree(*found) else None
+
+    def _check_odometry(
+        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Peak | None, *, known: bool
+    ) -> Peak | None:
+        """Compare the odometry with the images, if this is due. Returns the pose in the frame of the last such scan."""
+        if query is None or not self.odometry_check.is_due(pose):
+            self.odometry_check.skip()
+            return None
+        if not known and self._checked is not None:
+            nowhere = np.full(3, np.nan)
+            link = self._from_image(self._linked(query, self._checked, nowhere), self._checked, query.image)
+        self.odometry_check.add(pose, link)
+        self._checked = query.image
+        return link
 
     def _linked(self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]) -> Peak:
         spectrum = image_spectrum(image, self.verification)
@@ -243,13 +280,17 @@ class CandidateFinder:
         errors of such links add up."""
         key = self.motion.keyframe
         if frame != key or self.motion.is_next_keyframe(link):
-            pose = jax.device_get(refined(query, image, link, config=self.verification))
-            link = link._replace(x=pose.x, y=pose.y, yaw=pose.yaw)
+            link = self._from_image(link, image, query)
         if frame == key:
             return link
         poses = self.motion.poses
         moved = inverse(poses[key]) @ poses[frame] @ transform(float(link.x), float(link.y), float(link.yaw))
         return link._replace(x=moved[0, 3], y=moved[1, 3], yaw=yaw_of(moved))
+
+    def _from_image(self, link: Peak, image: UInt8[np.ndarray, "m m"], query: UInt8[np.ndarray, "m m"]) -> Peak:
+        """A link with a refined pose."""
+        pose = jax.device_get(refined(query, image, link, config=self.verification))
+        return link._replace(x=pose.x, y=pose.y, yaw=pose.yaw)
 
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self):

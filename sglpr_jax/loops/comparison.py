@@ -26,10 +26,10 @@ from sglpr_jax.loops.verification import Alignment, refined
 BATCH, COARSE_BATCH = 8, 32
 """Number of matches of a batch, of the exact and of the coarse comparison."""
 EVERY = np.array(True)
-LOOKALIKE = 0.6
-"""Correlation of a query with the best other place of an unknown drive. It counts until the drive has other places."""
-SYMMETRIES = 4
-"""Number of rotations at which a lookalike may fit."""
+MIN_AMBIGUITY = 0.8
+"""Ambiguity ratio from which few other places are enough to show that places repeat."""
+SURROUNDINGS_M, SYMMETRIES = 300.0, 4
+"""Side of the square in which a lookalike may stand, in metres, and number of rotations at which it may fit."""
 
 
 Spectra = Complex[Array, "2 s t f"]
@@ -175,28 +175,28 @@ class Comparer:
         deviation = float(self._deviations(query.frame, fits)[row])
         distracts = self._excluded(query.frame, match, peak, fits)
         if deviation <= self.drift.max_deviation:
-            distracts |= self._deviations(query.frame, fits) > self.drift.max_deviation
+            contradicts = self._deviations(query.frame, fits) > self.drift.max_deviation
+            distracts |= contradicts & ~self.are_joined(match, fits.frames)
         distracts &= fits.frames != match
-        correlations = fits.peaks.correlation[distracts]
+        ambiguity = float(max(fits.peaks.correlation[distracts], default=0.0)) / max(float(peak.correlation), 1e-6)
         other = self.elsewhere(fits.frames, query.frame) | self.elsewhere(fits.frames, match)
-        if other.sum() < self.config.exact_cohort:
-            correlations = np.append(correlations, LOOKALIKE)
-        ambiguity = max(correlations, default=0.0) / max(float(peak.correlation), 1e-6)
+        if other.sum() < self.config.exact_cohort and ambiguity < MIN_AMBIGUITY:
+            ambiguity = np.nan  # other places are not known yet
         alignment = jax.device_get(refined(query.image, image_of(match), peak, config=self.verification))
         evidence = Evidence.of(alignment.second, ambiguity, deviation, self.surprise(query.frame, match))
         return Candidate(query.frame, match, alignment, evidence)
 
     def surprise(self, query: int, match: int) -> float:
-        """Logarithm of the searched poses over those within the uncertainty of the motion.
+        """Logarithm of all poses that a sensor may have over those within the uncertainty of the motion.
 
-        A lookalike fits at any pose. Its rotation is one of `SYMMETRIES`, because walls stand at right angles.
+        A lookalike stands anywhere in the surroundings. Its rotation is one of `SYMMETRIES`, because walls stand at
+        right angles.
         """
-        rules, area = {"drift": self.drift, "level": self.level}, (2 * self.verification.max_shift_m) ** 2
+        rules = {"drift": self.drift, "level": self.level}
         spread = planar_spread(self.motion.path, np.array([query]), np.array([match]), **rules)[0]
-        most = self.drift.max_deviation
-        allowed = np.pi * most**2 * np.sqrt(np.linalg.det(spread[:2, :2]))
-        rotation = max(2 * most * np.sqrt(spread[2, 2]), 2 * np.pi / SYMMETRIES)
-        return float(max(np.log(area / allowed), 0) + max(np.log(2 * np.pi / rotation), 0))
+        area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
+        rotation = max(2 * self.drift.max_deviation * np.sqrt(spread[2, 2]), 2 * np.pi / SYMMETRIES)
+        return float(max(np.log(SURROUNDINGS_M**2 / area), 0) + max(np.log(2 * np.pi / rotation), 0))
 
     def _highest(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
         """The flagged fit with the highest correlation, not of the query's own pass."""

@@ -55,7 +55,7 @@ class DriftModel:
         return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"
 
 
-MOTION_DRIFT = DriftModel(metres_per_metre=0.015, degrees_per_metre=0.03, yaw_deg=2.5)
+MOTION_DRIFT = DriftModel(metres_per_metre=0.01, degrees_per_metre=0.03, yaw_deg=2.5)
 """Drift of the motion that is used if there is no odometry (`loops.motion`)."""
 
 
@@ -81,8 +81,10 @@ class MotionConfig:
     keyframe_m: float = 3.0
     keyframe_deg: float = 20.0
     """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
-    guess_factor: float = 1000.0
+    guess_factor: float = 300.0
     """Length of measured path with the same drift as one metre of guessed motion, in metres."""
+    ambiguous_share: float = 0.25
+    """Share of a step that counts as guessed if its link is ambiguous."""
     least_step_m: float = 0.5
     unknown_step_m: float = 12.0
     """Minimum length of a guessed step, and its length if the speed was never known, in metres."""
@@ -173,14 +175,12 @@ class ConsistencyConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SequenceConfig:
-    """Selection and weights of neighbouring frames."""
+    """Selection and weights of neighbouring pairs."""
 
     window_m: Positive = 50.0
     """Travelled distance before and after a query within which other queries are its neighbours, in metres."""
     independent_m: Positive = 25.0
     """Travelled distance after which two frames are nearly independent, in metres: the reach of an image."""
-    max_log_odds: Positive = 4.0
-    """Maximum log odds that a neighbour adds or subtracts."""
 
     def __post_init__(self):
         """Raises ValueError if a field has an invalid value."""

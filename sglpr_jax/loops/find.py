@@ -14,19 +14,20 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.gravity import with_odometry
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import OnBadScan, check_readable
+from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.add_scans import add_scans
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig, DriftModel
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import check_is, given_poses
-from sglpr_jax.loops.joint import check_odometry, settled
+from sglpr_jax.loops.joint import AXES, check_odometry, settled
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.mountings import mountings_of
 from sglpr_jax.loops.probability import LoopModel
 from sglpr_jax.loops.reasons import counted, listed
 from sglpr_jax.loops.registration import check_installed, is_installed
-from sglpr_jax.loops.scale import Search, divided_loop, divided_rejected
+from sglpr_jax.loops.scale import Search, divided_loop, divided_rejected, scaled_drift
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.upright import check_level
 from sglpr_jax.models.params import Params
@@ -53,7 +54,7 @@ class FoundLoops:
     unregistered: int = 0
     """Number of loops that were not registered because the search was stopped."""
     config: DetectorConfig = DetectorConfig()
-    """Settings of the search."""
+    """Settings of the search. The drift is that of the odometry, estimated from the drive."""
     empty: int = 0
     """Number of searched scans that are almost empty."""
     scale: Scale = 1
@@ -81,9 +82,12 @@ class FoundLoops:
 
     def divided(self, given: Search, scale: Scale) -> "FoundLoops":
         """Results in metres of a search whose input `given` was multiplied by `scale`."""
+        drift = scaled_drift(self.config.drift, 1 / scale)
         return dataclasses.replace(
             self,
-            **given._asdict(),
+            recording=given.recording,
+            odometry=None if self.odometry is None else given.odometry,
+            config=dataclasses.replace(given.config, drift=drift),
             loops=tuple(divided_loop(loop, scale) for loop in self.loops),
             rejected=tuple(divided_rejected(one, scale) for one in self.rejected),
             scale=scale,
@@ -194,9 +198,26 @@ def searched(
         acceptance=_acceptance(detector),
     )
     _check_scans(detector.finder, recording)
-    loops, rejected = _accepted(
-        detector, recording, odometry, registered=registered, scale=scale, should_stop=should_stop
-    )
+    if odometry is not None and detector.finder.odometry_check.is_unusable:
+        warn(
+            f"{recording.name}: the odometry contradicts the motion between neighbouring scans and is ignored; check "
+            f"that the poses belong to these scans and use these axes: {AXES}"
+        )
+        return searched(
+            given._replace(odometry=None),
+            params,
+            model=model,
+            registered=registered,
+            scale=scale,
+            on_bad_scan=on_bad_scan,
+            kept_in=None,
+            should_stop=should_stop,
+            on_progress=on_progress,
+        )
+    if odometry is not None:
+        config = dataclasses.replace(config, drift=detector.finder.present_drift)
+    options = {"registered": registered, "scale": scale, "should_stop": should_stop}
+    loops, rejected = _accepted(detector, recording, odometry, config, **options)
     missing = detector.finder.missing
     found = FoundLoops(
         recording,
@@ -269,16 +290,15 @@ def _accepted(
     detector: LoopDetector,
     recording: Recording,
     odometry: Float[np.ndarray, "n 4 4"] | None,
+    config: DetectorConfig,
     *,
     registered: bool,
     scale: Scale,
     should_stop: Callable[[], bool],
 ) -> tuple[tuple[Loop, ...], tuple[Rejected, ...]]:
     """Joint acceptance of the loops of a detector. Returns accepted and rejected loops, and warns of wrong odometry."""
-    config = detector.config
-    loops, rejected = settled(
-        recording, detector.loops, odometry, config, registered=registered, should_stop=should_stop
-    )
+    options = {"registered": registered, "knows_height": detector.finder.knows_height, "should_stop": should_stop}
+    loops, rejected = settled(recording, detector.loops, odometry, config, **options)
     rejected = _in_order([*rejected, *detector.rejected, *detector.undecided()])
     if odometry is not None:
         name, mounting = recording.name, mountings_of(recording)

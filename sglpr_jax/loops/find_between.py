@@ -260,7 +260,8 @@ def between_searches(
     for upright in sets:
         some = [_of_lidars(loop, found, offset) for loop in upright]
         if registered:
-            some, little = registered_loops(found[1].recording, found[0].recording, some, should_stop=should_stop)
+            both = found[1].recording, found[0].recording
+            some, little = registered_loops(*both, some, knows_height=knows_height, should_stop=should_stop)
             rejected = [*rejected, *little]
         if some:
             aligned.append(_aligned(some, found, finders, joined, offset, drift))

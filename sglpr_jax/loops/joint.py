@@ -14,8 +14,8 @@ from sglpr_jax.data.warning import warn
 from sglpr_jax.loops.config import ConsistencyConfig, DetectorConfig, DriftModel
 from sglpr_jax.loops.consistency import agree, largest_consistent_set
 from sglpr_jax.loops.drift import deviations
-from sglpr_jax.loops.loop import Loop, Reason, Rejected
-from sglpr_jax.loops.mountings import AnyMounting, mountings_of
+from sglpr_jax.loops.loop import UNKNOWN_HEIGHT_M, Loop, Reason, Rejected
+from sglpr_jax.loops.mountings import AnyMounting, mountings_of, upright_from_lidar
 from sglpr_jax.loops.planar import frames_of
 from sglpr_jax.loops.registration import register
 from sglpr_jax.loops.scale import scaled_drift
@@ -130,6 +130,7 @@ def settled(
     config: DetectorConfig,
     *,
     registered: bool,
+    knows_height: bool = True,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[list[Loop], list[Rejected]]:
     """Accept the loops of a whole drive jointly and, with `registered`, check the overlap of their scans.
@@ -145,13 +146,19 @@ def settled(
         rules = {"mounting": mountings_of(recording), "drift": config.drift, "config": config.consistency}
         kept, rejected = accepted(loops, odometry, **rules)
     if registered:
-        kept, others = registered_loops(recording, recording, kept, should_stop=should_stop)
+        options = {"knows_height": knows_height, "should_stop": should_stop}
+        kept, others = registered_loops(recording, recording, kept, **options)
         rejected = rejected + others
     return kept, rejected
 
 
 def registered_loops(
-    queries: Recording, matches: Recording, loops: list[Loop], *, should_stop: Callable[[], bool]
+    queries: Recording,
+    matches: Recording,
+    loops: list[Loop],
+    *,
+    knows_height: bool = True,
+    should_stop: Callable[[], bool],
 ) -> tuple[list[Loop], list[Rejected]]:
     """Registered loops, and loops whose scans contradict the images. After a stop, the others are unchanged.
 
@@ -159,6 +166,7 @@ def registered_loops(
       queries: Recording of the queries.
       matches: Recording of the matches, which may be the same.
       loops: Loops, with the rows of these recordings.
+      knows_height: Whether the odometry measures height. If not, the storey is unknown.
       should_stop: If it returns True, no further loop is registered.
     """
     kept, rejected = [], []
@@ -172,6 +180,10 @@ def registered_loops(
             rejected.append(Rejected(dataclasses.replace(loop, overlap=0.0), "little overlap"))
             continue
         fine = dataclasses.replace(loop, **found._asdict())
+        if not knows_height:  # registration does not tell equal storeys apart
+            up = np.zeros(6)
+            up[:3] = upright_from_lidar(queries.mounting_of(loop.query))[2, :3]
+            fine = dataclasses.replace(fine, covariance=fine.covariance + UNKNOWN_HEIGHT_M**2 * np.outer(up, up))
         if found.overlap >= MIN_OVERLAP or (found.overlap >= LITTLE_OVERLAP and agrees(fine, loop)):
             kept.append(fine)
         else:

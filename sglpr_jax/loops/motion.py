@@ -20,6 +20,8 @@ from sglpr_jax.loops.transforms import inverse, transform, travelled, yaw_of
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
+GAP_M = 1000.0
+"""Travelled distance that counts for an unknown motion, as after a restart, in metres."""
 UNKNOWN_M = 1e6
 """Length of measured path with the same drift as an unknown motion, in metres: the sensor may be anywhere."""
 NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8")]
@@ -65,6 +67,7 @@ class Motion:
         for one, level in zip(motions, levels, strict=True):
             numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
             numbers["guessed_m"] += UNKNOWN_M * len(last)
+            numbers["travelled"] += GAP_M * len(last)
             for name in ("segment", "travelled", "guessed_m") if len(last) else ():
                 numbers[name] += last[name] + (name == "segment")
             found._numbers.extend(numbers)
@@ -104,14 +107,16 @@ class Motion:
         link: Peak | None = None,
         continues: bool = True,
     ) -> None:
-        """Add a frame at `time` (seconds), by its `pose` from odometry or its peak `link` over the keyframe.
+        """Add a frame at `time`, by its `pose` from odometry or its peak `link` over the keyframe.
 
-        With `continues=False`, the motion since the last frame is unknown, as after a restart.
+        An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown, as
+        after a restart.
         """
         if len(self) and not continues:
             return self._begin(time, self.poses[-1] if pose is None else pose)
-        key, coasts = self.keyframe, False
-        if pose is None and link is not None and self.is_trusted(link, self.prior(time, key)):
+        key, coasts, ambiguous = self.keyframe, False, False
+        if pose is None and link is not None:
+            ambiguous = not self.is_trusted(link, self.prior(time, key))
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < self.config.max_coasting:
             pose, coasts = self._expected(time), True
@@ -123,9 +128,11 @@ class Motion:
         else:
             moved, rotation = self.moved(key, pose)
             travelled = self.travelled[key] + moved
-            guessed_m = self._drifted_m(time) if coasts else self.guessed_m[key]
+            guessed_m = self.guessed_m[key]
+            if coasts or ambiguous:
+                guessed_m = self._drifted_m(time, share=1.0 if coasts else self.config.ambiguous_share)
             self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
-            if not self._is_far(moved, rotation) and not coasts:
+            if not (self._is_far(moved, rotation) or coasts or ambiguous):
                 return
         self.keyframe = len(self) - 1
 
@@ -135,7 +142,7 @@ class Motion:
         return self._is_far(float(np.hypot(link.x, link.y)), abs((yaw + np.pi) % (2 * np.pi) - np.pi))
 
     def _is_far(self, metres: float, radians: float) -> bool:
-        return metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg)
+        return bool(metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg))
 
     def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
         """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
@@ -164,28 +171,34 @@ class Motion:
             time,
             self.poses[-1] @ transform((self._m_per_s or 0.0) * seconds, 0.0, 0.0),
             segment=int(self.segments[-1]) + 1,
-            travelled=self.travelled[-1],
+            travelled=self.travelled[-1] + self._guessed_step_m(time),
             guessed_m=self._drifted_m(time),
         )
 
     def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
         """Add the first frame after an unknown motion."""
         segment, guessed_m = int(self.segments[-1]) + 1, self.guessed_m[-1] + UNKNOWN_M
-        self._append(time, pose, segment=segment, travelled=self.travelled[-1], guessed_m=guessed_m)
+        self._append(time, pose, segment=segment, travelled=self.travelled[-1] + GAP_M, guessed_m=guessed_m)
         self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
 
-    def _drifted_m(self, time: float) -> float:
-        """Next value of `guessed_m`, if the motion since the last frame is a guess."""
-        config, step_m = self.config, self.config.unknown_step_m
+    def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
+        """Next value of `guessed_m`, if the motion since the last frame is a guess, or if this share of it is."""
+        step_m = max(self._guessed_step_m(time), self.config.least_step_m)
+        return self.guessed_m[-1] + share * self.config.guess_factor * step_m
+
+    def _guessed_step_m(self, time: float) -> float:
+        """Length of the next step, if it is a guess."""
         if len(self) > 1 and self.segments[-1] == self.segments[-2]:
-            step_m = self._last_step_m
-        elif self._m_per_s is not None:
-            step_m = abs(self._m_per_s) * (time - self._times[-1])
-        return self.guessed_m[-1] + config.guess_factor * max(step_m, config.least_step_m)
+            return self._last_step_m
+        if self._m_per_s is not None:
+            return abs(self._m_per_s) * (time - self._times[-1])
+        return self.config.unknown_step_m
 
     @property
     def _last_step_m(self) -> float:
-        return self.moved(len(self) - 2, self.poses[-1])[0] if len(self) > 1 else 0.0
+        """Length of the longer one of the last two steps. The last scan may have been added twice."""
+        ends = self.poses[-3:, :3, 3]
+        return float(np.linalg.norm(np.diff(ends, axis=0), axis=1).max(initial=0.0))
 
     def _append(
         self,
@@ -205,7 +218,7 @@ class Motion:
 
     def way_m(self, frames: Any) -> Any:
         """Travelled distance at one or more frames, in metres, with the guessed motion."""
-        return self.travelled[frames] + self.guessed_m[frames] / self.config.guess_factor
+        return self.travelled[frames]
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""

@@ -38,8 +38,8 @@ from sglpr_jax.models.params import Params
 from sglpr_jax.retrieval.index import Index
 from sglpr_jax.retrieval.index_rows import check_scale, check_weights
 
-NO_DRIFT = DriftModel(metres_per_metre=0.0, degrees_per_metre=0.0, height_per_metre=0.0)
-"""Drift of the poses of a map."""
+NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
+"""Drift of the poses of a map. It is small, but large over the unknown motion of a query (`motion.UNKNOWN_M`)."""
 NO_LOOPS = np.zeros((0, 2), np.int64)
 
 
@@ -211,7 +211,9 @@ class PlaceMap:
         query = Query(len(self), seen.descriptor, image, query_spectra(image))
         comparer = Comparer(scaled_map._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
         fits = comparer.compare(query, scaled_map)
-        best = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")[:candidates].tolist()
+        order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
+        _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
+        best = order[np.sort(first)][:candidates].tolist()
         found = [comparer.candidate(query, fits, row, self.image) for row in best]
         answers = [scaled_map._answer(one, seen, float(model.probability(one.evidence))) for one in found]
         return [one.divided(self.scale) for one in with_shared_probability(answers)]

@@ -21,11 +21,13 @@ KNOTS: Mapping[str, tuple[float, ...]] = {
     "peak_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "ambiguity_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "deviation": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0),
-    "surprise": (0.0, 1.0, 2.0, 3.0, 4.0, 6.0),
+    "surprise": (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0),
 }
 """Knots of the piecewise linear functions. Outside the knots they are constant."""
 RISING = ("surprise",)
 """Fields whose functions rise. The other functions fall."""
+MAX_STRENGTH = 4.0
+"""Maximum log odds with which a pair counts as neighbour."""
 RIDGE = 0.02
 """Weight of the penalty on squared steps between knots. It keeps the functions finite and smooth."""
 
@@ -36,11 +38,12 @@ class Evidence(NamedTuple):
     peak_ratio: Float[np.ndarray, "*n"]
     """Correlation at the second-best pose of the two images, divided by that at the best pose."""
     ambiguity_ratio: Float[np.ndarray, "*n"]
-    """Correlation with the best other place, divided by the correlation with the match."""
+    """Correlation with the best other place, divided by the correlation with the match. NaN if the drive has too few
+    other places to tell."""
     deviation: Float[np.ndarray, "*n"]
     """Deviation of the pose from the motion, in standard deviations."""
     surprise: Float[np.ndarray, "*n"]
-    """Logarithm of the searched poses over those that the motion allows. 0 if the motion says nothing."""
+    """Logarithm of all poses over those that the motion allows. 0 if the motion says nothing."""
 
     @classmethod
     def of(cls, peak_ratio: Any, ambiguity_ratio: Any, deviation: Any, surprise: Any) -> "Evidence":
@@ -55,8 +58,8 @@ class Evidence(NamedTuple):
 
 
 ALL = Evidence._fields
-OF_PAIR = ("peak_ratio", "ambiguity_ratio")
-"""Fields that count for each of several neighbouring pairs. The motion between two passes is common to all of them."""
+OF_REPETITION = ("peak_ratio", "ambiguity_ratio")
+"""Fields that compare the match with other poses and places."""
 
 
 class Curve(NamedTuple):
@@ -64,10 +67,12 @@ class Curve(NamedTuple):
 
     knots: tuple[float, ...]
     values: tuple[float, ...]
+    unknown: float = 0.0
+    """Value for NaN."""
 
     def __call__(self, numbers: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Evaluate the function."""
-        return np.interp(numbers, self.knots, self.values)
+        return np.where(np.isnan(numbers), self.unknown, np.interp(numbers, self.knots, self.values))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,13 +101,16 @@ class LoopModel:
     def log_odds_without_ambiguity(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """Log odds if no other pose and place fitted as well as the match."""
         parts = self.contributions(evidence)
-        best = {name: max(self.curves[name].values) for name in OF_PAIR if name in parts}
+        best = {name: max(self.curves[name].values) for name in OF_REPETITION if name in parts}
         return np.asarray(self.bias + sum((parts | best).values()))
 
-    def log_odds_of_images(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Log odds if the motion says nothing: a pose of one standard deviation, without surprise."""
-        nothing = {"deviation": np.ones_like(evidence.deviation), "surprise": np.zeros_like(evidence.surprise)}
-        return self.log_odds(evidence._replace(**nothing))
+    def strength(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
+        """How much a pair says about its neighbours: its log odds by the images, from 0 to `MAX_STRENGTH`.
+
+        The motion between the two passes is common to neighbours, so it does not count again.
+        """
+        nothing = {"deviation": np.zeros_like(evidence.deviation), "surprise": np.zeros_like(evidence.surprise)}
+        return np.clip(self.log_odds(evidence._replace(**nothing)), 0.0, MAX_STRENGTH)
 
     def to_json(self) -> dict[str, Any]:
         """Convert to a JSON value for `from_json`."""
@@ -116,9 +124,12 @@ class LoopModel:
         Raises ValueError if it is invalid. The message names `source`, its file.
         """
         try:
-            curves = {name: Curve(**{k: tuple(v) for k, v in one.items()}) for name, one in value["curves"].items()}
+            curves = {
+                name: Curve(tuple(one["knots"]), tuple(one["values"]), one["unknown"])
+                for name, one in value["curves"].items()
+            }
             model = cls(curves, value["bias"], value["made_with"])
-            numbers = [model.bias, *(number for curve in curves.values() for part in curve for number in part)]
+            numbers = [model.bias, *(n for one in curves.values() for n in (*one.knots, *one.values, one.unknown))]
             fits = set(curves) <= set(ALL) and all(math.isfinite(number) for number in numbers)
             fits = fits and all(_is_curve(curve) for curve in curves.values())
         except (TypeError, KeyError, AttributeError, OverflowError):
@@ -155,8 +166,9 @@ def fit(
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     weights = np.ones(len(is_loop)) if weights is None else weights
+    missing = [np.isnan(getattr(evidence, name)) for name in names]
     columns = np.concatenate([_rises(name, getattr(evidence, name)) for name in names], axis=1)
-    columns = np.column_stack([columns, np.ones(len(is_loop))])
+    columns = np.column_stack([columns, *missing, np.ones(len(is_loop))]).astype(np.float64)
     sign = np.where(is_loop, 1.0, -1.0)
 
     def cost(steps: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
@@ -172,7 +184,8 @@ def fit(
         count = len(KNOTS[name]) - 1
         rise = np.concatenate([[0.0], np.cumsum(steps[used : used + count])])
         values = rise if name in RISING else (rise[-1] - rise)
-        curves[name] = Curve(KNOTS[name], tuple(np.round(values, 4).tolist()))
+        unknown = float(steps[len(steps) - 1 - len(names) + names.index(name)])
+        curves[name] = Curve(KNOTS[name], tuple(np.round(values, 4).tolist()), round(unknown, 4))
         used += count
     return LoopModel(curves, float(steps[-1]), made_with)
 
@@ -183,7 +196,7 @@ def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k
     """
     knots = np.array(KNOTS[name])
     made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
-    return made if name in RISING else 1 - made
+    return np.nan_to_num(made if name in RISING else 1 - made, nan=0.0)
 
 
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
@@ -200,7 +213,8 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
 
     gain, shift = minimize(cost, np.array([1.0, 0.0]), method="L-BFGS-B", bounds=[(0.0, None), (None, None)]).x
     curves = {
-        name: Curve(curve.knots, tuple(gain * value for value in curve.values)) for name, curve in model.curves.items()
+        name: Curve(curve.knots, tuple(gain * value for value in curve.values), gain * curve.unknown)
+        for name, curve in model.curves.items()
     }
     return LoopModel(curves, float(gain * model.bias + shift), made_with)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from sglpr_jax.loops.loop import DEGENERATE_M, Reason, Rejected
 
 MEANING: dict[Reason, str] = {
-    "little similarity": "The images or the descriptors of the two scans fit too little.",
+    "little similarity": "The images fit too little, or the motion makes the pose improbable.",
     "repeats": "Another place, or another pose, fits about as well.",
     "too few neighbours": "Too few of the frames before and after the query show the same place.",
     "contradicts the motion": "The motion between the two frames, estimated from their images, leads elsewhere.",

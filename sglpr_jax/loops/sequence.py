@@ -1,15 +1,15 @@
-"""Sequential test: the evidence of neighbouring frames is added or subtracted.
+"""Sequential test: what neighbouring frames say about a pair.
 
-The log odds of neighbouring pairs are added if their matches move as their queries do, and subtracted if they match
+Neighbouring pairs support a pair if their matches move as their queries do, and speak against it if they match
 elsewhere. Neighbours that see the same walls are not independent, so the weight of a frame depends on the distance
-travelled since the previous one. The motion between the two passes is common to all neighbours, and counts once.
+travelled since the previous one. Only what their images say counts: the motion between the two passes is common to all.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from scipy.special import logit
 
 from sglpr_jax.loops.config import ConsistencyConfig, DriftModel, SequenceConfig
@@ -57,7 +57,7 @@ def tested_log_odds(
     if not pairs:
         return np.zeros(0)
     evidence = Evidence.stack([one.evidence for one in pairs])
-    own, found = model.log_odds_of_images(evidence), np.empty(len(pairs))
+    strength, added = model.strength(evidence), np.empty(len(pairs))
     loops, way_m = [one.loop for one in pairs], np.maximum.accumulate([one.way_m for one in pairs])
     for start in range(0, len(pairs), BLOCK):
         end = min(start + BLOCK, len(pairs))
@@ -65,34 +65,25 @@ def tested_log_odds(
         last = int(np.searchsorted(way_m, way_m[end - 1] + config.window_m, side="right"))
         options = {"mounting": mounting, "drift": drift, "config": consistency}
         agreeing = agree_along(path, loops[start:end], loops[first:last], **options)
-        rows = np.arange(start, end) - first
-        found[start:end] = added_log_odds(own[first:last], agreeing, way_m[first:last], rows, config=config)
-    return model.log_odds(evidence) + found
+        weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first, config=config)
+        added[start:end] = (np.where(agreeing, 1.0, -1.0) * weights) @ strength[first:last]
+    return model.log_odds(evidence) + added
 
 
-def added_log_odds(
-    log_odds: Float[np.ndarray, " n"],
-    agreeing: Bool[np.ndarray, "k n"],
-    way_m: Float[np.ndarray, " n"],
-    rows: np.ndarray,
-    *,
-    config: SequenceConfig = SequenceConfig(),
-) -> Float[np.ndarray, " k"]:
-    """Log odds that the neighbours of some pairs add to these.
+def neighbour_weights(
+    way_m: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], *, config: SequenceConfig = SequenceConfig()
+) -> Float[np.ndarray, "k n"]:
+    """Weight of each pair as neighbour of some pairs: the share of it that is new on the way to them.
 
     Arguments:
-      log_odds: Log odds of each pair alone, without the motion.
-      agreeing: Whether each of `rows` agrees with each pair: their matches move as their queries do.
       way_m: Travelled distance at each query, in metres, in increasing order.
-      rows: The k pairs whose log odds are computed.
-      config: Selection and weights of neighbours.
+      rows: The pairs whose neighbours are weighed.
+      config: Selection of neighbours.
     """
-    counted = np.clip(log_odds, 0, config.max_log_odds)
     fresh = 1 - np.exp(-np.concatenate([[0.0], np.diff(way_m), [0.0]]) / config.independent_m)
     before = rows[:, None] > np.arange(len(way_m))[None]
     weight = np.where(before, fresh[None, 1:], fresh[None, :-1]) * (rows[:, None] != np.arange(len(way_m))[None])
-    weight = weight * (np.abs(way_m[rows][:, None] - way_m[None]) <= config.window_m)
-    return (np.where(agreeing, 1.0, -1.0) * weight) @ counted
+    return weight * (np.abs(way_m[rows][:, None] - way_m[None]) <= config.window_m)
 
 
 def verdict(pair: Pair, model: LoopModel, min_probability: float) -> Reason:

@@ -1,7 +1,6 @@
 """The benchmarks of loops: scored on drives and on images, timed, fitted, and beside the closures of maps."""
 
 import importlib
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from recordings import of_scans
 
 import sglpr_jax
 from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.probability import ALL, default_model
 from sglpr_jax.sim import write_dataset
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording
@@ -44,7 +44,6 @@ def test_the_parts_of_a_loop_are_timed():
         "coarse comparison",
         "comparison",
         "refinement",
-        "rivals",
         "all of it",
     ]
 
@@ -59,11 +58,8 @@ def rendered(tmp_path_factory):
 
 
 def test_models_of_loops_are_fitted_and_written(rendered, tmp_path):
-    output = printed("quality.fit_loops", str(rendered), "--weights", "sglpr", "--out", str(tmp_path / "models.json"))
-    assert "sglpr: LoopModel" in output
-    found = json.loads((tmp_path / "models.json").read_text())
-    assert len(found) == 2 and set(found[""]["curves"]) == {"correlation", "second", "rival", "cells"}
-    assert "2 simulated drives (town, walls)" in found[""]["made_with"]
+    output = printed("quality.fit_loops", str(rendered), "--out", str(tmp_path / "model.json"))
+    assert "LoopModel" in output and set(default_model(tmp_path / "model.json").curves) == set(ALL)
 
 
 def test_loops_are_counted_by_scenery_and_drives_are_searched_once(rendered):
@@ -113,7 +109,7 @@ def test_peers_are_counted_where_places_repeat():
     assert seen[0].descriptor.shape == (1200,)
     for one in seen:
         finder.index.add(one.descriptor, times=None, positions=None)
-    assert finder.comparer.nearest(seen[0].descriptor, 2, np.array([True, False, False])).tolist() in ([1, 2], [2, 1])
+    assert finder.stored.nearest(seen[0].descriptor, 2, np.array([False, True, True])).tolist() in ([1, 2], [2, 1])
     detector = LoopDetector(finder.params)
     detector.finder = peers.ScanContextFinder(finder.params)
     found = peers.detected(detector, recording, 20.0)

@@ -33,7 +33,7 @@ LINES = {
         "--poses",
         "no",
     ),
-    "loops": ("scans", "--out", "found", "--seq", "1_0", "--near-m", "inf", "--candidates.rivals.age", "0", "1e-1"),
+    "loops": ("scans", "--out", "found", "--seq", "1_0", "--keyframe-m", "1e-1", "--candidates.recent-m", "50"),
     "map": ("scans", "--poses", "poses.tum", "--out", "a.safetensors", "--spacing-m", "0", "--skip-bad"),
     "peers": ("train", "rinet", "towns", "1e3", "--out", "run", "--learning-rate", "1e-3", "--held-out", "no"),
     "relocalize": ("drive", "--map", "a.safetensors", "--frame", "0", "--sensor-height", "estimate"),
@@ -104,10 +104,10 @@ def test_a_dump_needs_the_required_flags_and_does_nothing(tmp_path, monkeypatch)
 
 
 def test_flags_override_the_file_and_the_file_overrides_the_defaults(file):
-    path = file({"recording": "scans", "out": "found", "seq": "07", "register": True, "candidates.elsewhere": 5})
+    path = file({"recording": "scans", "out": "found", "seq": "07", "register": True, "candidates.cohort": 5})
     found = parsed("loops", "drive", "--config", path, "--seq", "08", "--no-register", "--candidates.candidates", "7")
     assert (found.recording, found.out, found.source.seq) == (Path("drive"), Path("found"), "08")
-    assert (found.register, found.candidates.candidates, found.candidates.elsewhere) == (False, 7, 5)
+    assert (found.register, found.candidates.candidates, found.candidates.cohort) == (False, 7, 5)
     assert found.candidates.min_cells == 20
 
 
@@ -136,10 +136,9 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
         ("loops", {"seq": 7}, ["seq: expected a value of type str, found 7"]),
         ("loops", {"out": None}, ["out: expected a value of type str, found None"]),
         ("loops", {"register": 1}, ["register: expected a value of type bool, found 1"]),
-        ("loops", {"near-m": "1e-4"}, ["near-m: expected a value of type float, found '1e-4'"]),
-        ("loops", {"near-m": True}, ["near-m: expected a value of type float, found True"]),
+        ("loops", {"keyframe-m": "1e-4"}, ["keyframe-m: expected a value of type float, found '1e-4'"]),
+        ("loops", {"keyframe-m": True}, ["keyframe-m: expected a value of type float, found True"]),
         ("loops", {"degenerate": "sometimes"}, ["degenerate: expected one of 'keep', 'drop', found 'sometimes'"]),
-        ("loops", {"candidates.rivals.age": [1]}, ["candidates.rivals.age: expected a list of 2, found [1]"]),
         (
             "loops",
             {"sensor-height": "high"},

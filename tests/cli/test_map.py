@@ -43,7 +43,7 @@ def test_a_scan_of_the_map_finds_itself_in_it(command, town, poses, tmp_path):
     assert ended.status == 0, ended.error
     assert "08/000020" in ended.out and "000020.bin in the map" in ended.out
     answers = json.loads((tmp_path / "pose.json").read_text())
-    assert len(answers) == 3 and answers[0]["place"] == "08/000020" and answers[0]["probability"] > 0.99
+    assert len(answers) == 3 and answers[0]["place"] == "08/000020" and answers[0]["probability"] > 0.5
     position = open_recording(town, "08").positions[20]
     np.testing.assert_allclose(np.array(answers[0]["world_from_query"])[:3, 3], position, atol=0.05)
 

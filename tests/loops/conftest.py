@@ -1,11 +1,16 @@
 """A simulated town that is driven through twice, in opposite directions, and two laps of an ellipse by odometry."""
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.loops.comparison import Candidate, Comparer
 from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.probability import Evidence
+from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.sim import Sensor, recording
 from sglpr_jax.sim.recording import SimulatedRecording
 
@@ -31,6 +36,26 @@ def revisit(drive) -> tuple[int, int]:
     query, match = np.unravel_index(apart.argmin(), apart.shape)
     assert apart[query, match] < 3
     return int(max(query, match)), int(min(query, match))
+
+
+@pytest.fixture
+def compare_only(monkeypatch) -> Callable[[Mapping[int, tuple[int, np.ndarray]]], None]:
+    """`compare_only({query: (match, match_from_query)})` replaces the comparison of images: each query has this match,
+    with clear images, and with the deviation of this pose from the motion."""
+
+    def only(pairs: Mapping[int, tuple[int, np.ndarray]]) -> None:
+        def candidates(self, query, fits, image_of, **_) -> list[Candidate]:
+            if query.frame not in pairs:
+                return []
+            match, pose = pairs[query.frame]
+            planar = np.array([[*pose[:2, 3], yaw_of(pose)]])
+            (deviation,) = self.deviations(query.frame, np.array([match]), planar)
+            alignment = Alignment(*planar[0], np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
+            return [Candidate(query.frame, match, alignment, Evidence.of(0.3, 0.3, deviation, 3.0))]
+
+        monkeypatch.setattr(Comparer, "candidates", candidates)
+
+    return only
 
 
 @pytest.fixture(scope="session")

@@ -2,17 +2,14 @@
 
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from sglpr_jax.loops import unfinished
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.comparison import Candidate
+from sglpr_jax.loops.comparison import NO_FITS, Fits
 from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.stored_scans import StoredScans
-from sglpr_jax.loops.verification import Alignment
 from sglpr_jax.retrieval.index import Index
 
 WANTED = {"format": unfinished.FORMAT, "name": "08", "recording": "a"}
@@ -35,16 +32,9 @@ def fake_frames(seed: int = 0, frames: int = 5) -> list[tuple[Seen | None, Compa
     for frame in range(frames):
         seen = Seen(draw.normal(size=4).astype(np.float32), draw.integers(0, 255, (6, 6), np.uint8), None)
         link = Peak(*map(np.asarray, draw.normal(size=6))) if frame else None
-        pairs = fake_candidates(seed) if frame == 4 else []
-        found.append((None if frame == 1 else seen, Compared(pairs, link)))
+        fits = Fits(np.array([1, 3]), Peak(*draw.normal(size=(6, 2)))) if frame == 4 else NO_FITS
+        found.append((None if frame == 1 else seen, Compared(fits, link)))
     return found
-
-
-def fake_candidates(seed: int = 0) -> list[Candidate]:
-    draw = np.random.default_rng(seed)
-    x, y, yaw = map(jnp.asarray, draw.normal(size=3))
-    evidence = Evidence(*map(np.asarray, draw.normal(size=len(Evidence._fields))))
-    return [Candidate(4, 1, Alignment(x, y, yaw, jnp.eye(3), jnp.array(0.5), jnp.array(0.4)), evidence)]
 
 
 def recalled(folder: Path, wanted: dict) -> list:

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.drift import deviations, on_other_floor, step_deviations
+from sglpr_jax.loops.drift import deviations, floor_deviations, planar_deviations, step_deviations
 from sglpr_jax.loops.driven_path import DrivenPath
 from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.loop_files import read_g2o, write_g2o
-from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.planar import inverted
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import upright_from_lidar
 
@@ -51,6 +51,20 @@ def test_by_hand_straight_on():
     )
     both = deviations([turned, ahead_is_its_right], odometry)
     np.testing.assert_allclose(both[1] ** 2 - both[0] ** 2, 9 / 1.89, rtol=0.01)
+
+
+def test_a_pose_deviates_as_much_as_its_inverse():
+    """The later frame may be the query or the match."""
+    path, rng = DrivenPath.of(drifted(town(), percent=0.5, deg_per_100m=0.2)), np.random.default_rng(0)
+    query, match = np.array([300, 700, 500]), np.array([40, 120, 480])
+    poses = path.poses[match]
+    apart = inverse(poses) @ path.poses[query]
+    pose = np.column_stack([apart[:, :2, 3], np.arctan2(apart[:, 1, 0], apart[:, 0, 0])])
+    pose += rng.normal(scale=[0.5, 0.5, 0.01], size=(3, 3))
+    rules = {"drift": SHARP, "level": np.eye(3)}
+    found = planar_deviations(path, query, match, pose, **rules)
+    np.testing.assert_allclose(planar_deviations(path, match, query, inverted(pose), **rules), found, rtol=0.01)
+    assert found.max() > 1
 
 
 def test_a_guessed_path_drifts_in_every_direction():
@@ -147,7 +161,8 @@ def test_another_floor_is_seen_in_a_world_that_is_tilted(roll, pitch):
     world = np.eye(4)
     world[:3, :3] = Rotation.from_euler("xy", [roll, pitch]).as_matrix()
     for rise_m, other in ((0.0, False), (3.5, True)):
-        poses = world @ ramp(3, rise_m)
-        frames = np.array([len(poses) - 101, len(poses) - 201])
-        peaks = Peak(*np.zeros((6, 2)))
-        assert (on_other_floor(DrivenPath.of(poses), frames, peaks, DriftModel()) == other).all()
+        path = DrivenPath.of(world @ ramp(3, rise_m))
+        query, match = np.array([299, 299, 99]), np.array([199, 99, 199])
+        rules = {"drift": DriftModel(), "level": world[:3, :3].T}
+        found = floor_deviations(path, query, match, np.zeros((3, 3)), **rules)
+        assert ((found > DriftModel().max_deviation) == other).all()

@@ -7,7 +7,8 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
+from sglpr_jax.loops.comparison import NO_FITS
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.stored_scans import StoredScans
@@ -64,7 +65,7 @@ def driven(params, step_m: float, turn_deg: float = 0.0, *, frames: int = 41, **
     seen = Seen(np.zeros(finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
     for frame in range(frames):
         pose = transform(step_m * frame, 0.0, np.radians(turn_deg * frame))
-        finder.add_seen(seen, odometry=pose, compared=Compared([], None))
+        finder.add_seen(seen, odometry=pose, compared=Compared(NO_FITS, None))
     return finder
 
 
@@ -76,10 +77,10 @@ def test_a_scan_near_the_last_stored_one_is_not_stored_unless_the_sensor_turned(
 
 
 def test_after_a_motion_that_is_unknown_a_scan_is_stored(params):
-    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=10), keyframe_m=1e9)
+    finder = CandidateFinder(params, keyframe_m=1e9)
     seen = Seen(np.zeros(finder.index.width, np.float32), np.ones((152, 152), np.uint8), None)
     for _ in range(3):
-        finder.add_seen(seen, compared=Compared([], None))  # without links the motion is unknown
+        finder.add_seen(seen, compared=Compared(NO_FITS, None))  # without links the motion is unknown
     assert finder.stored.frames.tolist() == [int(np.flatnonzero(finder.motion.segments == k)[0]) for k in range(3)]
 
 

@@ -50,10 +50,11 @@ def test_scans_between_those_of_the_map_find_themselves_however_they_are_turned(
         found = places.relocate(params, Record(points=rotated(drive.points(frame), angle)))
         true = drive.poses.world_from_lidar[frame]
         error = inverse(true) @ found[0].world_from_query
-        assert found[0].probability > 0.8 and np.linalg.norm(error[:2, 3]) < 0.4
+        assert found[0].probability > 0.5 and np.linalg.norm(error[:2, 3]) < 0.4
         assert abs(np.angle(np.exp(1j * (yaw_of(error) + angle)))) < np.radians(2)
         assert found[0].place == f"08/{drive.ids[frame - 1]}" or found[0].place == f"08/{drive.ids[frame + 1]}"
         assert [one.probability for one in found] == sorted((one.probability for one in found), reverse=True)
+        assert len({one.place for one in found}) == len(found)
 
 
 @pytest.mark.slow
@@ -98,7 +99,7 @@ def test_two_days_are_merged_and_places_that_both_have_are_taken_once(drive, fir
     np.testing.assert_array_equal(both.world_from_place[MAPPED // 2 :], shifted)
     found = both.relocate(params, drive.record(20), candidates=2)
     assert {one.place.split("/")[0] for one in found} == {"08", "sunday"}
-    assert min(one.probability for one in found) > 0.98
+    assert min(one.probability for one in found) > 0.5
 
     again = both.merged(places).merged(other)
     assert again.index.to_bytes() == both.index.to_bytes()

@@ -64,7 +64,7 @@ def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 @pytest.mark.parametrize("degrees", TILTS.values(), ids=TILTS)
 def test_the_pose_of_a_revisit_is_that_of_the_raw_points_and_is_registered(drive, revisit, params, degrees):
     recording, poses = tilted_drive(drive, degrees)
-    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=0, min_travelled_m=0.0))
+    finder = CandidateFinder(params, config=CandidateConfig(recent_m=1e-9))
     query, match = revisit
     finder.add(recording.record(match))
     (found,) = finder.add(recording.record(query))
@@ -184,7 +184,7 @@ def test_the_covariance_of_a_motion_in_another_frame_is_that_of_drawn_motions():
 @pytest.mark.slow
 def test_each_frame_of_a_stream_has_its_own_mounting(drive, revisit, params):
     query, match = revisit
-    finder = CandidateFinder(params, config=CandidateConfig(exclude_frames=0, min_travelled_m=0.0))
+    finder = CandidateFinder(params, config=CandidateConfig(recent_m=1e-9))
     tilts = [tilted_from_level(TILTS[name]) for name in ("sideways", "forward")]
     for frame, tilted in zip((match, query), tilts, strict=True):
         points = transformed(tilted, drive.points(frame)).astype(np.float32)
