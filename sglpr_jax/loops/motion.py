@@ -20,6 +20,8 @@ from sglpr_jax.loops.transforms import inverse, transform, travelled, yaw_of
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
+STANDING_M = 0.05
+"""Maximum length of a step of a sensor that stands, in metres."""
 GAP_M = 1000.0
 """Travelled distance that counts for an unknown motion, as after a restart, in metres."""
 UNKNOWN_M = 1e6
@@ -153,13 +155,28 @@ class Motion:
         return np.array([moved[0, 3], moved[1, 3], yaw_of(moved)])
 
     def _expected(self, time: float) -> Float[np.ndarray, "4 4"] | None:
-        if len(self) < 2 or self.segments[-1] != self.segments[-2] or self._times[-1] <= self._times[-2]:
+        moving = self._last_moving
+        if moving is None:
             return None
-        steps = (time - self._times[-1]) / (self._times[-1] - self._times[-2])
+        before, after = moving
+        steps = (time - self._times[-1]) / (self._times[after] - self._times[before])
         if not 0 < steps <= MOST_STEPS:
             return None
-        last = inverse(self.poses[-2]) @ self.poses[-1]
+        last = inverse(self.poses[before]) @ self.poses[after]
         return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
+
+    @property
+    def _last_moving(self) -> tuple[int, int] | None:
+        """Rows, from the end, of the last step with a known motion. A scan that was added twice makes no step."""
+        for after in (-1, -2):
+            before = after - 1
+            if len(self) < -before or self.segments[after] != self.segments[before]:
+                return None
+            moved = float(np.linalg.norm((self.poses[after] - self.poses[before])[:3, 3]))
+            known = self._times[after] > self._times[before]
+            if known and (moved > STANDING_M or after == -2):
+                return before, after
+        return None
 
     def _guess(self, time: float) -> None:
         """Add a frame whose motion is unknown."""

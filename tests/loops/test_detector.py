@@ -119,7 +119,7 @@ def test_scans_of_one_pass_are_no_candidates(drive, params, revisit, metres, the
 
 def model_of(log_odds: float) -> LoopModel:
     """A model that says the same of every pair without neighbours."""
-    return LoopModel({"support": Curve((-1.0, 1.0), (-4.0, 4.0))}, log_odds, "by hand")
+    return LoopModel({"deviation": Curve((0.0, 1.0), (0.0, 0.0))}, log_odds, "by hand")
 
 
 THERE_AND_BACK = np.stack(

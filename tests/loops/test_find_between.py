@@ -8,7 +8,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.data.readable import only
 from sglpr_jax.loops.find_between import find_loops_between
-from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.motion import GAP_M, Motion
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
 SCANS = 26
@@ -76,4 +76,4 @@ def test_joined_motions_keep_their_poses_and_are_apart():
     joined = Motion.joined([first, second], [np.eye(3)] * 2)
     assert joined.segments.tolist() == [0] * 5 + [1] * 3 and len(joined) == 8
     np.testing.assert_array_equal(joined.poses[5:], second.poses)
-    np.testing.assert_allclose(np.diff(joined.travelled), [4, 4, 4, 4, 0, 4, 4])
+    np.testing.assert_allclose(np.diff(joined.travelled), [4, 4, 4, 4, GAP_M, 4, 4])

@@ -12,8 +12,8 @@ from sglpr_jax.loops.sequence import Pair, neighbour_weights, verdict
 from sglpr_jax.loops.transforms import inverse, transform
 
 REPEATS = Curve((0.5, 1.0), (8.0, 0.0))
-SURPRISE, SUPPORT = Curve((0.0, 9.0), (0.0, 9.0)), Curve((-2.0, 2.0), (-8.0, 8.0))
-MODEL = LoopModel({"ambiguity_ratio": REPEATS, "surprise": SURPRISE, "support": SUPPORT}, -6.0, "by hand")
+SURPRISE = Curve((0.0, 9.0), (0.0, 9.0))
+MODEL = LoopModel({"ambiguity_ratio": REPEATS, "surprise": SURPRISE}, -6.0, "by hand")
 
 
 def by_hand(way_m: np.ndarray, row: int, config: SequenceConfig) -> list[float]:
