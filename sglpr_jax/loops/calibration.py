@@ -106,7 +106,7 @@ def certain_pairs(
 
 @dataclasses.dataclass(frozen=True)
 class _Some:
-    """Stored scans, some of which are ignored."""
+    """Stored scans without the ignored ones."""
 
     stored: StoredScans
     kept: Bool[np.ndarray, " n"]

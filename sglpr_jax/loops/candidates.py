@@ -276,8 +276,8 @@ class CandidateFinder:
     def _from_keyframe(
         self, link: Peak, frame: int, image: UInt8[np.ndarray, "m m"], query: UInt8[np.ndarray, "m m"]
     ) -> Peak:
-        """A link with a frame as pose in the frame of the keyframe. The link to a new keyframe is refined, because the
-        errors of such links add up."""
+        """A link with a frame as pose in the frame of the keyframe. The link to a new keyframe is refined, because its
+        errors add up."""
         key = self.motion.keyframe
         if frame != key or self.motion.is_next_keyframe(link):
             link = self._from_image(link, image, query)

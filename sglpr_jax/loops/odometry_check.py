@@ -20,7 +20,7 @@ MIN_WINDOWS = 3
 NOISE, NOISE_DEG = 0.015, 0.025
 """Drift of the images themselves, per metre: of lengths, and of angles in degrees."""
 UNUSABLE, UNUSABLE_DEG = 0.3, 0.5
-"""Drift per metre from which odometry is none: of lengths, and of angles in degrees."""
+"""Drift per metre from which odometry is ignored: of lengths, and of angles in degrees."""
 
 
 class OdometryCheck:
