@@ -37,13 +37,15 @@ def test_loops_are_scored_on_images(tmp_path):
 def test_the_parts_of_a_loop_are_timed():
     options = ("--frames", "100", "--repeats", "1", "--azimuth-steps", "60", *CHEAPER)
     output = printed("quality.loops", "speed", *options)
-    assert [line.split(":")[0] for line in output.splitlines()][-8:] == [
+    assert [line.split(":")[0] for line in output.splitlines()][-9:] == [
         "image and descriptor",
         "query",
         "rotations",
         "coarse comparison",
         "comparison",
         "refinement",
+        "other places, coarse",
+        "other places",
         "all of it",
     ]
 
