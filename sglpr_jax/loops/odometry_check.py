@@ -11,6 +11,8 @@ from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
 STEP_M, STEP_DEG, MOST_FRAMES = 2.5, 15.0, 20
 """Distance and angle by odometry, and number of frames, from which a scan is compared with the last compared one."""
+MAX_STEP_M = 8.0
+"""Maximum distance of two compared scans by odometry, in metres. Images of farther ones share too little."""
 MAX_SECOND, MAX_RIDGE = 0.6, 0.6
 """Maximum second-peak ratio and ridge of a comparison that counts."""
 WINDOW_M = 30.0
@@ -56,10 +58,12 @@ class OdometryCheck:
           pose: Gravity-aligned pose by odometry.
           link: Pose in the frame of the last compared scan by the images. None if unknown.
         """
-        if self._last is None or link is None or not _is_clear(link):
+        step = np.eye(4) if self._last is None else inverse(self._last) @ pose
+        far = float(np.linalg.norm(step[:3, 3])) > MAX_STEP_M
+        if self._last is None or link is None or far or not _is_clear(link):
             self._by_odometry, self._by_images, self._way_m = np.eye(4), np.eye(4), 0.0
         else:
-            step, seen = inverse(self._last) @ pose, transform(float(link.x), float(link.y), float(link.yaw))
+            seen = transform(float(link.x), float(link.y), float(link.yaw))
             self._by_odometry, self._by_images = self._by_odometry @ step, self._by_images @ seen
             self._way_m += max(float(np.linalg.norm(one[:3, 3])) for one in (step, seen))
         self._last, self._frames = pose, 0

@@ -73,7 +73,7 @@ def _map(command: LiveCommand, report: Report) -> LiveMap:
     """Open the map, with all programs compiled."""
     params, config, odometry = load(command.weights), command.detector, command.expects_odometry
     warm_up(params, config, odometry=odometry)
-    detector = LoopDetector(params, config=config, time_unit="s")
+    detector = LoopDetector(params, config=config)
     height = command.sensor_height
     return LiveMap(detector, command.out, report=report, sensor_height=height, expects_odometry=odometry)
 

@@ -18,7 +18,6 @@ FLAGS = (
     "drift_deg_per_100m",
     "drift_height_percent",
     "min_probability",
-    "near_m",
     "keyframe_m",
     "max_places",
 )
