@@ -4,9 +4,10 @@
     python -m benchmarks.quality.repeating_peers --drives tunnel:none:21 car_park:same:21
 
 A loop is wrong if its scans are farther apart than the scenery's `other_m`; revisits are those of `repeating.py`.
-Scan Context chooses the candidates and nothing else: motion, comparison of the images and sequential test are ours, with the model of the probability for any weights. MapClosures runs in an environment of its own, which is made on
-first use, on the odometry of kiss-icp; a closure between two local maps is wrong if all of their scans are that far
-apart, and finds the scans of the newer map that are near one of the older map.
+Scan Context chooses the candidates and nothing else: motion, comparison of the images and sequential test are ours.
+MapClosures runs in an environment of its own, which is made on first use, on the odometry of kiss-icp; a closure
+between two local maps is wrong if all of their scans are that far apart, and finds the scans of the newer map that are
+near one of the older map.
 """
 
 import dataclasses
