@@ -146,7 +146,7 @@ def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pair
     errors = pose_errors([(one.query, one.match) for one in found], np.array(fits), drive.world_from_lidar)
     evidence = np.array([one.evidence for one in found], np.float64).reshape(-1, len(ALL))
     loops = [planar_loop(one.query, one.match, one.alignment, probability=0.5) for one in found]
-    way_m = np.maximum.accumulate([float(finder.motion.way_m(one.query)) for one in found])
+    way_m = np.maximum.accumulate([float(finder.motion.travelled[one.query]) for one in found])
     agreeing = agree_along(finder.motion.path, loops, loops, drift=finder.present_drift)
     neighbours = neighbour_weights(way_m, np.arange(len(found))) * np.where(agreeing, 1.0, -1.0)
     wrong = errors.wrong if odometry != "none" else errors.wrong & (errors.storey_m <= STOREY_M)

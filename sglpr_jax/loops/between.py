@@ -90,7 +90,7 @@ def probable_loops(
     for one in candidates:
         probability = float(model.probability(one.evidence))
         loop = planar_loop(one.query, one.match, one.alignment, probability=probability, knows_height=knows_height)
-        pairs.append(Pair(loop, one.evidence, float(motion.way_m(one.query))))
+        pairs.append(Pair(loop, one.evidence, float(motion.travelled[one.query])))
     rules = {"mounting": None, "drift": drift, "consistency": config.consistency, "config": config.sequence}
     log_odds = tested_log_odds(pairs, model, motion.path, **rules)
     kept, rejected = [], []

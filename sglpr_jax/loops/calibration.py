@@ -145,11 +145,11 @@ class _Drive:
 
     def pair(self, frame: int, angle: float, *, positive: bool) -> Candidate | None:
         """Pair of a frame that is rotated by `angle` (radians) and a near or far one, or None."""
-        poses, frames, way_m = self.motion.poses, self.stored.frames, self.motion.way_m(self.stored.frames)
+        poses, frames, way_m = self.motion.poses, self.stored.frames, self.motion.travelled[self.stored.frames]
         apart = np.linalg.norm(poses[frames, :3, 3] - poses[frame, :3, 3], axis=1)
         far = (apart > NEGATIVE_M) & self.comparer.elsewhere(frames, frame)
         near = (apart >= NEAR_M[0]) & (apart <= NEAR_M[1])
-        near &= np.abs(way_m - self.motion.way_m(frame)) <= SAME_PASS_M
+        near &= np.abs(way_m - self.motion.travelled[frame]) <= SAME_PASS_M
         query = self.rotated(frame, angle)
         scans = _Some(self.stored, far | near if positive else far)
         fits = self.comparer.compare(query, scans, possible=near if positive else far)

@@ -48,7 +48,7 @@ class Candidate(NamedTuple):
 
 
 class Fits(NamedTuple):
-    """Fits of a query with other scans, from which its candidate is chosen. They do not depend on any threshold."""
+    """Fits of a query with other scans, from which its candidates are chosen."""
 
     frames: Int[np.ndarray, " k"]
     """Frames of the other scans."""
@@ -208,7 +208,7 @@ class Comparer:
 
     def way_m(self, frames: Int[np.ndarray, " k"], frame: int) -> Float[np.ndarray, " k"]:
         """Travelled distance between a frame and each of others, in metres."""
-        return np.abs(self.motion.way_m(frames) - self.motion.way_m(frame))
+        return np.abs(self.motion.travelled[frames] - self.motion.travelled[frame])
 
     def elsewhere(self, frames: Int[np.ndarray, " k"], frame: int) -> Bool[np.ndarray, " k"]:
         """Whether each of some frames certainly shows another place than a frame, according to the motion."""

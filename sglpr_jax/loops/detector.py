@@ -135,7 +135,7 @@ class LoopDetector:
         if self.config.max_places is not None:
             del self.candidates[: -self.config.max_places]
         self._waiting += [self._pair(one) for one in candidates]
-        oldest_m = self.finder.motion.way_m(len(self) - 1) - self.config.sequence.window_m
+        oldest_m = self.finder.motion.travelled[len(self) - 1] - self.config.sequence.window_m
         old = [one.way_m < oldest_m for one in self._waiting]
         count = max(sum(old), len(self._waiting) - MAX_WAITING)
         self.rejected += self._verdicts(self._waiting[:count])
@@ -161,7 +161,7 @@ class LoopDetector:
             query_mounting=each[one.query],
             match_mounting=each[one.match],
         )
-        return Pair(loop, evidence, self.finder.motion.way_m(one.query))
+        return Pair(loop, evidence, float(self.finder.motion.travelled[one.query]))
 
     def _confirmed(self) -> list[Loop]:
         """New loops of the last frames that pass the sequential test."""

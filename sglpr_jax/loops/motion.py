@@ -7,7 +7,6 @@ drift grows fast. Only ratios of times count, so a drive at another speed has th
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -88,7 +87,7 @@ class Motion:
 
     @property
     def travelled(self) -> Float[np.ndarray, " n"]:
-        """Travelled distance at each frame, from keyframe to keyframe, in metres."""
+        """Travelled distance at each frame, from keyframe to keyframe and with the guessed motion, in metres."""
         return self._numbers.rows["travelled"]
 
     @property
@@ -232,10 +231,6 @@ class Motion:
     @property
     def _times(self) -> Float[np.ndarray, " n"]:
         return self._numbers.rows["time"]
-
-    def way_m(self, frames: Any) -> Any:
-        """Travelled distance at one or more frames, in metres, with the guessed motion."""
-        return self.travelled[frames]
 
     def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""

@@ -25,7 +25,7 @@ def test_links_to_keyframes_add_up():
     motion = Motion()
     for frame in range(10):  # 1 m each; the keyframe is the last frame that was more than 3 m from the one before
         motion.add(float(frame), link=link(float(frame - motion.keyframe)) if frame else None)
-    for found in ([pose[0, 3] for pose in motion.poses], motion.travelled, motion.way_m(np.arange(10))):
+    for found in ([pose[0, 3] for pose in motion.poses], motion.travelled):
         np.testing.assert_allclose(found, np.arange(10.0))
     assert motion.keyframe == 8 and set(motion.segments) == {0}
     assert [motion.is_next_keyframe(link(x)) for x in (2.9, 3.1)] == [False, True]
@@ -38,7 +38,7 @@ def test_across_a_gap_the_pose_is_a_guess_that_drifts():
     np.testing.assert_allclose([pose[0, 3] for pose in motion.poses], np.arange(most + 4.0))
     guessed = [0, 0, *range(1, most + 2), most + 1]
     np.testing.assert_allclose(motion.guessed_m, np.array(guessed) * motion.config.guess_factor)
-    np.testing.assert_allclose(motion.way_m(np.arange(most + 4)), np.arange(most + 4.0))
+    np.testing.assert_allclose(motion.travelled[: most + 4], np.arange(most + 4.0))
 
 
 WEAK = (link(1.0, correlation=0.1, second=0.03), link(1.0, second=1.4), link(1.0, ridge=0.8))
@@ -74,7 +74,7 @@ def test_odometry_is_taken_as_it_is():
         motion.add(float(frame), pose=transform(0.5 * frame, 0.0, 0.1 * frame))
     assert motion.travelled[-1] == pytest.approx(14.5) and set(motion.segments) == {0}
     known = Motion.of(motion.poses)
-    np.testing.assert_allclose(known.way_m(np.arange(30)), motion.way_m(np.arange(30)))
+    np.testing.assert_allclose(known.travelled[:30], motion.travelled[:30])
 
 
 def test_after_an_unknown_motion_nothing_is_known_about_the_way():
