@@ -26,6 +26,7 @@ from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query, Stored
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
+from sglpr_jax.loops.motion import Link
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.probability import Evidence
 from sglpr_jax.loops.seen import Seen, square_image
@@ -138,14 +139,16 @@ class WithoutImages(CandidateFinder):
     def comparer(self) -> Comparer:
         return _ByTruePose(super().comparer, self._drive)
 
-    def _link(self, query: Query | None, clock: float) -> Peak | None:
-        return peak(self._drive, len(self), self.motion.keyframe) if len(self) else None
+    def _link(self, query: Query | None, clock: float) -> Link | None:
+        if not len(self):
+            return None
+        return Link(*peak(self._drive, len(self), self.motion.keyframe), np.asarray(0.1))
 
 
 def peak(drive: Drive, query: int, match: int) -> Peak:
     """The pose of a query in the frame of its match."""
     moved = inverse(drive.pose(match)) @ drive.pose(query)
-    return Peak(*map(np.asarray, (moved[0, 3], moved[1, 3], yaw_of(moved), 0.9, 0.3, 0.2)))
+    return Peak(*map(np.asarray, (moved[0, 3], moved[1, 3], yaw_of(moved), 0.9, 0.3)))
 
 
 def measured(

@@ -23,7 +23,7 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.given import given_pose
 from sglpr_jax.loops.loop import Loop
 
-FORMAT = "sglpr-jax live 2"
+FORMAT = "sglpr-jax live 3"
 JOURNAL, LOOPS = "journal.bin", "loops.jsonl"
 SYNC_S = 5.0
 """Time after which new scans are forced to the disk, in seconds. A loss of power costs at most these scans."""

@@ -17,7 +17,7 @@ from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.unfinished import COLUMNS, columns, compared_of
 from sglpr_jax.schema import Column, check_about, check_columns
 
-FORMAT = "sglpr-jax live scan 2"
+FORMAT = "sglpr-jax live scan 3"
 ABOUT = {"name": str, "stamp": float, "time": float, "wall": float, "continues": bool, "mounting": dict | None}
 """JSON values of each scan."""
 ARRAYS = {

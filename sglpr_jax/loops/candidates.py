@@ -14,7 +14,7 @@ from sglpr_jax.loops.compared_image import within_reach
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
 from sglpr_jax.loops.config import MOTION_DRIFT, CandidateConfig, DriftModel, VerificationConfig
 from sglpr_jax.loops.given import check_is
-from sglpr_jax.loops.motion import Motion
+from sglpr_jax.loops.motion import Link, Motion
 from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
 from sglpr_jax.loops.odometry_check import OdometryCheck
 from sglpr_jax.loops.pose_search import Peak, search_near
@@ -40,11 +40,11 @@ class Compared(NamedTuple):
 
     fits: Fits
     """Fits with earlier scans, from which the candidate is chosen."""
-    link: Peak | None
+    link: Link | None
     """Pose in the frame of the keyframe, from which the motion without odometry is computed."""
 
 
-def agree(first: Peak, second: Peak) -> bool:
+def agree(first: Link, second: Link) -> bool:
     """Whether two poses of a scan in one frame agree."""
     turned = abs((float(first.yaw) - float(second.yaw) + np.pi) % (2 * np.pi) - np.pi)
     return bool(np.hypot(first.x - second.x, first.y - second.y) <= AGREE_M and turned <= np.radians(AGREE_DEG))
@@ -235,62 +235,62 @@ class CandidateFinder:
         """Whether an image has fewer than `min_cells` occupied cells, too few to recognise a place."""
         return bool(np.count_nonzero(image) < self.config.min_cells)
 
-    def _link(self, query: Query | None, clock: float) -> Peak | None:
+    def _link(self, query: Query | None, clock: float) -> Link | None:
         """Pose of the next frame in the frame of the motion's keyframe, or None if the images do not show it.
 
         The image is compared with that of the keyframe and, if this is ambiguous, with that of the last frame. Two
-        ambiguous poses that agree are trusted, too.
+        ambiguous poses that agree are trusted, too. If the images show only the position across a direction, the sensor
+        is assumed to move on as before.
         """
-        found: list[Peak] = []
+        found, ridge = list[Link](), None
         for frame, image in dict(filter(None, (self._keyframe, self._last))).items():
             if query is None:
                 break
             prior = self.motion.prior(clock, frame)
-            one = self._linked(query, image, prior)
-            trusted = self.motion.is_trusted(one, prior)
-            found.append(self._from_keyframe(one, frame, image, query.image))
-            if trusted:
-                return found[-1]
-        return found[0] if len(found) > 1 and agree(*found) else None
+            best, expected = self._linked(query, image, prior)
+            if self.motion.is_trusted(best, prior):
+                return self._from_keyframe(best, frame)
+            shown = expected.correlation >= self.config.motion.min_expected * best.correlation
+            if self.motion.is_ridge(best) and shown and np.isfinite(prior).all():
+                x, y, yaw = prior
+                ridge = self._from_keyframe(best._replace(x=x, y=y, yaw=yaw), frame)
+            found.append(self._from_keyframe(expected, frame))
+        certain = not any(map(self.motion.is_ridge, found))
+        return found[0] if len(found) > 1 and certain and agree(*found) else ridge
 
     def _check_odometry(
-        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Peak | None, *, known: bool
-    ) -> Peak | None:
+        self, query: Query | None, pose: Float[np.ndarray, "4 4"], link: Link | None, *, known: bool
+    ) -> Link | None:
         """Compare the odometry with the images, if this is due. Returns the pose in the frame of the last such scan."""
         if query is None or not self.odometry_check.is_due(pose):
             self.odometry_check.skip()
             return None
         if not known and self._checked is not None:
-            nowhere = np.full(3, np.nan)
-            link = self._from_image(self._linked(query, self._checked, nowhere), self._checked, query.image)
+            link, _ = self._linked(query, self._checked, np.full(3, np.nan))
         self.odometry_check.add(pose, link)
         self._checked = query.image
         return link
 
-    def _linked(self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]) -> Peak:
+    def _linked(
+        self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]
+    ) -> tuple[Link, Link]:
+        """The best pose of a query in the frame of an image, and the best one near an expected pose."""
         spectrum = image_spectrum(image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
-        anywhere, expected = peaks.one(0), peaks.one(1)
-        return anywhere if self.motion.is_trusted(anywhere, prior) else expected
+        best = self._refined(peaks.one(0), image, query)
+        same = bool(np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1])
+        return best, best if same else self._refined(peaks.one(1), image, query)
 
-    def _from_keyframe(
-        self, link: Peak, frame: int, image: UInt8[np.ndarray, "m m"], query: UInt8[np.ndarray, "m m"]
-    ) -> Peak:
-        """A link with a frame as pose in the frame of the keyframe. The link to a new keyframe is refined, because its
-        errors add up."""
-        key = self.motion.keyframe
-        if frame != key or self.motion.is_next_keyframe(link):
-            link = self._from_image(link, image, query)
+    def _refined(self, peak: Peak, image: UInt8[np.ndarray, "m m"], query: Query) -> Link:
+        return Link.of(jax.device_get(refined(query.image, image, peak, config=self.verification)))
+
+    def _from_keyframe(self, link: Link, frame: int) -> Link:
+        """A link with a frame as pose in the frame of the keyframe."""
+        key, poses = self.motion.keyframe, self.motion.poses
         if frame == key:
             return link
-        poses = self.motion.poses
         moved = inverse(poses[key]) @ poses[frame] @ transform(float(link.x), float(link.y), float(link.yaw))
         return link._replace(x=moved[0, 3], y=moved[1, 3], yaw=yaw_of(moved))
-
-    def _from_image(self, link: Peak, image: UInt8[np.ndarray, "m m"], query: UInt8[np.ndarray, "m m"]) -> Peak:
-        """A link with a refined pose."""
-        pose = jax.device_get(refined(query, image, link, config=self.verification))
-        return link._replace(x=pose.x, y=pose.y, yaw=pose.yaw)
 
     def _check(self, seen: Seen | None, time: float | None, odometry: Float[np.ndarray, "4 4"] | None) -> None:
         if not len(self):

@@ -65,8 +65,12 @@ class MotionConfig:
 
     min_correlation: float = 0.15
     """Minimum correlation of the two images."""
-    max_ridge: float = 0.8
-    """Maximum ratio of ridge to peak. Above it, the images do not show how far the sensor moved."""
+    max_along_m: float = 0.25
+    """Maximum standard deviation of the pose along its least certain direction, in metres. Above it, the images do not
+    show how far the sensor moved, as between walls."""
+    min_expected: float = 0.8
+    """Minimum correlation at the expected pose, divided by that at the best one, if this is so. The sensor is then
+    assumed to move on as before."""
     max_second: float = 0.8
     max_second_of_jump: float = 0.6
     max_second_expected: float = 0.95
@@ -150,8 +154,6 @@ class VerificationConfig:
     second_m: float = 3.0
     second_deg: float = 15.0
     """Minimum distance of the second peak from the best one, in metres or in degrees."""
-    ridge_m: float = 6.0
-    """Maximum distance at which a peak of the same rotation belongs to the ridge of the best one, in metres."""
     prior_m: float = 2.0
     prior_deg: float = 10.0
     """Maximum distance of a pose from the expected pose, if there is one, in metres and degrees."""

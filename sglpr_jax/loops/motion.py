@@ -7,6 +7,7 @@ drift grows fast. Only ratios of times count, so a drive at another speed has th
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax.growing import GrowingArray
 from sglpr_jax.loops.config import MotionConfig
 from sglpr_jax.loops.driven_path import DrivenPath
-from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, travelled, yaw_of
+from sglpr_jax.loops.verification import Alignment
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
@@ -27,6 +28,27 @@ UNKNOWN_M = 1e6
 """Length of measured path with the same drift as an unknown motion, in metres: the sensor may be anywhere."""
 NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8")]
 """Numbers of a frame beside its pose."""
+
+
+class Link(NamedTuple):
+    """Pose of a frame in the frame of an earlier one, from their images."""
+
+    x: Float[np.ndarray, ""]
+    y: Float[np.ndarray, ""]
+    """Position, in metres."""
+    yaw: Float[np.ndarray, ""]
+    """Rotation in radians, counter-clockwise."""
+    correlation: Float[np.ndarray, ""]
+    second: Float[np.ndarray, ""]
+    """Second-peak ratio."""
+    along_m: Float[np.ndarray, ""]
+    """Standard deviation of the position along its least certain direction, in metres."""
+
+    @classmethod
+    def of(cls, one: Alignment) -> "Link":
+        """Pose of an alignment."""
+        along = np.sqrt(np.linalg.eigvalsh(np.asarray(one.covariance)[:2, :2])[1])
+        return cls(one.x, one.y, one.yaw, one.correlation, one.second, along)
 
 
 class Motion:
@@ -105,10 +127,10 @@ class Motion:
         time: float,
         *,
         pose: Float[np.ndarray, "4 4"] | None = None,
-        link: Peak | None = None,
+        link: Link | None = None,
         continues: bool = True,
     ) -> None:
-        """Add a frame at `time`, by its `pose` from odometry or its peak `link` over the keyframe.
+        """Add a frame at `time`, by its `pose` from odometry or its `link` with the keyframe.
 
         An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown, as
         after a restart.
@@ -136,11 +158,6 @@ class Motion:
             if not (self._is_far(moved, rotation) or coasts or ambiguous):
                 return
         self.keyframe = len(self) - 1
-
-    def is_next_keyframe(self, link: Peak) -> bool:
-        """Whether a frame with this pose in the frame of the keyframe is far enough to become the next keyframe."""
-        yaw = float(link.yaw)
-        return self._is_far(float(np.hypot(link.x, link.y)), abs((yaw + np.pi) % (2 * np.pi) - np.pi))
 
     def _is_far(self, metres: float, radians: float) -> bool:
         return bool(metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg))
@@ -236,21 +253,24 @@ class Motion:
         """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
         return self.segments[rows] == self.segments[frame]
 
-    def is_trusted(self, link: Peak, prior: Float[np.ndarray, " 3"]) -> bool:
-        """Whether a link shows how the sensor moved: no other pose, and no pose along a ridge, fits about as well.
+    def is_trusted(self, link: Link, prior: Float[np.ndarray, " 3"]) -> bool:
+        """Whether a link shows how the sensor moved: no other pose fits about as well.
 
         A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
         """
-        best, config = float(link.correlation), self.config
+        config, most = self.config, self.config.max_second
         apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
         turned = abs((float(link.yaw) - prior[2] + np.pi) % (2 * np.pi) - np.pi)
-        most = config.max_second
         if apart > config.max_jump * self._last_step_m + 1.0:
             most = config.max_second_of_jump
         elif apart <= config.expected_m and turned <= np.radians(config.expected_deg):
             most = config.max_second_expected
-        fits = best >= config.min_correlation and float(link.second) <= most * best
-        return fits and float(link.ridge) <= config.max_ridge * best
+        fits = bool(link.correlation >= config.min_correlation and link.second <= most)
+        return fits and not self.is_ridge(link)
+
+    def is_ridge(self, link: Link) -> bool:
+        """Whether the images show the position across a direction only, as between walls."""
+        return bool(link.along_m > self.config.max_along_m)
 
     def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
         """Distance (metres) and rotation (radians) from a frame to a pose."""

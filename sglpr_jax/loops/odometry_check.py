@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.motion import Link
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
 STEP_M, STEP_DEG, MOST_FRAMES = 2.5, 15.0, 20
 """Distance and angle by odometry, and number of frames, from which a scan is compared with the last compared one."""
 MAX_STEP_M = 8.0
 """Maximum distance of two compared scans by odometry, in metres. Images of farther ones share too little."""
-MAX_SECOND, MAX_RIDGE = 0.6, 0.6
-"""Maximum second-peak ratio and ridge of a comparison that counts."""
+MAX_SECOND, MAX_ALONG_M = 0.6, 0.2
+"""Maximum second-peak ratio and standard deviation of the position, in metres, of a comparison that counts."""
 WINDOW_M = 30.0
 """Distance over which odometry and images are compared, in metres."""
 MIN_WINDOWS = 3
@@ -51,7 +51,7 @@ class OdometryCheck:
         """Note a scan that is not compared."""
         self._frames += 1
 
-    def add(self, pose: Float[np.ndarray, "4 4"], link: Peak | None) -> None:
+    def add(self, pose: Float[np.ndarray, "4 4"], link: Link | None) -> None:
         """Add a compared scan.
 
         Arguments:
@@ -97,7 +97,6 @@ class OdometryCheck:
         )
 
 
-def _is_clear(link: Peak) -> bool:
+def _is_clear(link: Link) -> bool:
     """Whether no other pose fits about as well."""
-    best = float(link.correlation)
-    return float(link.second) <= MAX_SECOND * best and float(link.ridge) <= MAX_RIDGE * best
+    return bool(link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M)

@@ -31,9 +31,6 @@ class Peak(NamedTuple):
     """Correlation at the pose: 1 for equal images, about 0 for unrelated ones."""
     second: Float[AnyArray, "*b"]
     """Highest correlation at any other pose (`second_m`, `second_deg`)."""
-    ridge: Float[AnyArray, "*b"]
-    """Highest correlation at `second_m` to `ridge_m` from the best pose, at about the same rotation. It is high if the
-    surroundings do not show how far the sensor moved, as between walls."""
 
     def one(self, k: int) -> "Peak":
         """The k-th peak."""
@@ -129,33 +126,28 @@ def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], config: Verif
     turn, right = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
     column = found[:, turn, right]
     down = jnp.argmax(jnp.where(near_prior[:, turn, right] | jnp.isnan(x), column, -1.0))
-    second, ridge = _others(found, highest, (down, turn, right), cell_m, config)
+    second = _second(found, highest, (down, turn, right), cell_m, config)
     at = down, turn, right
     down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
     x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
-    return Peak(x, y, yaw, found[at], second, ridge)
+    return Peak(x, y, yaw, found[at], second)
 
 
-def _others(
+def _second(
     found: Float[Array, "d t r"],
     highest: Float[Array, "t r"],
     at: tuple[Int[Array, ""], ...],
     cell_m: float,
     config: VerificationConfig,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Highest correlation away from a peak, and on its ridge. `highest` is the maximum over all shifts down."""
+) -> Float[Array, ""]:
+    """Highest correlation away from a peak. `highest` is the maximum over all shifts down."""
     down, turn, right = at
     most_turns = int(config.second_deg * config.turns / 360 + 1e-6)
     turns = jnp.mod(turn + np.arange(-most_turns, most_turns + 1), config.turns)
     about = found[:, turns]
-    middle = down, most_turns, right
-    near, on_ridge = (
-        _near(about.shape, middle, metres / cell_m, 360.0) for metres in (config.second_m, config.ridge_m)
-    )
+    near = _near(about.shape, (down, most_turns, right), config.second_m / cell_m, 360.0)
     other_turns = jnp.ones(config.turns, bool).at[turns].set(False)
-    ridge = jnp.max(jnp.where(on_ridge & ~near, about, 0.0))
-    second = jnp.maximum(jnp.max(jnp.where(other_turns[:, None], highest, 0.0)), jnp.max(jnp.where(~near, about, 0.0)))
-    return second, ridge
+    return jnp.maximum(jnp.max(jnp.where(other_turns[:, None], highest, 0.0)), jnp.max(jnp.where(~near, about, 0.0)))
 
 
 def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:

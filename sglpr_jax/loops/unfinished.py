@@ -23,6 +23,7 @@ from sglpr_jax.data.warning import warn
 from sglpr_jax.files import alone_in, read_json, replacing, write_json, writing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import Fits
+from sglpr_jax.loops.motion import Link
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.retrieval.index import Index
@@ -30,7 +31,7 @@ from sglpr_jax.retrieval.reuse import each_mounting, fingerprint
 from sglpr_jax.schema import Column, check_columns
 
 KIND = "sglpr-jax unfinished loops"
-FORMAT = f"{KIND} 5"
+FORMAT = f"{KIND} 6"
 SETTINGS = "settings.json"
 ENDING = ".safetensors"
 OWN = re.compile(r"[0-9]{6,}\.safetensors|\.([0-9]{6,}\.safetensors|settings\.json)\.[0-9a-f]{32}\.tmp")
@@ -42,7 +43,7 @@ COLUMNS = {
     "counts": Column("int64", ("n",)),
     "fitted": Column("int64", ("fits",)),
     "fits": Column("float64", ("fits", len(Peak._fields))),
-    "links": Column("float64", ("n", len(Peak._fields)), finite=False),
+    "links": Column("float64", ("n", len(Link._fields)), finite=False),
 }
 """Arrays of a file of frames: `counts` fits a frame. A row of NaN in the links is a missing link."""
 FRAMES = 50
@@ -280,13 +281,13 @@ def _is_own(path: Path) -> bool:
 def columns(compared: Sequence[Compared]) -> dict[str, np.ndarray]:
     """Convert the comparisons of some frames to arrays: their fits, in order, and the link of each frame."""
     counts = [len(one.fits.frames) for one in compared]
-    links = [[np.nan] * len(Peak._fields) if one.link is None else [float(v) for v in one.link] for one in compared]
+    links = [[np.nan] * len(Link._fields) if one.link is None else [float(v) for v in one.link] for one in compared]
     fits = [np.stack(one.fits.peaks, axis=1) for one in compared]
     return {
         "counts": np.array(counts, np.int64),
         "fitted": np.concatenate([np.zeros(0, np.int64), *(one.fits.frames for one in compared)]),
         "fits": np.concatenate([np.zeros((0, len(Peak._fields))), *fits]),
-        "links": np.array(links).reshape(-1, len(Peak._fields)),
+        "links": np.array(links).reshape(-1, len(Link._fields)),
     }
 
 
@@ -295,6 +296,6 @@ def compared_of(columns: dict[str, np.ndarray]) -> list[Compared]:
     ends = np.cumsum(columns["counts"])[:-1]
     parts = zip(np.split(columns["fitted"], ends), np.split(columns["fits"], ends), columns["links"], strict=True)
     return [
-        Compared(Fits(frames, Peak(*fits.T)), None if np.isnan(link).all() else Peak(*link))
+        Compared(Fits(frames, Peak(*fits.T)), None if np.isnan(link).all() else Link(*link))
         for frames, fits, link in parts
     ]

@@ -10,17 +10,18 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.live.scan_bytes import LiveScan, from_bytes, to_bytes
 from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.comparison import NO_FITS, Fits
+from sglpr_jax.loops.motion import Link
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.seen import Seen
 
 DRAW = np.random.default_rng(0)
-FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(6, 2))))
+FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))
 SEEN = Seen(np.ones(4, np.float32), np.ones((6, 6), np.uint8), Mounting(1.5))
 
 
 def live_scan(fits: Fits, **more) -> LiveScan:
     given = {"pose": np.eye(4), "continues": True, "name": "a", "stamp": 1.0, "time": 2.0, "wall": 3.0}
-    return LiveScan(SEEN, Compared(fits, Peak(*DRAW.normal(size=6))), **given | more)
+    return LiveScan(SEEN, Compared(fits, Link(*DRAW.normal(size=6))), **given | more)
 
 
 @pytest.mark.parametrize("scan", [live_scan(FITS), live_scan(NO_FITS, pose=None, continues=False)])

@@ -7,6 +7,7 @@ import numpy as np
 from sglpr_jax.loops import unfinished
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import NO_FITS, Fits
+from sglpr_jax.loops.motion import Link
 from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.stored_scans import StoredScans
@@ -31,8 +32,8 @@ def fake_frames(seed: int = 0, frames: int = 5) -> list[tuple[Seen | None, Compa
     draw, found = np.random.default_rng(seed), []
     for frame in range(frames):
         seen = Seen(draw.normal(size=4).astype(np.float32), draw.integers(0, 255, (6, 6), np.uint8), None)
-        link = Peak(*map(np.asarray, draw.normal(size=6))) if frame else None
-        fits = Fits(np.array([1, 3]), Peak(*draw.normal(size=(6, 2)))) if frame == 4 else NO_FITS
+        link = Link(*map(np.asarray, draw.normal(size=6))) if frame else None
+        fits = Fits(np.array([1, 3]), Peak(*draw.normal(size=(5, 2)))) if frame == 4 else NO_FITS
         found.append((None if frame == 1 else seen, Compared(fits, link)))
     return found
 

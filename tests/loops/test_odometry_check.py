@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.motion import Link
 from sglpr_jax.loops.odometry_check import OdometryCheck
-from sglpr_jax.loops.pose_search import Peak
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
 from .drives import along, drifted
@@ -19,7 +19,7 @@ def checked(odometry: np.ndarray, *, second: float = 0.3, steps: int = len(TRUE)
     for row in range(steps):
         assert check.is_due(odometry[row])
         moved = inverse(TRUE[row - 1]) @ TRUE[row]
-        link = Peak(*map(np.float64, (*moved[:2, 3], yaw_of(moved), 0.8, 0.8 * second, 0.2)))
+        link = Link(*map(np.float64, (*moved[:2, 3], yaw_of(moved), 0.8, second, 0.1)))
         check.add(odometry[row], link if row else None)
     return check
 
