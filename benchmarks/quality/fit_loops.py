@@ -10,6 +10,7 @@ another storey. All kinds of drives count alike. Each scenery is judged by a mod
 table has its pairs, with neighbours and alone, the share of right pairs above two probabilities, and the wrong pairs.
 """
 
+import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Sequence
@@ -58,7 +59,11 @@ class Pairs(NamedTuple):
 
     def log_odds(self, model: LoopModel) -> Float[np.ndarray, " n"]:
         """Log odds of each pair, with its neighbours."""
-        return model.log_odds(self.evidence) + self.neighbours @ model.strength(self.evidence)
+        return model.tested_log_odds(self.evidence, self.support(model))
+
+    def support(self, model: LoopModel) -> Float[np.ndarray, " n"]:
+        """What the neighbours of each pair say, by their evidence alone."""
+        return self.neighbours @ model.strength(self.evidence)
 
 
 def main(drives: tyro.conf.Positional[Path], *, weights: str = "sglpr", workers: int = 1, out: Path = DEFAULT) -> None:
@@ -109,25 +114,23 @@ def _row(probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"]) 
     return [str(len(right)), *shares, str(len(wrong)), *(str((wrong >= limit).sum()) for limit in (SURE, 0.5))]
 
 
-def known(found: Sequence[Pairs]) -> tuple[Evidence, Bool[np.ndarray, " n"]]:
-    """Evidence of the pairs of several drives that are certainly loops or none, and which are loops."""
-    evidence = Evidence(*map(np.concatenate, zip(*(one.evidence for one in found), strict=True)))
-    chosen = np.concatenate([one.is_known for one in found])
-    is_loop = np.concatenate([one.is_loop for one in found])
-    return Evidence(*(values[chosen] for values in evidence)), is_loop[chosen]
-
-
 def fitted(found: Sequence[Pairs], kinds: Sequence[str]) -> LoopModel:
     """Model of some drives, of which each kind counts alike."""
     counts = Counter[str]()
     for kind, one in zip(kinds, found, strict=True):
         counts[kind] += int(one.is_known.sum())
     each = zip(kinds, found, strict=True)
-    shares = np.concatenate([np.full(one.is_known.sum(), PAIRS / max(counts[kind], 1)) for kind, one in each])
+    weights = np.concatenate([np.full(one.is_known.sum(), PAIRS / max(counts[kind], 1)) for kind, one in each])
+    evidence = Evidence(*map(np.concatenate, zip(*(one.evidence for one in found), strict=True)))
+    known = np.concatenate([one.is_known for one in found])
+    is_loop = np.concatenate([one.is_loop for one in found])[known]
+    alone = fit({name: values[known] for name, values in evidence._asdict().items()}, is_loop, weights=weights)
     sceneries = ", ".join(dict.fromkeys(kind.split("-")[0] for kind in kinds))
-    evidence, is_loop = known(found)
     about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(found)} simulated drives ({sceneries})"
-    return fit(evidence, is_loop, weights=shares, made_with=f"{about}; benchmarks/quality/fit_loops.py")
+    model = LoopModel(alone, f"{about}; benchmarks/quality/fit_loops.py")
+    support = np.concatenate([one.support(model) for one in found])
+    values = {"alone": model.log_odds(evidence)[known], "support": support[known]}
+    return dataclasses.replace(model, tested=fit(values, is_loop, weights=weights))
 
 
 def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pairs:

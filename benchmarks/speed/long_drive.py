@@ -111,6 +111,8 @@ class Drive:
 class _ByTruePose(Comparer):
     """Comparison of which the nearest scan is the result, at its true pose."""
 
+    drive: Drive
+
     def __init__(self, known: Comparer, drive: Drive):
         vars(self).update(vars(known))
         self.__dict__["drive"] = drive
@@ -125,7 +127,7 @@ class _ByTruePose(Comparer):
     def candidate(self, query: Query, fits: Fits, row: int, image_of: Any) -> Candidate:
         one = fits.peaks.one(row)
         values: Any = (one.x, one.y, one.yaw, np.diag([0.05, 0.05, 0.005]) ** 2, 0.9, 0.3)
-        return Candidate(query.frame, int(fits.frames[row]), Alignment(*values), Evidence.of(0.3, 0.3, 0.5, 2.0))
+        return Candidate(query.frame, int(fits.frames[row]), Alignment(*values), Evidence.of(0.3, 0.1, 0.5, 2.0))
 
 
 class WithoutImages(CandidateFinder):
@@ -142,7 +144,9 @@ class WithoutImages(CandidateFinder):
     def _link(self, query: Query | None, clock: float) -> Link | None:
         if not len(self):
             return None
-        return Link(*peak(self._drive, len(self), self.motion.keyframe), np.asarray(0.1))
+        found = peak(self._drive, len(self), self.motion.keyframe)
+        x, y, yaw, correlation, second = map(np.asarray, found)
+        return Link(x, y, yaw, correlation, second, np.asarray(0.1))
 
 
 def peak(drive: Drive, query: int, match: int) -> Peak:

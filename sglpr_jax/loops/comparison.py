@@ -26,8 +26,6 @@ from sglpr_jax.loops.verification import Alignment, refined
 BATCH, COARSE_BATCH = 8, 32
 """Number of matches of a batch, of the exact and of the coarse comparison."""
 EVERY = np.array(True)
-MIN_AMBIGUITY = 0.8
-"""Ambiguity ratio from which few other places are enough to show that places repeat."""
 SURROUNDINGS_M, SYMMETRIES = 300.0, 4
 """Side of the square in which a lookalike may stand, in metres, and number of rotations at which it may fit."""
 
@@ -170,7 +168,11 @@ class Comparer:
     def candidate(
         self, query: Query, fits: Fits, row: int, image_of: Callable[[int], UInt8[np.ndarray, "m m"]]
     ) -> Candidate:
-        """Collect the evidence of one fit."""
+        """Collect the evidence of one fit.
+
+        The poses of other scans that the motion excludes count against it. So do second-best poses, those of the match
+        and of scans whose best poses the motion allows.
+        """
         match, peak = int(fits.frames[row]), fits.peaks.one(row)
         deviation = float(self._deviations(query.frame, fits)[row])
         distracts = self._excluded(query.frame, match, peak, fits)
@@ -178,12 +180,10 @@ class Comparer:
             contradicts = self._deviations(query.frame, fits) > self.drift.max_deviation
             distracts |= contradicts & ~self.are_joined(match, fits.frames)
         distracts &= fits.frames != match
-        ambiguity = float(max(fits.peaks.correlation[distracts], default=0.0)) / max(float(peak.correlation), 1e-6)
-        other = self.elsewhere(fits.frames, query.frame) | self.elsewhere(fits.frames, match)
-        if other.sum() < self.config.exact_cohort and ambiguity < MIN_AMBIGUITY:
-            ambiguity = np.nan  # other places are not known yet
+        others = np.where(distracts, fits.peaks.correlation, fits.peaks.second)
+        ambiguity = float(others.max()) / max(float(peak.correlation), 1e-6)
         alignment = jax.device_get(refined(query.image, image_of(match), peak, config=self.verification))
-        evidence = Evidence.of(alignment.second, ambiguity, deviation, self.surprise(query.frame, match))
+        evidence = Evidence.of(ambiguity, alignment.along_m, deviation, self.surprise(query.frame, match))
         return Candidate(query.frame, match, alignment, evidence)
 
     def surprise(self, query: int, match: int) -> float:

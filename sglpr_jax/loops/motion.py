@@ -47,8 +47,7 @@ class Link(NamedTuple):
     @classmethod
     def of(cls, one: Alignment) -> "Link":
         """Pose of an alignment."""
-        along = np.sqrt(np.linalg.eigvalsh(np.asarray(one.covariance)[:2, :2])[1])
-        return cls(one.x, one.y, one.yaw, one.correlation, one.second, along)
+        return cls(*map(np.asarray, (one.x, one.y, one.yaw, one.correlation, one.second, one.along_m)))
 
 
 class Motion:

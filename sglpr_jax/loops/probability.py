@@ -1,7 +1,8 @@
 """Probability that two scans show one place: a monotone additive model of the evidence.
 
-The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. The functions are monotone and
-bounded. Therefore a perfect fit of the images cannot outweigh other places that fit as well.
+The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. A second sum of two such
+functions adds what neighbouring pairs say. The functions are monotone and bounded. Therefore a perfect fit of the
+images cannot outweigh other places that fit as well.
 """
 
 import dataclasses
@@ -18,13 +19,15 @@ from scipy.optimize import minimize
 DEFAULT = Path(__file__).with_name("probability.json")
 """File of the model fitted in the simulator. See docs/decisions/loops.md."""
 KNOTS: Mapping[str, tuple[float, ...]] = {
-    "peak_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "ambiguity_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+    "along_m": (0.03, 0.06, 0.1, 0.2, 0.4, 1.0, 3.0),
     "deviation": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0),
     "surprise": (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0),
+    "alone": (-10.0, -6.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0),
+    "support": (-12.0, -6.0, -3.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 13.0, 18.0),
 }
 """Knots of the piecewise linear functions. Outside the knots they are constant."""
-RISING = ("surprise",)
+RISING = ("surprise", "alone", "support")
 """Fields whose functions rise. The other functions fall."""
 MAX_STRENGTH = 4.0
 """Maximum log odds with which a pair counts as neighbour."""
@@ -35,20 +38,19 @@ RIDGE = 0.02
 class Evidence(NamedTuple):
     """Evidence for pairs of scans, one number of each kind for each pair (`Comparer`)."""
 
-    peak_ratio: Float[np.ndarray, "*n"]
-    """Correlation at the second-best pose of the two images, divided by that at the best pose."""
     ambiguity_ratio: Float[np.ndarray, "*n"]
-    """Correlation with the best other place, divided by the correlation with the match. NaN if the drive has too few
-    other places to tell."""
+    """Correlation with the best other place, or at the best other pose, divided by the correlation with the match."""
+    along_m: Float[np.ndarray, "*n"]
+    """Standard deviation of the position along its least certain direction, in metres. It is large between walls."""
     deviation: Float[np.ndarray, "*n"]
     """Deviation of the pose from the motion, in standard deviations."""
     surprise: Float[np.ndarray, "*n"]
     """Logarithm of all poses over those that the motion allows. 0 if the motion says nothing."""
 
     @classmethod
-    def of(cls, peak_ratio: Any, ambiguity_ratio: Any, deviation: Any, surprise: Any) -> "Evidence":
+    def of(cls, ambiguity_ratio: Any, along_m: Any, deviation: Any, surprise: Any) -> "Evidence":
         """Create the evidence of one pair."""
-        values = (peak_ratio, ambiguity_ratio, deviation, surprise)
+        values = (ambiguity_ratio, along_m, deviation, surprise)
         return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
@@ -58,8 +60,8 @@ class Evidence(NamedTuple):
 
 
 ALL = Evidence._fields
-OF_REPETITION = ("peak_ratio", "ambiguity_ratio")
-"""Fields that compare the match with other poses and places."""
+OF_NEIGHBOURS = ("alone", "support")
+"""Log odds of a pair alone, and what its neighbours say: the sum of their strengths, weighted and signed."""
 
 
 class Curve(NamedTuple):
@@ -67,42 +69,88 @@ class Curve(NamedTuple):
 
     knots: tuple[float, ...]
     values: tuple[float, ...]
-    unknown: float = 0.0
-    """Value for NaN."""
 
     def __call__(self, numbers: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Evaluate the function."""
-        return np.where(np.isnan(numbers), self.unknown, np.interp(numbers, self.knots, self.values))
+        return np.asarray(np.interp(numbers, self.knots, self.values))
+
+
+@dataclasses.dataclass(frozen=True)
+class AdditiveModel:
+    """Log odds: bias + sum of curves."""
+
+    curves: Mapping[str, Curve]
+    """Curves by the name of their argument. Arguments without a curve are not used."""
+    bias: float
+
+    def __call__(self, values: Mapping[str, Float[np.ndarray, "*n"]]) -> Float[np.ndarray, "*n"]:
+        """Log odds of pairs with these values of the arguments."""
+        return np.asarray(self.bias + sum(curve(np.asarray(values[name])) for name, curve in self.curves.items()))
+
+    def scaled(self, gain: float, shift: float) -> "AdditiveModel":
+        """Model whose log odds are `gain` times those of this one, plus `shift`."""
+        curves = {
+            name: Curve(curve.knots, tuple(gain * value for value in curve.values))
+            for name, curve in self.curves.items()
+        }
+        return AdditiveModel(curves, gain * self.bias + shift)
+
+    def to_json(self) -> dict[str, Any]:
+        """Convert to a JSON value for `from_json`."""
+        return {"curves": {name: curve._asdict() for name, curve in self.curves.items()}, "bias": self.bias}
+
+    @classmethod
+    def from_json(cls, value: Any, names: Sequence[str]) -> "AdditiveModel":
+        """Build a model of some of these arguments from the output of `to_json`. Raises ValueError if it is none."""
+        try:
+            curves = {name: Curve(tuple(one["knots"]), tuple(one["values"])) for name, one in value["curves"].items()}
+            found = cls(curves, value["bias"])
+            numbers = [found.bias, *(number for one in curves.values() for number in (*one.knots, *one.values))]
+            fits = set(curves) <= set(names) and all(math.isfinite(number) for number in numbers)
+            fits = fits and all(_is_curve(curve) for curve in curves.values())
+        except (TypeError, KeyError, AttributeError, OverflowError):
+            fits = False
+        if not fits:
+            raise ValueError(f"expected curves of {', '.join(names)} and a bias, found others")
+        return found
+
+
+def _is_curve(curve: Curve) -> bool:
+    return len(curve.knots) == len(curve.values) > 0 and bool(np.all(np.diff(curve.knots) > 0))
+
+
+_SAME = Curve((-50.0, 50.0), (-50.0, 50.0))
+ADDED = AdditiveModel(dict.fromkeys(OF_NEIGHBOURS, _SAME), 0.0)
+"""Log odds alone plus the support of the neighbours, as they are."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoopModel:
-    """Model of the probability of loops: 1 / (1 + exp(-(bias + sum of curves)))."""
+    """Model of the probability of loops."""
 
-    curves: Mapping[str, Curve]
-    """Curves by the field of `Evidence`. Fields without a curve are not used."""
-    bias: float
+    alone: AdditiveModel
+    """Log odds of a pair by its `Evidence`."""
     made_with: str
     """Description of the pairs that the model was fitted to."""
+    tested: AdditiveModel = ADDED
+    """Log odds of a pair given its neighbours, by its log odds alone and by their support."""
 
     def probability(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Probability that each pair is a loop."""
+        """Probability that each pair alone is a loop."""
         return np.asarray(1 / (1 + np.exp(-np.clip(self.log_odds(evidence), -50, 50))))
 
     def log_odds(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Log odds of each pair: the logarithm of probability / (1 - probability)."""
-        return np.asarray(self.bias + sum(self.contributions(evidence).values()))
+        """Log odds of each pair alone: the logarithm of probability / (1 - probability)."""
+        return self.alone(evidence._asdict())
 
-    def contributions(self, evidence: Evidence) -> dict[str, Float[np.ndarray, "*n"]]:
-        """Term of each field in the log odds."""
-        values = evidence._asdict()
-        return {name: curve(np.asarray(values[name], np.float64)) for name, curve in self.curves.items()}
+    def tested_log_odds(self, evidence: Evidence, support: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Log odds of each pair, given the support of its neighbours."""
+        return self.tested({"alone": self.log_odds(evidence), "support": support})
 
     def log_odds_without_ambiguity(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
-        """Log odds if no other pose and place fitted as well as the match."""
-        parts = self.contributions(evidence)
-        best = {name: max(self.curves[name].values) for name in OF_REPETITION if name in parts}
-        return np.asarray(self.bias + sum((parts | best).values()))
+        """Log odds of each pair alone if no other pose and place fitted as well as the match."""
+        nothing = np.zeros_like(evidence.ambiguity_ratio)
+        return self.log_odds(evidence._replace(ambiguity_ratio=nothing))
 
     def strength(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """How much a pair says about its neighbours: its log odds by the images, from 0 to `MAX_STRENGTH`.
@@ -114,8 +162,7 @@ class LoopModel:
 
     def to_json(self) -> dict[str, Any]:
         """Convert to a JSON value for `from_json`."""
-        curves = {name: curve._asdict() for name, curve in self.curves.items()}
-        return {"curves": curves, "bias": self.bias, "made_with": self.made_with}
+        return {"alone": self.alone.to_json(), "tested": self.tested.to_json(), "made_with": self.made_with}
 
     @classmethod
     def from_json(cls, value: Any, *, source: str) -> "LoopModel":
@@ -124,41 +171,28 @@ class LoopModel:
         Raises ValueError if it is invalid. The message names `source`, its file.
         """
         try:
-            curves = {
-                name: Curve(tuple(one["knots"]), tuple(one["values"]), one["unknown"])
-                for name, one in value["curves"].items()
-            }
-            model = cls(curves, value["bias"], value["made_with"])
-            numbers = [model.bias, *(n for one in curves.values() for n in (*one.knots, *one.values, one.unknown))]
-            fits = set(curves) <= set(ALL) and all(math.isfinite(number) for number in numbers)
-            fits = fits and all(_is_curve(curve) for curve in curves.values())
-        except (TypeError, KeyError, AttributeError, OverflowError):
-            fits = False
-        if not fits:
-            raise ValueError(f"{source}: expected a loop model ({', '.join(ALL)}), found another value")
-        return model
-
-
-def _is_curve(curve: Curve) -> bool:
-    return len(curve.knots) == len(curve.values) > 0 and bool(np.all(np.diff(curve.knots) > 0))
+            alone, tested = value["alone"], value["tested"]
+            return cls(
+                AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, OF_NEIGHBOURS)
+            )
+        except (TypeError, KeyError) as error:
+            raise ValueError(f"{source}: expected a loop model, found another value") from error
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from error
 
 
 def fit(
-    evidence: Evidence,
+    values: Mapping[str, Float[np.ndarray, " n"]],
     is_loop: Bool[np.ndarray, " n"],
     *,
-    names: Sequence[str] = ALL,
     weights: Float[np.ndarray, " n"] | None = None,
-    made_with: str = "",
-) -> LoopModel:
+) -> AdditiveModel:
     """Fit a monotone model to labelled pairs by maximum likelihood.
 
     Arguments:
-      evidence: Evidence of the pairs.
+      values: Arguments of the model, with names of `KNOTS`, at each pair.
       is_loop: Whether each pair is a loop.
-      names: Fields of the evidence that the model uses.
       weights: Weights of the pairs, by default all equal.
-      made_with: Description of the pairs.
 
     Raises:
       ValueError: If all pairs are loops or no pair is.
@@ -166,9 +200,8 @@ def fit(
     if is_loop.all() or not is_loop.any():
         raise ValueError(f"expected loops and other pairs to fit, found {is_loop.sum()} loops of {len(is_loop)} pairs")
     weights = np.ones(len(is_loop)) if weights is None else weights
-    missing = [np.isnan(getattr(evidence, name)) for name in names]
-    columns = np.concatenate([_rises(name, getattr(evidence, name)) for name in names], axis=1)
-    columns = np.column_stack([columns, *missing, np.ones(len(is_loop))]).astype(np.float64)
+    columns = [_rises(name, numbers) for name, numbers in values.items()]
+    columns = np.concatenate([*columns, np.ones((len(is_loop), 1))], axis=1)
     sign = np.where(is_loop, 1.0, -1.0)
 
     def cost(steps: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
@@ -180,14 +213,13 @@ def fit(
     bounds = [(0.0, None)] * (columns.shape[1] - 1) + [(None, None)]
     steps = minimize(cost, np.zeros(columns.shape[1]), jac=True, method="L-BFGS-B", bounds=bounds).x
     curves, used = {}, 0
-    for name in names:
+    for name in values:
         count = len(KNOTS[name]) - 1
         rise = np.concatenate([[0.0], np.cumsum(steps[used : used + count])])
-        values = rise if name in RISING else (rise[-1] - rise)
-        unknown = float(steps[len(steps) - 1 - len(names) + names.index(name)])
-        curves[name] = Curve(KNOTS[name], tuple(np.round(values, 4).tolist()), round(unknown, 4))
+        heights = rise if name in RISING else (rise[-1] - rise)
+        curves[name] = Curve(KNOTS[name], tuple(np.round(heights, 4).tolist()))
         used += count
-    return LoopModel(curves, float(steps[-1]), made_with)
+    return AdditiveModel(curves, float(steps[-1]))
 
 
 def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
@@ -196,7 +228,7 @@ def _rises(name: str, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k
     """
     knots = np.array(KNOTS[name])
     made = np.clip((np.asarray(values)[:, None] - knots[None, :-1]) / np.diff(knots)[None], 0, 1)
-    return np.nan_to_num(made if name in RISING else 1 - made, nan=0.0)
+    return made if name in RISING else 1 - made
 
 
 def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray, " n"], *, made_with: str) -> LoopModel:
@@ -212,11 +244,7 @@ def recalibrated(model: LoopModel, evidence: Evidence, is_loop: Bool[np.ndarray,
         return float(np.logaddexp(0, -sign * (line[0] * log_odds + line[1])).sum() + (line[0] - 1) ** 2)
 
     gain, shift = minimize(cost, np.array([1.0, 0.0]), method="L-BFGS-B", bounds=[(0.0, None), (None, None)]).x
-    curves = {
-        name: Curve(curve.knots, tuple(gain * value for value in curve.values), gain * curve.unknown)
-        for name, curve in model.curves.items()
-    }
-    return LoopModel(curves, float(gain * model.bias + shift), made_with)
+    return LoopModel(model.alone.scaled(float(gain), float(shift)), made_with, model.tested)
 
 
 def default_model(path: Path = DEFAULT) -> LoopModel:

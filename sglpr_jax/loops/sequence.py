@@ -57,7 +57,7 @@ def tested_log_odds(
     if not pairs:
         return np.zeros(0)
     evidence = Evidence.stack([one.evidence for one in pairs])
-    strength, added = model.strength(evidence), np.empty(len(pairs))
+    strength, support = model.strength(evidence), np.empty(len(pairs))
     loops, way_m = [one.loop for one in pairs], np.maximum.accumulate([one.way_m for one in pairs])
     for start in range(0, len(pairs), BLOCK):
         end = min(start + BLOCK, len(pairs))
@@ -66,8 +66,8 @@ def tested_log_odds(
         options = {"mounting": mounting, "drift": drift, "config": consistency}
         agreeing = agree_along(path, loops[start:end], loops[first:last], **options)
         weights = neighbour_weights(way_m[first:last], np.arange(start, end) - first, config=config)
-        added[start:end] = (np.where(agreeing, 1.0, -1.0) * weights) @ strength[first:last]
-    return model.log_odds(evidence) + added
+        support[start:end] = (np.where(agreeing, 1.0, -1.0) * weights) @ strength[first:last]
+    return model.tested_log_odds(evidence, support)
 
 
 def neighbour_weights(

@@ -42,6 +42,11 @@ class Alignment(NamedTuple):
         """The k-th alignment."""
         return Alignment(*(value[k] for value in self))
 
+    @property
+    def along_m(self) -> float:
+        """Standard deviation of the position of one alignment along its least certain direction, in metres."""
+        return float(np.sqrt(np.linalg.eigvalsh(np.asarray(self.covariance)[:2, :2])[1]))
+
 
 TURN_STEPS = 4
 """Number of rotation steps of the refinement to each side."""

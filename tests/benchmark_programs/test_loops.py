@@ -61,7 +61,7 @@ def rendered(tmp_path_factory):
 
 def test_models_of_loops_are_fitted_and_written(rendered, tmp_path):
     output = printed("quality.fit_loops", str(rendered), "--out", str(tmp_path / "model.json"))
-    assert "LoopModel" in output and set(default_model(tmp_path / "model.json").curves) == set(ALL)
+    assert "LoopModel" in output and set(default_model(tmp_path / "model.json").alone.curves) == set(ALL)
 
 
 def test_loops_are_counted_by_scenery_and_drives_are_searched_once(rendered):

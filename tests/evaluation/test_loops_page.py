@@ -12,7 +12,7 @@ from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.find import FoundLoops
 from sglpr_jax.loops.loop import Loop, Rejected
 from sglpr_jax.loops.optimization import OptimizedTrajectory
-from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.transforms import transform
 
 from .test_page import Parsed
@@ -76,7 +76,7 @@ def test_stopped_before_the_first_scan_there_is_nothing_corrected(found):
 @pytest.fixture
 def known(found) -> FoundLoops:
     """The same with true positions, off the odometry, and with candidates: two loops, and one that is none."""
-    model = LoopModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0, "by hand")
+    model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((8, 3))
     positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
     recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")

@@ -14,7 +14,7 @@ from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.evaluation.inputs.methods import read_methods
 from sglpr_jax.evaluation.scoring import evaluate_methods
 from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.probability import Curve, LoopModel
+from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.loops.transforms import transform
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import as_tree, by_name, for_places, weights_hash
@@ -59,7 +59,7 @@ def _as_fields(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 PARAMS = Params(as_tree(WEIGHTS), CONFIG)
-ALWAYS = LoopModel({"deviation": Curve((0.0,), (0.0,))}, 1.0, "everything")
+ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 1.0), "everything")
 IMAGES = DRAWN.integers(0, 255, (6, 16, 16)).astype(np.uint8) * (DRAWN.random((6, 16, 16)) < 0.5)
 
 

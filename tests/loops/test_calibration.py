@@ -35,7 +35,7 @@ def test_certain_pairs_are_told_apart(short, params, odometry):
     evidence, is_loop = certain_pairs(params, short, odometry, pairs=20)
     assert 10 <= is_loop.sum() <= 20 and 10 <= (~is_loop).sum() <= 20
     assert np.nanmedian(evidence.ambiguity_ratio[is_loop]) < 0.7 < np.nanmedian(evidence.ambiguity_ratio[~is_loop])
-    assert np.median(evidence.peak_ratio[is_loop]) < np.median(evidence.peak_ratio[~is_loop])
+    assert np.median(evidence.along_m[is_loop]) < np.median(evidence.along_m[~is_loop])
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.find import find_loops
 from sglpr_jax.loops.joint import LITTLE_OVERLAP
 from sglpr_jax.loops.loop import UNKNOWN_HEIGHT_M
-from sglpr_jax.loops.probability import Curve, LoopModel
+from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.loops.seen import Seen, square_image
 from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 
@@ -119,7 +119,7 @@ def test_scans_of_one_pass_are_no_candidates(drive, params, revisit, metres, the
 
 def model_of(log_odds: float) -> LoopModel:
     """A model that says the same of every pair without neighbours."""
-    return LoopModel({"deviation": Curve((0.0, 1.0), (0.0, 0.0))}, log_odds, "by hand")
+    return LoopModel(AdditiveModel({"deviation": Curve((0.0, 1.0), (0.0, 0.0))}, log_odds), "by hand")
 
 
 THERE_AND_BACK = np.stack(

@@ -19,13 +19,13 @@ from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import check_odometry
 from sglpr_jax.loops.loop import Loop, Rejected
-from sglpr_jax.loops.probability import Curve, LoopModel
+from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import check_level
 
 N = 40
-ALWAYS = LoopModel({"deviation": Curve((0.0,), (0.0,))}, 10.0, "everything")
+ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 10.0), "everything")
 CONFIG = DetectorConfig()
 
 

@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sglpr_jax.loops.probability import (
+    ADDED,
     ALL,
     KNOTS,
-    OF_REPETITION,
+    OF_NEIGHBOURS,
     RISING,
-    Curve,
+    AdditiveModel,
     Evidence,
     LoopModel,
     default_model,
@@ -20,20 +21,25 @@ from sglpr_jax.loops.probability import (
     recalibrated,
 )
 
+DRAWN = {"ambiguity_ratio": (0.9, -0.4, 0.15), "along_m": (0.3, -0.2, 0.1), "deviation": (1.8, -1.0, 0.6)}
+"""Mean of the pairs that are no loops, what a loop adds, and the standard deviation."""
+
 
 def pairs(n: int = 600, *, seed: int = 0, noise: float = 1.0, shift: float = 0.0) -> tuple[Evidence, np.ndarray]:
     """Pairs of which a third are loops, with evidence that overlaps."""
     rng = np.random.default_rng(seed)
     is_loop = rng.random(n) < 1 / 3
-    draw = [rng.normal(scale=noise * s, size=n) for s in (0.2, 0.15, 0.6, 1.0)]
-    peak, ambiguity = 0.9 - shift - 0.4 * is_loop + draw[0], 0.9 - 0.4 * is_loop + draw[1]
-    deviation, surprise = np.abs(1.8 - is_loop + draw[2]), 2.0 + is_loop + draw[3]
-    return Evidence(peak, ambiguity, deviation, surprise), is_loop
+    drawn = (DRAWN | {"surprise": (2.0, 1.0, 1.0)}).values()
+    values = [mean + more * is_loop + noise * spread * rng.normal(size=n) for mean, more, spread in drawn]
+    return Evidence(values[0] - shift, *values[1:]), is_loop
 
 
-@pytest.mark.parametrize("names", [ALL, OF_REPETITION])
-def test_probabilities_are_those_of_pairs_that_were_not_fitted(names):
-    model = fit(*pairs(6000, noise=2.0), names=names)
+def model_of(evidence: Evidence, is_loop: np.ndarray, made_with: str = "") -> LoopModel:
+    return LoopModel(fit(evidence._asdict(), is_loop), made_with)
+
+
+def test_probabilities_are_those_of_pairs_that_were_not_fitted():
+    model = model_of(*pairs(6000, noise=2.0))
     evidence, is_loop = pairs(6000, seed=1, noise=2.0)
     probabilities = model.probability(evidence)
     for low in np.arange(0, 1, 0.2):
@@ -44,26 +50,23 @@ def test_probabilities_are_those_of_pairs_that_were_not_fitted(names):
 def test_the_fit_finds_the_curve_that_the_pairs_were_drawn_from():
     """Log odds that bend once, which a straight line cannot follow."""
     rng, n = np.random.default_rng(0), 40_000
-    values = rng.uniform(0, 1.2, n)
-    true = 4 * np.clip((0.8 - values) / 0.4, 0, 1) - 2
+    values = {"ambiguity_ratio": rng.uniform(0, 1.2, n)}
+    true = 4 * np.clip((0.8 - values["ambiguity_ratio"]) / 0.4, 0, 1) - 2
     is_loop = rng.random(n) < 1 / (1 + np.exp(-true))
-    evidence = Evidence(*[values if name == "ambiguity_ratio" else np.full(n, 0.5) for name in ALL])
-    model = fit(evidence, is_loop, names=("ambiguity_ratio",))
-    np.testing.assert_allclose(model.log_odds(evidence), true, atol=0.35)
+    np.testing.assert_allclose(fit(values, is_loop)(values), true, atol=0.35)
 
 
 def test_weights_are_as_good_as_pairs_that_stand_several_times():
     evidence, is_loop = pairs(200)
-    often = np.arange(200) % 3 + 1
-    again = Evidence(*(np.repeat(values, often) for values in evidence))
-    one = fit(evidence, is_loop, weights=often.astype(float))
-    other = fit(again, np.repeat(is_loop, often))
-    np.testing.assert_allclose(one.log_odds(evidence), other.log_odds(evidence), atol=0.02)
+    values, often = evidence._asdict(), np.arange(200) % 3 + 1
+    one = fit(values, is_loop, weights=often.astype(float))
+    other = fit({name: np.repeat(column, often) for name, column in values.items()}, np.repeat(is_loop, often))
+    np.testing.assert_allclose(one(values), other(values), atol=0.02)
 
 
 @given(values=st.lists(st.floats(-1, 6), min_size=8, max_size=8), name=st.sampled_from(ALL))
 def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
-    one, other = (Evidence(*np.array(half)) for half in (values[:4], values[4:]))
+    one, other = (Evidence.of(*half) for half in (values[:4], values[4:]))
     better = other._replace(**{field: getattr(one, field) for field in ALL if field != name})
     stronger = (
         getattr(better, name) >= getattr(one, name) if name in RISING else getattr(better, name) <= getattr(one, name)
@@ -72,40 +75,38 @@ def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
     assert FITTED.log_odds(low) <= FITTED.log_odds(high) + 1e-9
 
 
-FITTED = fit(*pairs())
+FITTED = model_of(*pairs())
 
 
 def test_evidence_says_this_much_and_no_more():
-    best, beyond = Evidence.of(0.3, 0.3, 0.5, 12.0), Evidence.of(-9.0, -9.0, 0.0, 9e9)
+    best, beyond = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(-9.0, -9.0, 0.0, 9e9)
     assert FITTED.log_odds(best) == FITTED.log_odds(beyond)
 
 
-def test_pairs_without_other_places_have_a_value_of_their_own():
-    evidence, is_loop = pairs()
-    some = evidence._replace(ambiguity_ratio=np.where(np.arange(len(is_loop)) % 5, evidence.ambiguity_ratio, np.nan))
-    model = fit(some, is_loop)
-    found = model.log_odds(some)
-    assert np.isfinite(found).all() and np.mean((found > 0) == is_loop) > 0.9
-
-
 def test_ambiguity_is_left_out():
-    evidence, best = (Evidence.of(*ratios, 3.0, 2.0) for ratios in ((0.6, 0.7), (0.0, 0.0)))
+    evidence, best = (Evidence.of(ratio, 0.1, 3.0, 2.0) for ratio in (0.7, 0.0))
     assert FITTED.log_odds_without_ambiguity(evidence) == FITTED.log_odds(best)
     np.testing.assert_allclose(FITTED.probability(evidence), 1 / (1 + np.exp(-FITTED.log_odds(evidence))))
 
 
+def test_neighbours_add_their_support_to_what_a_pair_says_alone():
+    evidence = Evidence.of(0.7, 0.1, 3.0, 2.0)
+    np.testing.assert_allclose(FITTED.tested_log_odds(evidence, np.array(2.5)), FITTED.log_odds(evidence) + 2.5)
+    assert FITTED.tested is ADDED and set(default_model().tested.curves) == set(OF_NEIGHBOURS)
+
+
 def test_pairs_that_can_be_told_apart_give_finite_curves():
     evidence, is_loop = pairs(noise=0.01)
-    model = fit(evidence, is_loop)
-    assert all(max(curve.values) < 30 and curve.knots == KNOTS[name] for name, curve in model.curves.items())
+    model = model_of(evidence, is_loop)
+    assert all(max(curve.values) < 30 and curve.knots == KNOTS[name] for name, curve in model.alone.curves.items())
     np.testing.assert_array_equal(model.probability(evidence) > 0.5, is_loop)
 
 
 def test_recalibration_mends_probabilities_on_another_sensor():
-    model = fit(*pairs())
-    evidence, is_loop = pairs(seed=1, shift=0.15, noise=1.3)
+    model = model_of(*pairs())
+    evidence, is_loop = pairs(seed=1, shift=-0.15, noise=1.3)
     again = recalibrated(model, evidence, is_loop, made_with="own drive")
-    other, truth = pairs(2000, seed=2, shift=0.15, noise=1.3)
+    other, truth = pairs(2000, seed=2, shift=-0.15, noise=1.3)
 
     def surprise(of: LoopModel) -> float:
         probabilities = np.clip(of.probability(other), 1e-9, 1 - 1e-9)
@@ -118,7 +119,7 @@ def test_recalibration_mends_probabilities_on_another_sensor():
 
 
 @pytest.mark.parametrize(
-    "use", [lambda e, y: fit(e, y), lambda e, y: recalibrated(default_model(), e, y, made_with="")]
+    "use", [lambda e, y: fit(e._asdict(), y), lambda e, y: recalibrated(default_model(), e, y, made_with="")]
 )
 def test_one_kind_alone_cannot_be_fitted(use):
     evidence, is_loop = pairs(20)
@@ -127,17 +128,22 @@ def test_one_kind_alone_cannot_be_fitted(use):
 
 
 def test_models_go_to_a_file_and_back(tmp_path):
-    model = fit(*pairs(), made_with="here")
+    model = model_of(*pairs(), made_with="here")
     path = tmp_path / "model.json"
     path.write_text(json.dumps(model.to_json()))
     assert default_model(path) == model
     values = model.to_json()
 
+    def alone(**change):
+        return {**values, "alone": {**values["alone"], **change}}
+
     def curve(**change):
-        return {**values, "curves": {**values["curves"], "deviation": {**values["curves"]["deviation"], **change}}}
+        curves = values["alone"]["curves"]
+        return alone(curves={**curves, "deviation": {**curves["deviation"], **change}})
 
     broken = [curve(values=[np.nan] * 6), curve(values=[1.0]), curve(knots=[1.0] * 6)]
-    broken += [{**values, "bias": "x"}, {**values, "bias": np.inf}, {**values, "curves": {"height": Curve((0,), (0,))}}]
+    broken += [alone(bias="x"), alone(bias=np.inf), alone(curves={"height": {"knots": [0], "values": [0]}})]
+    broken += [{**values, "tested": values["alone"]}]
     for wrong in ('{"bias": 1}', "[]", "no", "3", *map(json.dumps, broken)):
         path.write_text(wrong)
         with pytest.raises(ValueError, match=r"model\.json: expected"):
@@ -146,5 +152,6 @@ def test_models_go_to_a_file_and_back(tmp_path):
 
 def test_the_shipped_model_tells_clear_pairs():
     model = default_model()
-    loop, none = Evidence.of(0.3, 0.3, 0.5, 12.0), Evidence.of(1.0, 1.0, 4.0, 0.0)
-    assert set(model.curves) == set(ALL) and model.probability(loop) > 0.99 and model.probability(none) < 0.01
+    loop, none = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(1.0, 3.0, 4.0, 0.0)
+    assert set(model.alone.curves) == set(ALL) and isinstance(model.alone, AdditiveModel)
+    assert model.probability(loop) > 0.99 and model.probability(none) < 0.01

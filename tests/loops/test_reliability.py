@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.probability import Curve, Evidence, LoopModel
+from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.reliability import EDGES, reliability, reliability_of
 
 
@@ -34,7 +34,7 @@ def test_every_pair_is_in_one_bin(pairs):
 
 
 def test_candidates_with_true_positions_and_those_in_between_are_left_out():
-    model = LoopModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0, "by hand")
+    model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((6, 3))
     positions[3:, 0] = 3, 15, 40
     candidates = [Candidate(q, 0, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, c in ((3, 6.0), (4, 6.0), (5, -6.0))]
