@@ -89,6 +89,8 @@ class MotionConfig:
     """Length of measured path with the same drift as one metre of guessed motion, in metres."""
     ambiguous_share: float = 0.25
     """Share of a step that counts as guessed if its link is ambiguous."""
+    m_per_uncertain_m: float = 100.0
+    """Length of measured path with the same drift as one metre of uncertainty along a wall, in metres."""
     least_step_m: float = 0.5
     unknown_step_m: float = 12.0
     """Minimum length of a guessed step, and its length if the speed was never known, in metres."""

@@ -6,6 +6,7 @@ tunnel, the motion is unknown and a new segment begins. Its pose is extrapolated
 drift grows fast. Only ratios of times count, so a drive at another speed has the same motion.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ from sglpr_jax.loops.verification import Alignment
 
 MOST_STEPS = 3.0
 """Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
+EQUAL = 0.99
+"""Correlation of equal images. Between plain walls, too, they show that the sensor stands."""
 STANDING_M = 0.05
 """Maximum length of a step of a sensor that stands, in metres."""
 GAP_M = 1000.0
@@ -136,9 +139,10 @@ class Motion:
         """
         if len(self) and not continues:
             return self._begin(time, self.poses[-1] if pose is None else pose)
-        key, coasts, ambiguous = self.keyframe, False, False
+        key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
         if pose is None and link is not None:
             ambiguous = not self.is_trusted(link, self.prior(time, key))
+            along_m = float(link.along_m) if self.is_ridge(link) else along_m
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < self.config.max_coasting:
             pose, coasts = self._expected(time), True
@@ -152,7 +156,8 @@ class Motion:
             travelled = self.travelled[key] + moved
             guessed_m = self.guessed_m[key]
             if coasts or ambiguous:
-                guessed_m = self._drifted_m(time, share=1.0 if coasts else self.config.ambiguous_share)
+                drifted_m = self._drifted_m(time, share=1.0 if coasts else self.config.ambiguous_share)
+                guessed_m = min(drifted_m, self.guessed_m[-1] + self.config.m_per_uncertain_m * along_m)
             self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
             if not (self._is_far(moved, rotation) or coasts or ambiguous):
                 return
@@ -269,7 +274,7 @@ class Motion:
 
     def is_ridge(self, link: Link) -> bool:
         """Whether the images show the position across a direction only, as between walls."""
-        return bool(link.along_m > self.config.max_along_m)
+        return bool(link.along_m > self.config.max_along_m and link.correlation < EQUAL)
 
     def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
         """Distance (metres) and rotation (radians) from a frame to a pose."""

@@ -75,11 +75,12 @@ class OdometryCheck:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Root mean square of the errors of length and angle (degrees) per metre, beyond those of the images."""
+        """Root mean square of the errors of length and angle (degrees) per metre. 0 if those of the images explain
+        it."""
         if len(self._errors) < MIN_WINDOWS:
             return 0.0, 0.0
-        length, angle = np.square(self._errors).mean(axis=0)
-        return float(np.sqrt(max(length - NOISE**2, 0))), float(np.sqrt(max(angle - NOISE_DEG**2, 0)))
+        length, angle = np.sqrt(np.square(self._errors).mean(axis=0)).tolist()
+        return (length if length > NOISE else 0.0), (angle if angle > NOISE_DEG else 0.0)
 
     @property
     def is_unusable(self) -> bool:

@@ -15,7 +15,7 @@ from sglpr_jax.loops.transforms import inverse, transform, yaw_of
 from sglpr_jax.sim import Sensor
 from sglpr_jax.sim.repeating import simulate_repeating
 
-SCANS = 120
+SCANS = 160
 SENSOR = Sensor(elevations_deg=tuple(np.linspace(10, -24, 24)), azimuth_steps=480)
 ANGLE = np.radians(137.0)
 POSE_M, POSE_DEG = 1.5, 6.0
