@@ -46,6 +46,14 @@ LIDARS = {
     "hdl64e-120": dataclasses.replace(HDL64E, shadows_deg=(HIDDEN_DEG,)),
     "os0-32-140": dataclasses.replace(SENSORS["os0-32"], azimuths_deg=(-70.0, 70.0)),
 }
+CARS, WALKERS = ("hdl64e", "vlp16"), ("os0-32+backpack", "os0-32-140+handheld")
+OF_SCENERY: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("hall", "yard"), WALKERS),
+    **dict.fromkeys(("campus", "warehouse"), (*CARS, "os0-32+cart")),
+    "forest": (*CARS, "os0-32+backpack"),
+    "storeys": ("hdl32e", "vlp16"),
+}
+"""Sensors of a scenery, if they are not `CARS`."""
 OTHER_M = 20.0
 """In towns, frames farther apart than this show different places."""
 
@@ -67,7 +75,7 @@ def main(
     *,
     sceneries: tuple[str, ...] = (*REPEATING, *SCENERIES),
     seeds: tuple[int, ...] = (1,),
-    sensors: tuple[str, ...] = ("hdl64e", "vlp16"),
+    sensors: tuple[str, ...] = (),
     revisits: tuple[Revisit, ...] = REVISITS,
     scans: int = 300,
     azimuth_steps: int = 900,
@@ -81,7 +89,8 @@ def main(
     Args:
         sceneries: names of sceneries that repeat, and of towns.
         seeds: one drive for each.
-        sensors: names in `LIDARS`, with a plus sign and a carrier if it is not a vehicle.
+        sensors: names in `LIDARS`, with a plus sign and a carrier if it is not a vehicle. By default those of the
+            scenery.
         revisits: whether and how the vehicle returns.
         scans: number of scans of each drive.
         azimuth_steps: firings of the sensor per turn.
@@ -90,8 +99,11 @@ def main(
         workers: number of processes.
         out: the folder.
     """
-    every = itertools.product(seeds, sensors, revisits, sceneries)
-    drives = [Drive(scenery, revisit, sensor, seed) for seed, sensor, revisit, scenery in every]
+    drives = [
+        Drive(scenery, revisit, sensor, seed)
+        for seed, revisit, scenery in itertools.product(seeds, revisits, sceneries)
+        for sensor in sensors or OF_SCENERY.get(scenery, CARS)
+    ]
     drives = [drive for drive in drives if not (out / drive.file).exists()]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         count = len(drives)
