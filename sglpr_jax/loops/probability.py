@@ -101,7 +101,10 @@ class AdditiveModel:
 
     @classmethod
     def from_json(cls, value: Any, names: Sequence[str]) -> "AdditiveModel":
-        """Build a model of some of these arguments from the output of `to_json`. Raises ValueError if it is none."""
+        """Build a model of some of these arguments from the output of `to_json`.
+
+        Raises ValueError if the value is invalid.
+        """
         try:
             curves = {name: Curve(tuple(one["knots"]), tuple(one["values"])) for name, one in value["curves"].items()}
             found = cls(curves, value["bias"])
