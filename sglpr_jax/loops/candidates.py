@@ -250,11 +250,12 @@ class CandidateFinder:
             best, expected = self._linked(query, image, prior)
             if self.motion.is_trusted(best, prior):
                 return self._from_keyframe(best, frame)
-            shown = expected.correlation >= self.config.motion.min_expected * best.correlation
+            near = best if expected is None else self._refined(expected, image, query)
+            shown = near.correlation >= self.config.motion.min_expected * best.correlation
             if self.motion.is_ridge(best) and shown and np.isfinite(prior).all():
                 x, y, yaw = prior
                 ridge = self._from_keyframe(best._replace(x=x, y=y, yaw=yaw), frame)
-            found.append(self._from_keyframe(expected, frame))
+            found.append(self._from_keyframe(near, frame))
         certain = not any(map(self.motion.is_ridge, found))
         return found[0] if len(found) > 1 and certain and agree(*found) else ridge
 
@@ -273,13 +274,13 @@ class CandidateFinder:
 
     def _linked(
         self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]
-    ) -> tuple[Link, Link]:
-        """The best pose of a query in the frame of an image, and the best one near an expected pose."""
+    ) -> tuple[Link, Peak | None]:
+        """The best pose of a query in the frame of an image, and another one that is the best near an expected pose."""
         spectrum = image_spectrum(image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
         best = self._refined(peaks.one(0), image, query)
         same = bool(np.isnan(prior).any() or peaks.correlation[0] == peaks.correlation[1])
-        return best, best if same else self._refined(peaks.one(1), image, query)
+        return best, None if same else peaks.one(1)
 
     def _refined(self, peak: Peak, image: UInt8[np.ndarray, "m m"], query: Query) -> Link:
         return Link.of(jax.device_get(refined(query.image, image, peak, config=self.verification)))

@@ -1,9 +1,10 @@
 """Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
 
 The decision about a loop needs to know which scans show other places. The motion is accurate enough for this purpose
-over some hundred metres. It does not replace odometry. Where the surroundings do not show how the sensor moved, as in a
-tunnel, the motion is unknown and a new segment begins. Its pose is extrapolated at the last known velocity, and its
-drift grows fast. Only ratios of times count, so a drive at another speed has the same motion.
+over some hundred metres. It does not replace odometry. Where the surroundings show the position across a direction
+only, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast. Where they show nothing,
+the motion is unknown and a new segment begins. Only ratios of times count, so a drive at another speed has the same
+motion.
 """
 
 import math

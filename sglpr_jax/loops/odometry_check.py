@@ -75,8 +75,7 @@ class OdometryCheck:
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Root mean square of the errors of length and angle (degrees) per metre. 0 if those of the images explain
-        it."""
+        """Root mean square of the errors of length and angle (degrees) per metre. 0 below the errors of images."""
         if len(self._errors) < MIN_WINDOWS:
             return 0.0, 0.0
         length, angle = np.sqrt(np.square(self._errors).mean(axis=0)).tolist()
