@@ -7,13 +7,14 @@ Every drive is searched by the loop detector's finder without odometry, once as 
 motion in its middle, and every third drive with odometry that drifts. A pair is a loop if its pose is right within
 1.5 m and 6 degrees on the same storey, and none if it is wrong by more than 3 m or 15 degrees, or, with odometry, on
 another storey. All kinds of drives count alike. Each scenery is judged by a model that was fitted to the others: the
-table has its pairs, with neighbours and alone, the share of right pairs above two probabilities, and the wrong pairs.
+table has its pairs, with neighbours and alone, the share of right pairs above two probabilities, the wrong pairs, and
+the expected calibration error. With `--without-each`, the same follows for models that lack one term.
 """
 
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -29,12 +30,11 @@ from scipy.special import expit
 import sglpr_jax
 from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
 from sglpr_jax.files import write_json
-from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.consistency import agree_along
+from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.loop import planar_loop
 from sglpr_jax.loops.probability import ALL, DEFAULT, Evidence, LoopModel, fit
-from sglpr_jax.loops.reliability import reliability
+from sglpr_jax.loops.reliability import calibration_error, reliability
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.loops.transforms import transform
 
@@ -43,7 +43,6 @@ PAIRS = 300.0
 DRIFTING = 3
 """One of this number of drives is also searched with odometry."""
 SURE = 0.99
-KEYFRAME_M = DetectorConfig.keyframe_m
 
 
 class Pairs(NamedTuple):
@@ -66,13 +65,21 @@ class Pairs(NamedTuple):
         return self.neighbours @ model.strength(self.evidence)
 
 
-def main(drives: tyro.conf.Positional[Path], *, weights: str = "sglpr", workers: int = 1, out: Path = DEFAULT) -> None:
+def main(
+    drives: tyro.conf.Positional[Path],
+    *,
+    weights: str = "sglpr",
+    workers: int = 1,
+    without_each: bool = False,
+    out: Path = DEFAULT,
+) -> None:
     """Fit and write the model.
 
     Args:
         drives: folder of `repeating_scans.py`.
         weights: the model that describes the scans.
         workers: number of processes.
+        without_each: also judge models without each term.
         out: the file to write.
     """
     files = sorted(drives.glob("*.npz"))
@@ -82,23 +89,15 @@ def main(drives: tyro.conf.Positional[Path], *, weights: str = "sglpr", workers:
         found = list(pool.map(functools.partial(pairs, weights=weights), *zip(*works, strict=True)))
     sceneries = [path.stem.split("-")[0] for path, _, _ in works]
     kinds = ["-".join([*path.stem.split("-")[:2], odometry]) for path, odometry, _ in works]
-    table = Table("scenery", "right", f">= {SURE}", ">= 0.5", "wrong", f">= {SURE}", ">= 0.5")
-    held_out = []
-    for scenery in dict.fromkeys(sceneries):
-        others = [row for row, one in enumerate(sceneries) if one != scenery]
-        model = fitted([found[row] for row in others], [kinds[row] for row in others])
-        own = [found[row] for row, one in enumerate(sceneries) if one == scenery]
-        chosen = np.concatenate([one.is_known for one in own])
-        is_loop = np.concatenate([one.is_loop for one in own])[chosen]
-        for title, log_odds in (
-            (scenery, [one.log_odds(model) for one in own]),
-            (f"{scenery}, alone", [model.log_odds(one.evidence) for one in own]),
-        ):
-            probability = expit(np.concatenate(log_odds)[chosen])
-            table.add_row(title, *_row(probability, is_loop))
-            held_out += [(probability, is_loop)] if title == scenery else []
-    probability, is_loop = (np.concatenate(values) for values in zip(*held_out, strict=True))
+    table = Table("scenery", "right", f">= {SURE}", ">= 0.5", "wrong", f">= {SURE}", ">= 0.5", "calibration error")
+    judged = held_out(found, sceneries, kinds)
+    for scenery, (probability, alone, is_loop) in judged.items():
+        table.add_row(scenery, *_row(probability, is_loop))
+        table.add_row(f"{scenery}, alone", *_row(alone, is_loop))
+    probability, is_loop = _whole(judged)
     table.add_row("all", *_row(probability, is_loop))
+    for name in (*ALL, "support") if without_each else ():
+        table.add_row(f"all, without {name}", *_row(*_whole(held_out(found, sceneries, kinds, without=name))))
     Console().print(table)
     for one in reliability(probability, is_loop):
         print(f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.said:.3f}, {one.share:.3f} are loops")
@@ -107,15 +106,46 @@ def main(drives: tyro.conf.Positional[Path], *, weights: str = "sglpr", workers:
     print(everything)
 
 
+class Judged(NamedTuple):
+    """Pairs that are certainly loops or certainly none, judged by a model of other sceneries."""
+
+    probability: Float[np.ndarray, " n"]
+    """With neighbours."""
+    alone: Float[np.ndarray, " n"]
+    is_loop: Bool[np.ndarray, " n"]
+
+
+def held_out(
+    found: Sequence[Pairs], sceneries: Sequence[str], kinds: Sequence[str], *, without: str | None = None
+) -> dict[str, Judged]:
+    """Judge each scenery by a model that was fitted to the others, or by one that lacks a term."""
+    judged = {}
+    for scenery in dict.fromkeys(sceneries):
+        others = [row for row, one in enumerate(sceneries) if one != scenery]
+        model = fitted([found[row] for row in others], [kinds[row] for row in others], without=without)
+        own = [found[row] for row, one in enumerate(sceneries) if one == scenery]
+        chosen = np.concatenate([one.is_known for one in own])
+        log_odds = [one.log_odds(model) for one in own], [model.log_odds(one.evidence) for one in own]
+        tested, alone = (expit(np.concatenate(values)[chosen]) for values in log_odds)
+        judged[scenery] = Judged(tested, alone, np.concatenate([one.is_loop for one in own])[chosen])
+    return judged
+
+
+def _whole(judged: Mapping[str, Judged]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    return tuple(np.concatenate(values) for values in zip(*((p, ok) for p, _, ok in judged.values()), strict=True))
+
+
 def _row(probability: Float[np.ndarray, " n"], is_loop: Bool[np.ndarray, " n"]) -> list[str]:
-    """Counts of right and wrong pairs, with the shares of the right and the numbers of the wrong ones above limits."""
+    """Counts of right and wrong pairs, the shares of the right and the numbers of the wrong ones above limits, and the
+    expected calibration error."""
     right, wrong = probability[is_loop], probability[~is_loop]
     shares = [f"{(right >= limit).mean():.2f}" if len(right) else "" for limit in (SURE, 0.5)]
-    return [str(len(right)), *shares, str(len(wrong)), *(str((wrong >= limit).sum()) for limit in (SURE, 0.5))]
+    error = f"{calibration_error(reliability(probability, is_loop)):.3f}"
+    return [str(len(right)), *shares, str(len(wrong)), *(str((wrong >= limit).sum()) for limit in (SURE, 0.5)), error]
 
 
-def fitted(found: Sequence[Pairs], kinds: Sequence[str]) -> LoopModel:
-    """Model of some drives, of which each kind counts alike."""
+def fitted(found: Sequence[Pairs], kinds: Sequence[str], *, without: str | None = None) -> LoopModel:
+    """Model of some drives, of which each kind counts alike. It may lack one term."""
     counts = Counter[str]()
     for kind, one in zip(kinds, found, strict=True):
         counts[kind] += int(one.is_known.sum())
@@ -124,21 +154,22 @@ def fitted(found: Sequence[Pairs], kinds: Sequence[str]) -> LoopModel:
     evidence = Evidence(*map(np.concatenate, zip(*(one.evidence for one in found), strict=True)))
     known = np.concatenate([one.is_known for one in found])
     is_loop = np.concatenate([one.is_loop for one in found])[known]
-    alone = fit({name: values[known] for name, values in evidence._asdict().items()}, is_loop, weights=weights)
+    terms = {name: values[known] for name, values in evidence._asdict().items() if name != without}
+    alone = fit(terms, is_loop, weights=weights)
     sceneries = ", ".join(dict.fromkeys(kind.split("-")[0] for kind in kinds))
     about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(found)} simulated drives ({sceneries})"
     model = LoopModel(alone, f"{about}; benchmarks/quality/fit_loops.py")
     support = np.concatenate([one.support(model) for one in found])
     values = {"alone": model.log_odds(evidence)[known], "support": support[known]}
-    return dataclasses.replace(model, tested=fit(values, is_loop, weights=weights))
+    tested = {name: each for name, each in values.items() if name != without}
+    return dataclasses.replace(model, tested=fit(tested, is_loop, weights=weights))
 
 
 def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pairs:
     """The candidates of one drive that the motion allows. With `breaks`, the motion is unknown in the middle."""
     drive, params = read(path), sglpr_jax.load(weights)
-    finder = CandidateFinder(params, keyframe_m=KEYFRAME_M)
-    empty = CandidateFinder(params, keyframe_m=KEYFRAME_M)
-    frames = compared(drive, empty, path.parent / "compared", odometry=odometry, breaks=breaks)
+    finder = LoopDetector(params).finder
+    frames = compared(drive, LoopDetector(params).finder, path.parent / "compared", odometry=odometry, breaks=breaks)
     poses, found = drive.odometry(odometry), []
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if poses is None else poses[i]

@@ -30,7 +30,6 @@ from rich.table import Table
 import sglpr_jax
 from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
 from sglpr_jax.loops import optimization
-from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.joint import accepted
 from sglpr_jax.loops.loop import Loop
@@ -103,7 +102,7 @@ def searched(path: Path, *, odometry: Odometry, optimized: bool, weights: str) -
     poses, times = drive.world_from_lidar, drive.times
     given = drive.odometry(odometry)
     detector = LoopDetector(params)
-    frames = compared(drive, CandidateFinder(params), path.parent / "compared", odometry=odometry)
+    frames = compared(drive, LoopDetector(params).finder, path.parent / "compared", odometry=odometry)
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if given is None else given[i]
         detector.add_seen(seen, time=float(times[i]), odometry=pose, compared=frame)

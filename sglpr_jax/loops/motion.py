@@ -26,6 +26,9 @@ EQUAL = 0.99
 """Correlation of equal images. Between plain walls, too, they show that the sensor stands."""
 STANDING_M = 0.05
 """Maximum length of a step of a sensor that stands, in metres."""
+TURN_DEG = 90.0
+"""Maximum rotation from the expected pose, in degrees. Beyond it, or if no pose is expected, as after a gap, a pose drifts
+like a guess: rows of cars look alike, and from both ends."""
 GAP_M = 1000.0
 """Travelled distance that counts for an unknown motion, as after a restart, in metres."""
 UNKNOWN_M = 1e6
@@ -52,6 +55,11 @@ class Link(NamedTuple):
     def of(cls, one: Alignment) -> "Link":
         """Pose of an alignment."""
         return cls(*map(np.asarray, (one.x, one.y, one.yaw, one.correlation, one.second, one.along_m)))
+
+
+def turned(link: Link, prior: Float[np.ndarray, " 3"]) -> float:
+    """Angle between a link and the expected pose, in radians. NaN if no pose is expected."""
+    return float(abs((float(link.yaw) - prior[2] + np.pi) % (2 * np.pi) - np.pi))
 
 
 class Motion:
@@ -142,7 +150,9 @@ class Motion:
             return self._begin(time, self.poses[-1] if pose is None else pose)
         key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
         if pose is None and link is not None:
-            ambiguous = not self.is_trusted(link, self.prior(time, key))
+            prior = self.prior(time, key)
+            expected = self._last_moving is None or turned(link, prior) <= np.radians(TURN_DEG)
+            ambiguous = not (self.is_trusted(link, prior) and expected)
             along_m = float(link.along_m) if self.is_ridge(link) else along_m
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < self.config.max_coasting:
@@ -180,11 +190,19 @@ class Motion:
         if moving is None:
             return None
         before, after = moving
-        steps = (time - self._times[-1]) / (self._times[after] - self._times[before])
+        steps = self._steps(time)
         if not 0 < steps <= MOST_STEPS:
             return None
         last = inverse(self.poses[before]) @ self.poses[after]
         return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
+
+    def _steps(self, time: float) -> float:
+        """Time since the last frame, as a multiple of the last time step with a known motion. 1 if there is none."""
+        moving = self._last_moving
+        if moving is None:
+            return 1.0
+        before, after = moving
+        return float((time - self._times[-1]) / (self._times[after] - self._times[before]))
 
     @property
     def _last_moving(self) -> tuple[int, int] | None:
@@ -227,7 +245,7 @@ class Motion:
     def _guessed_step_m(self, time: float) -> float:
         """Length of the next step, if it is a guess."""
         if len(self) > 1 and self.segments[-1] == self.segments[-2]:
-            return self._last_step_m
+            return self._last_step_m * max(self._steps(time), 1.0)
         if self._m_per_s is not None:
             return abs(self._m_per_s) * (time - self._times[-1])
         return self.config.unknown_step_m
@@ -265,10 +283,9 @@ class Motion:
         """
         config, most = self.config, self.config.max_second
         apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
-        turned = abs((float(link.yaw) - prior[2] + np.pi) % (2 * np.pi) - np.pi)
         if apart > config.max_jump * self._last_step_m + 1.0:
             most = config.max_second_of_jump
-        elif apart <= config.expected_m and turned <= np.radians(config.expected_deg):
+        elif apart <= config.expected_m and turned(link, prior) <= np.radians(config.expected_deg):
             most = config.max_second_expected
         fits = bool(link.correlation >= config.min_correlation and link.second <= most)
         return fits and not self.is_ridge(link)

@@ -47,6 +47,12 @@ def reliability(
     return tuple(found)
 
 
+def calibration_error(bins: Sequence[Bin]) -> float:
+    """Expected calibration error: mean difference between probability and share of loops, weighted by pairs."""
+    pairs = np.array([one.pairs for one in bins])
+    return float(pairs @ [abs(one.said - one.share) for one in bins] / pairs.sum())
+
+
 def reliability_of(
     candidates: Sequence[Candidate], model: LoopModel, positions: Float[np.ndarray, "n 3"]
 ) -> tuple[Bin, ...]:

@@ -8,8 +8,10 @@ from sglpr_jax.loops.motion import UNKNOWN_M, Link, Motion
 from sglpr_jax.loops.transforms import transform
 
 
-def link(x: float, correlation: float = 0.9, second: float = 0.3, along_m: float = 0.1) -> Link:
-    return Link(*map(np.float32, (x, 0.0, 0.0, correlation, second, along_m)))
+def link(
+    x: float, correlation: float = 0.9, second: float = 0.3, along_m: float = 0.1, turned_deg: float = 0.0
+) -> Link:
+    return Link(*map(np.float32, (x, 0.0, np.radians(turned_deg), correlation, second, along_m)))
 
 
 def moved(links: list[Link | None], *, factor: float = 1.0) -> Motion:
@@ -55,6 +57,22 @@ def test_another_peak_is_no_matter_where_the_pose_is_expected():
     ambiguous = link(3.0, second=0.85)
     assert motion.is_trusted(ambiguous, motion.prior(0.3, 0)) and not motion.is_trusted(ambiguous, np.full(3, 9.0))
     assert np.isnan(motion.prior(0.9, 0)).all()  # too long after
+
+
+@pytest.mark.parametrize("turned_deg,drifts", [(80.0, False), (100.0, True), (-179.0, True)])
+def test_a_sensor_that_seems_to_turn_round_at_once_may_be_in_another_row(turned_deg, drifts):
+    motion = moved([None, link(1.0), link(1.5, turned_deg=turned_deg)])
+    share = motion.config.ambiguous_share * motion.config.guess_factor
+    np.testing.assert_allclose(motion.guessed_m, [0, 0, share * drifts])
+
+
+def test_a_link_after_a_gap_drifts_by_what_the_sensor_may_have_moved_meanwhile():
+    motion = Motion()
+    for time, one in ((0.0, None), (0.1, link(1.0)), (0.2, link(2.0)), (1.2, link(2.5)), (1.3, link(3.5))):
+        motion.add(time, link=one)
+    share = motion.config.ambiguous_share * motion.config.guess_factor
+    np.testing.assert_allclose(motion.guessed_m[:4], [0, 0, 0, 10 * share])
+    assert set(motion.segments) == {0}
 
 
 @pytest.mark.parametrize("factor", [0.25, 4.0, 1e9])
