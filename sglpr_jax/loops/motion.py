@@ -21,14 +21,14 @@ from sglpr_jax.loops.transforms import inverse, transform, travelled, yaw_of
 from sglpr_jax.loops.verification import Alignment
 
 MOST_STEPS = 3.0
-"""Maximum time step for which a pose is extrapolated, as a multiple of the previous time step."""
+"""Maximum time step, as a multiple of the previous one, for which a pose is extrapolated. A longer one is a gap."""
 EQUAL = 0.99
 """Correlation of equal images. Between plain walls, too, they show that the sensor stands."""
 STANDING_M = 0.05
 """Maximum length of a step of a sensor that stands, in metres."""
 TURN_DEG = 90.0
-"""Maximum rotation from the expected pose, in degrees. Beyond it, or if no pose is expected, as after a gap, a pose drifts
-like a guess: rows of cars look alike, and from both ends."""
+"""Maximum rotation from the expected pose, in degrees. Beyond it, as after a gap, a pose drifts like a guess, because
+rows of cars look alike from both ends."""
 GAP_M = 1000.0
 """Travelled distance that counts for an unknown motion, as after a restart, in metres."""
 UNKNOWN_M = 1e6
@@ -151,8 +151,8 @@ class Motion:
         key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
         if pose is None and link is not None:
             prior = self.prior(time, key)
-            expected = self._last_moving is None or turned(link, prior) <= np.radians(TURN_DEG)
-            ambiguous = not (self.is_trusted(link, prior) and expected)
+            surprises = turned(link, prior) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
+            ambiguous = surprises or not self.is_trusted(link, prior)
             along_m = float(link.along_m) if self.is_ridge(link) else along_m
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
         elif pose is None and self._coasted < self.config.max_coasting:
