@@ -89,7 +89,7 @@ def main(
         found = list(pool.map(functools.partial(pairs, weights=weights), *zip(*works, strict=True)))
     sceneries = [path.stem.split("-")[0] for path, _, _ in works]
     kinds = ["-".join([*path.stem.split("-")[:2], odometry]) for path, odometry, _ in works]
-    table = Table("scenery", "right", f">= {SURE}", ">= 0.5", "wrong", f">= {SURE}", ">= 0.5", "calibration error")
+    table = Table("scenery", "right", f">= {SURE}", ">= 0.5", "wrong", f">= {SURE}", ">= 0.5", "ECE")
     judged = held_out(found, sceneries, kinds)
     for scenery, (probability, alone, is_loop) in judged.items():
         table.add_row(scenery, *_row(probability, is_loop))
@@ -97,7 +97,7 @@ def main(
     probability, is_loop = _whole(judged)
     table.add_row("all", *_row(probability, is_loop))
     for name in (*ALL, "support") if without_each else ():
-        table.add_row(f"all, without {name}", *_row(*_whole(held_out(found, sceneries, kinds, without=name))))
+        table.add_row(f"without {name}", *_row(*_whole(held_out(found, sceneries, kinds, without=name))))
     Console().print(table)
     for one in reliability(probability, is_loop):
         print(f"{one.low:.2f} to {one.high:.2f}: {one.pairs} pairs, said {one.said:.3f}, {one.share:.3f} are loops")

@@ -197,7 +197,7 @@ class Motion:
         return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
 
     def _steps(self, time: float) -> float:
-        """Time since the last frame, as a multiple of the last time step with a known motion. 1 if there is none."""
+        """Time since the last frame, as a multiple of the last time step with a known motion. 1 without such a step."""
         moving = self._last_moving
         if moving is None:
             return 1.0
