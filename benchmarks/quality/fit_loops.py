@@ -175,7 +175,7 @@ def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pair
         pose = None if poses is None else poses[i]
         continues = not (breaks and i == len(frames) // 2)
         found += finder.add_seen(seen, time=float(drive.times[i]), odometry=pose, compared=frame, continues=continues)
-    found = [one for one in found if one.deviation <= finder.present_drift.max_deviation]
+    found = [one for one in found if one.evidence.deviation <= finder.present_drift.max_deviation]
     fits = [transform(*(float(value) for value in one.alignment[:3])) for one in found]
     errors = pose_errors([(one.query, one.match) for one in found], np.array(fits), drive.world_from_lidar)
     evidence = np.array([one.evidence for one in found], np.float64).reshape(-1, len(ALL))

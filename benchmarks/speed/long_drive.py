@@ -127,7 +127,7 @@ class _ByTruePose(Comparer):
     def candidate(self, query: Query, fits: Fits, row: int, image_of: Any) -> Candidate:
         one = fits.peaks.one(row)
         values: Any = (one.x, one.y, one.yaw, np.diag([0.05, 0.05, 0.005]) ** 2, 0.9, 0.3)
-        return Candidate(query.frame, int(fits.frames[row]), Alignment(*values), Evidence.of(0.3, 0.1, 1.5), 0.5)
+        return Candidate(query.frame, int(fits.frames[row]), Alignment(*values), Evidence.of(0.3, 0.1, 0.5, 2.0))
 
 
 class WithoutImages(CandidateFinder):

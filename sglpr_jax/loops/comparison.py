@@ -43,8 +43,6 @@ class Candidate(NamedTuple):
     alignment: Alignment
     """Pose of the query's image in the frame of the match's image."""
     evidence: Evidence
-    deviation: float
-    """Deviation of the pose from the motion, in standard deviations."""
 
 
 class Fits(NamedTuple):
@@ -175,20 +173,20 @@ class Comparer:
         The poses of other scans that the motion excludes count against it. So do second-best poses, those of the match
         and of scans whose best poses the motion allows.
         """
-        match, peak, deviations = int(fits.frames[row]), fits.peaks.one(row), self._deviations(query.frame, fits)
-        contradicts = deviations > self.drift.max_deviation
+        match, peak = int(fits.frames[row]), fits.peaks.one(row)
+        deviation = float(self._deviations(query.frame, fits)[row])
         distracts = self._excluded(query.frame, match, peak, fits)
-        if not contradicts[row]:
+        if deviation <= self.drift.max_deviation:
+            contradicts = self._deviations(query.frame, fits) > self.drift.max_deviation
             distracts |= contradicts & ~self.are_joined(match, fits.frames)
         distracts &= fits.frames != match
         others = np.where(distracts, fits.peaks.correlation, fits.peaks.second)
         ambiguity = float(others.max()) / max(float(peak.correlation), 1e-6)
         alignment = jax.device_get(refined(query.image, image_of(match), peak, config=self.verification))
-        agreement = self.information(query.frame, match) - deviations[row]
-        evidence = Evidence.of(ambiguity, alignment.along_m, agreement)
-        return Candidate(query.frame, match, alignment, evidence, float(deviations[row]))
+        evidence = Evidence.of(ambiguity, alignment.along_m, deviation, self.surprise(query.frame, match))
+        return Candidate(query.frame, match, alignment, evidence)
 
-    def information(self, query: int, match: int) -> float:
+    def surprise(self, query: int, match: int) -> float:
         """Logarithm of all poses that a sensor may have over those within the uncertainty of the motion.
 
         A lookalike stands anywhere in the surroundings. Its rotation is one of `SYMMETRIES`, because walls stand at

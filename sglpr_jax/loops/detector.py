@@ -161,13 +161,12 @@ class LoopDetector:
             query_mounting=each[one.query],
             match_mounting=each[one.match],
         )
-        is_allowed = one.deviation <= self.finder.present_drift.max_deviation
-        return Pair(loop, evidence, float(self.finder.motion.travelled[one.query]), is_allowed)
+        return Pair(loop, evidence, float(self.finder.motion.travelled[one.query]))
 
     def _confirmed(self) -> list[Loop]:
         """New loops of the last frames that pass the sequential test."""
-        allowed = [one for one in self._waiting if one.is_allowed]
-        others = [one for one in self._waiting if not one.is_allowed]
+        allowed = [one for one in self._waiting if self._is_allowed(one)]
+        others = [one for one in self._waiting if not self._is_allowed(one)]
         reason: Reason = "contradicts the odometry" if self.finder.has_odometry else "contradicts the motion"
         self.rejected += [Rejected(loop, reason) for loop in self._probable(others, self._contradicting)]
         return self._probable(allowed, self._returned)
@@ -186,7 +185,11 @@ class LoopDetector:
         done |= {loop.query for loop in found}
         return found
 
+    def _is_allowed(self, one: Pair) -> bool:
+        """Whether the motion allows the pose of a pair."""
+        return bool(one.evidence.deviation <= self.finder.present_drift.max_deviation)
+
     def _verdicts(self, pairs: Sequence[Pair]) -> list[Rejected]:
         """Reasons why pairs that were not returned are no loops."""
-        left = [one for one in pairs if one.loop.query not in self._returned and one.is_allowed]
+        left = [one for one in pairs if one.loop.query not in self._returned and self._is_allowed(one)]
         return [Rejected(one.loop, verdict(one, self.model, self.config.min_probability)) for one in left]

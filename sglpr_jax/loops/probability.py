@@ -21,12 +21,13 @@ DEFAULT = Path(__file__).with_name("probability.json")
 KNOTS: Mapping[str, tuple[float, ...]] = {
     "ambiguity_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "along_m": (0.03, 0.06, 0.1, 0.2, 0.4, 1.0, 3.0),
-    "agreement": (-4.0, -2.0, 0.0, 2.0, 4.0, 6.0, 9.0),
+    "deviation": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0),
+    "surprise": (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0),
     "alone": (-10.0, -6.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0),
     "support": (-12.0, -6.0, -3.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 13.0, 18.0),
 }
 """Knots of the piecewise linear functions. Outside the knots they are constant."""
-RISING = ("agreement", "alone", "support")
+RISING = ("surprise", "alone", "support")
 """Fields whose functions rise. The other functions fall."""
 MAX_STRENGTH = 4.0
 """Maximum log odds with which a pair counts as neighbour."""
@@ -41,14 +42,15 @@ class Evidence(NamedTuple):
     """Correlation with the best other place, or at the best other pose, divided by the correlation with the match."""
     along_m: Float[np.ndarray, "*n"]
     """Standard deviation of the position along its least certain direction, in metres. It is large between walls."""
-    agreement: Float[np.ndarray, "*n"]
-    """Agreement with the motion: logarithm of all poses over those that the motion allows, minus the deviation of the
-    pose from the motion in standard deviations. 0 if the motion says nothing."""
+    deviation: Float[np.ndarray, "*n"]
+    """Deviation of the pose from the motion, in standard deviations."""
+    surprise: Float[np.ndarray, "*n"]
+    """Logarithm of all poses over those that the motion allows. 0 if the motion says nothing."""
 
     @classmethod
-    def of(cls, ambiguity_ratio: Any, along_m: Any, agreement: Any) -> "Evidence":
+    def of(cls, ambiguity_ratio: Any, along_m: Any, deviation: Any, surprise: Any) -> "Evidence":
         """Create the evidence of one pair."""
-        values = (ambiguity_ratio, along_m, agreement)
+        values = (ambiguity_ratio, along_m, deviation, surprise)
         return cls(*(np.asarray(value, np.float64) for value in values))
 
     @classmethod
@@ -158,8 +160,8 @@ class LoopModel:
 
         The motion between the two passes is common to neighbours, so it does not count again.
         """
-        nothing = np.zeros_like(evidence.agreement)
-        return np.clip(self.log_odds(evidence._replace(agreement=nothing)), 0.0, MAX_STRENGTH)
+        nothing = {"deviation": np.zeros_like(evidence.deviation), "surprise": np.zeros_like(evidence.surprise)}
+        return np.clip(self.log_odds(evidence._replace(**nothing)), 0.0, MAX_STRENGTH)
 
     def to_json(self) -> dict[str, Any]:
         """Convert to a JSON value for `from_json`."""

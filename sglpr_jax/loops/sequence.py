@@ -31,8 +31,6 @@ class Pair(NamedTuple):
     evidence: Evidence
     way_m: float
     """Travelled distance at the query, in metres."""
-    is_allowed: bool = True
-    """Whether the motion allows the pose."""
 
 
 def tested_log_odds(

@@ -76,12 +76,12 @@ def test_stopped_before_the_first_scan_there_is_nothing_corrected(found):
 @pytest.fixture
 def known(found) -> FoundLoops:
     """The same with true positions, off the odometry, and with candidates: two loops, and one that is none."""
-    model = LoopModel(AdditiveModel({"agreement": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
+    model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((8, 3))
     positions[:, 0] = [0, 1, 2, 3, 4, 5, 6, 97]
     recording = dataclasses.replace(found.recording, positions=positions, pose_source="poses.txt")
     pairs = [(5, 1, 6.0), (6, 2, 7.0), (7, 3, -6.0)]
-    candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, c), 0.0) for q, m, c in pairs)
+    candidates = tuple(Candidate(q, m, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, m, c in pairs)
     return dataclasses.replace(found, recording=recording, candidates=candidates, model=model)
 
 

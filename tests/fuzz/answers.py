@@ -59,7 +59,7 @@ def _as_fields(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 PARAMS = Params(as_tree(WEIGHTS), CONFIG)
-ALWAYS = LoopModel(AdditiveModel({"agreement": Curve((0.0,), (0.0,))}, 1.0), "everything")
+ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 1.0), "everything")
 IMAGES = DRAWN.integers(0, 255, (6, 16, 16)).astype(np.uint8) * (DRAWN.random((6, 16, 16)) < 0.5)
 
 

@@ -51,7 +51,7 @@ def compare_only(monkeypatch) -> Callable[[Mapping[int, tuple[int, np.ndarray]]]
             planar = np.array([[*pose[:2, 3], yaw_of(pose)]])
             (deviation,) = self.deviations(query.frame, np.array([match]), planar)
             alignment = Alignment(*planar[0], np.diag([0.05, 0.05, 0.005]) ** 2, 0.8, 0.3)
-            return [Candidate(query.frame, match, alignment, Evidence.of(0.3, 0.1, 3.0 - deviation), deviation)]
+            return [Candidate(query.frame, match, alignment, Evidence.of(0.3, 0.1, deviation, 3.0))]
 
         monkeypatch.setattr(Comparer, "candidates", candidates)
 

@@ -60,7 +60,7 @@ def test_the_place_is_found_and_no_other_place_fits_as_well():
     assert (found.query, found.match) == (PLACES, TRUE)
     turned = (np.array(found.alignment[:3]) - THERE + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(turned, 0, atol=0.2)
-    assert found.deviation < 1 and found.evidence.ambiguity_ratio < 0.7 and found.evidence.agreement > 2
+    assert found.evidence.deviation < 1 and found.evidence.ambiguity_ratio < 0.7 and found.evidence.surprise > 3
 
 
 @pytest.mark.parametrize("x", [60.0 * 7 + 20, 60.0 * 2 + 12], ids=["elsewhere", "near, but not so near"])
@@ -80,7 +80,7 @@ def test_a_scan_that_fits_better_where_the_motion_excludes_it_is_a_second_candid
     poses, images = street(copy=(60.0 * 7 + 20, image(TRUE, THERE, noise=1)))
     first, second = compared([*poses, transform(*LAST)], images)
     assert (first.match, second.match) == (TRUE, 8)
-    assert first.deviation < EXACT.max_deviation < second.deviation
+    assert first.evidence.deviation < EXACT.max_deviation < second.evidence.deviation
     assert first.evidence.ambiguity_ratio > 1 > second.evidence.ambiguity_ratio
 
 
@@ -129,18 +129,16 @@ def test_elsewhere_is_farther_than_a_shift_and_the_drift():
     assert not unknown.elsewhere(np.arange(100), 100).any()
 
 
-def test_the_information_of_the_motion_falls_with_the_poses_that_the_motion_allows():
+def test_a_surprise_falls_with_the_poses_that_the_motion_allows():
     poses = [transform(2.0 * k, 0.0, 0.0) for k in range(50)]
 
-    def information(position_m: float, yaw_deg: float) -> float:
+    def surprise(position_m: float, yaw_deg: float) -> float:
         rates = {"metres_per_metre": 0.0, "degrees_per_metre": 0.0}
-        return comparer_along(poses, drift=DriftModel(**rates, position_m=position_m, yaw_deg=yaw_deg)).information(
-            49, 0
-        )
+        return comparer_along(poses, drift=DriftModel(**rates, position_m=position_m, yaw_deg=yaw_deg)).surprise(49, 0)
 
-    assert information(0.5, 1.5) - information(1.0, 1.5) == pytest.approx(np.log(4))
-    assert information(0.5, 1.5) == information(0.5, 3.0)  # the rotation is one of four
-    assert information(0.5, 1.5) - information(0.5, 180 / 8) == pytest.approx(np.log(2))
+    assert surprise(0.5, 1.5) - surprise(1.0, 1.5) == pytest.approx(np.log(4))
+    assert surprise(0.5, 1.5) == surprise(0.5, 3.0)  # the rotation is one of four
+    assert surprise(0.5, 1.5) - surprise(0.5, 180 / 8) == pytest.approx(np.log(2))
     unknown = comparer_along(poses)
     unknown.motion.add(0.0, continues=False)
-    assert unknown.information(50, 0) == 0
+    assert unknown.surprise(50, 0) == 0

@@ -105,7 +105,7 @@ def test_odometry_that_is_far_off_contradicts_a_match(drive, params, revisit):
         finder = CandidateFinder(params, config=NOW)
         finder.add(Record(points=match), odometry=np.eye(4))
         (found,) = finder.add(Record(points=query), odometry=transform(metres, 0.0, 0.0) @ true)
-        assert (found.deviation <= finder.drift.max_deviation) == allowed
+        assert (found.evidence.deviation <= finder.drift.max_deviation) == allowed
 
 
 @pytest.mark.parametrize(("metres", "there"), [(0.4, 0), (0.6, 1)])
@@ -119,7 +119,7 @@ def test_scans_of_one_pass_are_no_candidates(drive, params, revisit, metres, the
 
 def model_of(log_odds: float) -> LoopModel:
     """A model that says the same of every pair without neighbours."""
-    return LoopModel(AdditiveModel({"agreement": Curve((0.0, 1.0), (0.0, 0.0))}, log_odds), "by hand")
+    return LoopModel(AdditiveModel({"deviation": Curve((0.0, 1.0), (0.0, 0.0))}, log_odds), "by hand")
 
 
 THERE_AND_BACK = np.stack(

@@ -25,7 +25,7 @@ from sglpr_jax.loops.transforms import inverse, transform
 from sglpr_jax.loops.upright import check_level
 
 N = 40
-ALWAYS = LoopModel(AdditiveModel({"agreement": Curve((0.0,), (0.0,))}, 10.0), "everything")
+ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 10.0), "everything")
 CONFIG = DetectorConfig()
 
 

@@ -21,7 +21,7 @@ from sglpr_jax.loops.probability import (
     recalibrated,
 )
 
-DRAWN = {"ambiguity_ratio": (0.9, -0.4, 0.15), "along_m": (0.3, -0.2, 0.1), "agreement": (1.0, 2.0, 1.2)}
+DRAWN = {"ambiguity_ratio": (0.9, -0.4, 0.15), "along_m": (0.3, -0.2, 0.1), "deviation": (1.8, -1.0, 0.6)}
 """Mean of the pairs that are no loops, what a loop adds, and the standard deviation."""
 
 
@@ -29,7 +29,8 @@ def pairs(n: int = 600, *, seed: int = 0, noise: float = 1.0, shift: float = 0.0
     """Pairs of which a third are loops, with evidence that overlaps."""
     rng = np.random.default_rng(seed)
     is_loop = rng.random(n) < 1 / 3
-    values = [mean + more * is_loop + noise * spread * rng.normal(size=n) for mean, more, spread in DRAWN.values()]
+    drawn = (DRAWN | {"surprise": (2.0, 1.0, 1.0)}).values()
+    values = [mean + more * is_loop + noise * spread * rng.normal(size=n) for mean, more, spread in drawn]
     return Evidence(values[0] - shift, *values[1:]), is_loop
 
 
@@ -63,9 +64,9 @@ def test_weights_are_as_good_as_pairs_that_stand_several_times():
     np.testing.assert_allclose(one(values), other(values), atol=0.02)
 
 
-@given(values=st.lists(st.floats(-1, 6), min_size=6, max_size=6), name=st.sampled_from(ALL))
+@given(values=st.lists(st.floats(-1, 6), min_size=8, max_size=8), name=st.sampled_from(ALL))
 def test_log_odds_never_fall_where_the_evidence_is_stronger(values, name):
-    one, other = (Evidence.of(*half) for half in (values[:3], values[3:]))
+    one, other = (Evidence.of(*half) for half in (values[:4], values[4:]))
     better = other._replace(**{field: getattr(one, field) for field in ALL if field != name})
     stronger = (
         getattr(better, name) >= getattr(one, name) if name in RISING else getattr(better, name) <= getattr(one, name)
@@ -78,18 +79,18 @@ FITTED = model_of(*pairs())
 
 
 def test_evidence_says_this_much_and_no_more():
-    best, beyond = Evidence.of(0.3, 0.03, 9.0), Evidence.of(-9.0, -9.0, 9e9)
+    best, beyond = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(-9.0, -9.0, 0.0, 9e9)
     assert FITTED.log_odds(best) == FITTED.log_odds(beyond)
 
 
 def test_ambiguity_is_left_out():
-    evidence, best = (Evidence.of(ratio, 0.1, 2.0) for ratio in (0.7, 0.0))
+    evidence, best = (Evidence.of(ratio, 0.1, 3.0, 2.0) for ratio in (0.7, 0.0))
     assert FITTED.log_odds_without_ambiguity(evidence) == FITTED.log_odds(best)
     np.testing.assert_allclose(FITTED.probability(evidence), 1 / (1 + np.exp(-FITTED.log_odds(evidence))))
 
 
 def test_neighbours_add_their_support_to_what_a_pair_says_alone():
-    evidence = Evidence.of(0.7, 0.1, 2.0)
+    evidence = Evidence.of(0.7, 0.1, 3.0, 2.0)
     np.testing.assert_allclose(FITTED.tested_log_odds(evidence, np.array(2.5)), FITTED.log_odds(evidence) + 2.5)
     assert FITTED.tested is ADDED and set(default_model().tested.curves) == set(OF_NEIGHBOURS)
 
@@ -138,9 +139,9 @@ def test_models_go_to_a_file_and_back(tmp_path):
 
     def curve(**change):
         curves = values["alone"]["curves"]
-        return alone(curves={**curves, "agreement": {**curves["agreement"], **change}})
+        return alone(curves={**curves, "deviation": {**curves["deviation"], **change}})
 
-    broken = [curve(values=[np.nan] * 7), curve(values=[1.0]), curve(knots=[1.0] * 7)]
+    broken = [curve(values=[np.nan] * 6), curve(values=[1.0]), curve(knots=[1.0] * 6)]
     broken += [alone(bias="x"), alone(bias=np.inf), alone(curves={"height": {"knots": [0], "values": [0]}})]
     broken += [{**values, "tested": values["alone"]}]
     for wrong in ('{"bias": 1}', "[]", "no", "3", *map(json.dumps, broken)):
@@ -151,6 +152,6 @@ def test_models_go_to_a_file_and_back(tmp_path):
 
 def test_the_shipped_model_tells_clear_pairs():
     model = default_model()
-    loop, none = Evidence.of(0.3, 0.03, 9.0), Evidence.of(1.0, 3.0, -4.0)
+    loop, none = Evidence.of(0.3, 0.03, 0.5, 12.0), Evidence.of(1.0, 3.0, 4.0, 0.0)
     assert set(model.alone.curves) == set(ALL) and isinstance(model.alone, AdditiveModel)
     assert model.probability(loop) > 0.99 and model.probability(none) < 0.01

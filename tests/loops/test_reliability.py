@@ -34,10 +34,10 @@ def test_every_pair_is_in_one_bin(pairs):
 
 
 def test_candidates_with_true_positions_and_those_in_between_are_left_out():
-    model = LoopModel(AdditiveModel({"agreement": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
+    model = LoopModel(AdditiveModel({"surprise": Curve((-9.0, 9.0), (-9.0, 9.0))}, 0.0), "by hand")
     positions = np.zeros((6, 3))
     positions[3:, 0] = 3, 15, 40
-    candidates = [Candidate(q, 0, None, Evidence.of(0.0, 0.0, c), 0.0) for q, c in ((3, 6.0), (4, 6.0), (5, -6.0))]
+    candidates = [Candidate(q, 0, None, Evidence.of(0.0, 0.0, 0.0, c)) for q, c in ((3, 6.0), (4, 6.0), (5, -6.0))]
     low, high = reliability_of(candidates, model, positions)
     assert (low.pairs, low.loops, high.pairs, high.loops) == (1, 0, 1, 1)
     assert high.said == pytest.approx(1 / (1 + np.exp(-6)))

@@ -12,8 +12,8 @@ from sglpr_jax.loops.sequence import Pair, neighbour_weights, verdict
 from sglpr_jax.loops.transforms import inverse, transform
 
 REPEATS = Curve((0.5, 1.0), (8.0, 0.0))
-AGREEMENT = Curve((0.0, 9.0), (0.0, 9.0))
-MODEL = LoopModel(AdditiveModel({"ambiguity_ratio": REPEATS, "agreement": AGREEMENT}, -6.0), "by hand")
+SURPRISE = Curve((0.0, 9.0), (0.0, 9.0))
+MODEL = LoopModel(AdditiveModel({"ambiguity_ratio": REPEATS, "surprise": SURPRISE}, -6.0), "by hand")
 
 
 def by_hand(way_m: np.ndarray, row: int, config: SequenceConfig) -> list[float]:
@@ -48,7 +48,7 @@ def test_neighbours_whose_matches_move_as_they_do_support_a_loop_and_others_oppo
     true = [(query, 99 - query, inverse(poses[99 - query]) @ poses[query]) for query in range(60, 70)]
     wrong = (70, 38, transform(4.0, 1.0, 0.0))
     loops = [Loop(*one, 1e-4 * np.eye(6), 0.9) for one in [*true, wrong]]
-    evidence = Evidence.of(0.5, 0.1, 0.0)  # log odds of 2 alone
+    evidence = Evidence.of(0.5, 0.1, 1.0, 0.0)  # log odds of 2 alone
     pairs = [Pair(loop, evidence, 2.0 * loop.query) for loop in loops]
     path, rules = DrivenPath.of(poses), {"mounting": None, "drift": DriftModel()}
     found = sequence.tested_log_odds(pairs, MODEL, path, **rules)
@@ -59,9 +59,9 @@ def test_neighbours_whose_matches_move_as_they_do_support_a_loop_and_others_oppo
 
 
 @pytest.mark.parametrize(
-    ("ambiguity", "agreement", "reason"),
+    ("ambiguity", "surprise", "reason"),
     [(0.5, 0.0, "too few neighbours"), (1.0, 2.0, "little similarity"), (1.0, 3.0, "repeats")],
 )
-def test_the_reason_of_a_rejection_is_what_is_missing(ambiguity, agreement, reason):
-    pair = Pair(Loop(9, 0, np.eye(4), np.eye(6), 0.5), Evidence.of(ambiguity, 0.1, agreement), 90.0)
+def test_the_reason_of_a_rejection_is_what_is_missing(ambiguity, surprise, reason):
+    pair = Pair(Loop(9, 0, np.eye(4), np.eye(6), 0.5), Evidence.of(ambiguity, 0.1, 1.0, surprise), 90.0)
     assert verdict(pair, MODEL, 0.99) == reason

@@ -25,7 +25,7 @@ from .kept import WANTED, fake_frames, keep, recalled
 
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
-ALWAYS = LoopModel(AdditiveModel({"agreement": Curve((0.0,), (0.0,))}, 10.0), "everything")
+ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 10.0), "everything")
 find_loops = functools.partial(find.find_loops, model=ALWAYS)
 """Every candidate is probable, so that the loops depend on nothing but what is kept."""
 CONFIG = DetectorConfig(candidates=CandidateConfig(recent_m=20.0))
