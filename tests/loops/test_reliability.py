@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.reliability import EDGES, reliability, reliability_of
+from sglpr_jax.loops.reliability import EDGES, calibration_error, reliability, reliability_of
 
 
 def test_bins_are_counted():
@@ -42,3 +42,9 @@ def test_candidates_with_true_positions_and_those_in_between_are_left_out():
     assert (low.pairs, low.loops, high.pairs, high.loops) == (1, 0, 1, 1)
     assert high.said == pytest.approx(1 / (1 + np.exp(-6)))
     assert reliability_of([], model, positions) == () == reliability_of(candidates[1:2], model, positions)
+
+
+def test_the_calibration_error_is_the_mean_difference_between_probability_and_share():
+    probability, is_loop = np.array([0.2, 0.2, 0.2, 0.2, 0.95, 0.95]), np.array([True, False, False, False, True, True])
+    found = calibration_error(reliability(probability, is_loop))
+    np.testing.assert_allclose(found, (4 * abs(0.2 - 0.25) + 2 * abs(0.95 - 1)) / 6)
