@@ -19,6 +19,7 @@ from sglpr_jax.data.record import Record
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.transforms import inverse, yaw_of
 from sglpr_jax.loops.unfinished import columns, compared_of
@@ -72,13 +73,19 @@ def read(path: Path, params: Params | None = None) -> RenderedDrive:
     return RenderedDrive(path.stem, seen, scaled_poses(poses, scale), times, scale * float(other_m), about, scale)
 
 
+def finder_of(params: Params) -> CandidateFinder:
+    """An empty finder with the settings of the loop detector. It needs no model of the probability."""
+    return CandidateFinder(params, keyframe_m=DetectorConfig.keyframe_m)
+
+
 def compared(
-    drive: RenderedDrive, finder: CandidateFinder, folder: Path, *, odometry: Odometry = "none", breaks: bool = False
+    drive: RenderedDrive, params: Params, folder: Path, *, odometry: Odometry = "none", breaks: bool = False
 ) -> list[Compared]:
-    """What a finder, an empty one, makes of each scan; read from the folder where it is kept.
+    """What the finder makes of each scan; read from the folder where it is kept.
 
     With `breaks`, the motion is unknown in the middle of the drive.
     """
+    finder = finder_of(params)
     path = folder / f"{drive.name}-{_settings(finder, odometry)}{'-broken' * breaks}.npz"
     if path.exists():
         with np.load(path) as file:

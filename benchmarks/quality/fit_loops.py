@@ -28,10 +28,9 @@ from rich.table import Table
 from scipy.special import expit
 
 import sglpr_jax
-from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
+from benchmarks.quality.drives import STOREY_M, Odometry, compared, finder_of, pose_errors, read
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.consistency import agree_along
-from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.loop import planar_loop
 from sglpr_jax.loops.probability import ALL, DEFAULT, Evidence, LoopModel, fit
 from sglpr_jax.loops.reliability import calibration_error, reliability
@@ -112,6 +111,7 @@ class Judged(NamedTuple):
     probability: Float[np.ndarray, " n"]
     """With neighbours."""
     alone: Float[np.ndarray, " n"]
+    """Without neighbours."""
     is_loop: Bool[np.ndarray, " n"]
 
 
@@ -168,8 +168,8 @@ def fitted(found: Sequence[Pairs], kinds: Sequence[str], *, without: str | None 
 def pairs(path: Path, odometry: Odometry, breaks: bool, *, weights: str) -> Pairs:
     """The candidates of one drive that the motion allows. With `breaks`, the motion is unknown in the middle."""
     drive, params = read(path), sglpr_jax.load(weights)
-    finder = LoopDetector(params).finder
-    frames = compared(drive, LoopDetector(params).finder, path.parent / "compared", odometry=odometry, breaks=breaks)
+    finder = finder_of(params)
+    frames = compared(drive, params, path.parent / "compared", odometry=odometry, breaks=breaks)
     poses, found = drive.odometry(odometry), []
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if poses is None else poses[i]

@@ -102,7 +102,7 @@ def searched(path: Path, *, odometry: Odometry, optimized: bool, weights: str) -
     poses, times = drive.world_from_lidar, drive.times
     given = drive.odometry(odometry)
     detector = LoopDetector(params)
-    frames = compared(drive, LoopDetector(params).finder, path.parent / "compared", odometry=odometry)
+    frames = compared(drive, params, path.parent / "compared", odometry=odometry)
     for i, (seen, frame) in enumerate(zip(drive.seen, frames, strict=True)):
         pose = None if given is None else given[i]
         detector.add_seen(seen, time=float(times[i]), odometry=pose, compared=frame)

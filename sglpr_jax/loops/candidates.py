@@ -46,8 +46,8 @@ class Compared(NamedTuple):
 
 def agree(first: Link, second: Link) -> bool:
     """Whether two poses of a scan in one frame agree."""
-    turned = abs((float(first.yaw) - float(second.yaw) + np.pi) % (2 * np.pi) - np.pi)
-    return bool(np.hypot(first.x - second.x, first.y - second.y) <= AGREE_M and turned <= np.radians(AGREE_DEG))
+    apart, turned = np.hypot(first.x - second.x, first.y - second.y), first.angle_to(float(second.yaw))
+    return bool(apart <= AGREE_M and turned <= np.radians(AGREE_DEG))
 
 
 class CandidateFinder:
@@ -275,7 +275,7 @@ class CandidateFinder:
     def _linked(
         self, query: Query, image: UInt8[np.ndarray, "m m"], prior: Float[np.ndarray, " 3"]
     ) -> tuple[Link, Peak | None]:
-        """The best pose of a query in the frame of an image, and another one that is the best near an expected pose."""
+        """The best pose of a query in the frame of an image, and the best one near an expected pose. None if equal."""
         spectrum = image_spectrum(image, self.verification)
         peaks = jax.device_get(search_near(query.spectra, spectrum, prior, config=self.verification))
         best = self._refined(peaks.one(0), image, query)

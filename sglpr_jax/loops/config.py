@@ -69,8 +69,8 @@ class MotionConfig:
     """Maximum standard deviation of the pose along its least certain direction, in metres. Above it, the images do not
     show how far the sensor moved, as between walls."""
     min_expected: float = 0.8
-    """Minimum correlation near the expected pose, divided by that at the best one, if the best one is so uncertain.
-    Above it, the sensor is assumed to move on as before."""
+    """Minimum correlation near the expected pose, divided by that at the best pose, if the best pose is less certain
+    than `max_along_m`. Above it, the sensor is assumed to move on as before."""
     max_second: float = 0.8
     max_second_of_jump: float = 0.6
     max_second_expected: float = 0.95

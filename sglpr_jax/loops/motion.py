@@ -56,10 +56,9 @@ class Link(NamedTuple):
         """Pose of an alignment."""
         return cls(*map(np.asarray, (one.x, one.y, one.yaw, one.correlation, one.second, one.along_m)))
 
-
-def turned(link: Link, prior: Float[np.ndarray, " 3"]) -> float:
-    """Angle between a link and the expected pose, in radians. NaN if no pose is expected."""
-    return float(abs((float(link.yaw) - prior[2] + np.pi) % (2 * np.pi) - np.pi))
+    def angle_to(self, yaw: float) -> float:
+        """Angle between the rotation and another one, in radians, from 0 to pi. NaN if the other one is unknown."""
+        return float(abs((float(self.yaw) - float(yaw) + np.pi) % (2 * np.pi) - np.pi))
 
 
 class Motion:
@@ -151,7 +150,7 @@ class Motion:
         key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
         if pose is None and link is not None:
             prior = self.prior(time, key)
-            surprises = turned(link, prior) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
+            surprises = link.angle_to(prior[2]) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
             ambiguous = surprises or not self.is_trusted(link, prior)
             along_m = float(link.along_m) if self.is_ridge(link) else along_m
             pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
@@ -285,7 +284,7 @@ class Motion:
         apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
         if apart > config.max_jump * self._last_step_m + 1.0:
             most = config.max_second_of_jump
-        elif apart <= config.expected_m and turned(link, prior) <= np.radians(config.expected_deg):
+        elif apart <= config.expected_m and link.angle_to(prior[2]) <= np.radians(config.expected_deg):
             most = config.max_second_expected
         fits = bool(link.correlation >= config.min_correlation and link.second <= most)
         return fits and not self.is_ridge(link)
