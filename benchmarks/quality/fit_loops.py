@@ -32,7 +32,7 @@ from benchmarks.quality.drives import STOREY_M, Odometry, compared, finder_of, p
 from sglpr_jax.files import write_json
 from sglpr_jax.loops.consistency import agree_along
 from sglpr_jax.loops.loop import planar_loop
-from sglpr_jax.loops.probability import ALL, DEFAULT, Evidence, LoopModel, fit
+from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
 from sglpr_jax.loops.reliability import calibration_error, reliability
 from sglpr_jax.loops.sequence import neighbour_weights
 from sglpr_jax.loops.transforms import transform
@@ -160,8 +160,8 @@ def fitted(found: Sequence[Pairs], kinds: Sequence[str], *, without: str | None 
     about = f"{is_loop.sum()} loops and {(~is_loop).sum()} others of {len(found)} simulated drives ({sceneries})"
     model = LoopModel(alone, f"{about}; benchmarks/quality/fit_loops.py")
     support = np.concatenate([one.support(model) for one in found])
-    values = {"alone": model.log_odds(evidence)[known], "support": support[known]}
-    tested = {name: each for name, each in values.items() if name != without}
+    values = {"alone": model.log_odds(evidence), "support": support, "surprise": evidence.surprise}
+    tested = {name: values[name][known] for name in TESTED if name != without}
     return dataclasses.replace(model, tested=fit(tested, is_loop, weights=weights))
 
 

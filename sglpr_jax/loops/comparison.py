@@ -190,13 +190,13 @@ class Comparer:
         """Logarithm of all poses that a sensor may have over those within the uncertainty of the motion.
 
         A lookalike stands anywhere in the surroundings. Its rotation is one of `SYMMETRIES`, because walls stand at
-        right angles.
+        right angles. The result is negative if the motion allows more positions than the surroundings have.
         """
         rules = {"drift": self.drift, "level": self.level}
         spread = planar_spread(self.motion.path, np.array([query]), np.array([match]), **rules)[0]
         area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
         rotation = max(2 * self.drift.max_deviation * np.sqrt(spread[2, 2]), 2 * np.pi / SYMMETRIES)
-        return float(max(np.log(SURROUNDINGS_M**2 / area), 0) + max(np.log(2 * np.pi / rotation), 0))
+        return float(np.log(SURROUNDINGS_M**2 / area) + max(np.log(2 * np.pi / rotation), 0))
 
     def _highest(self, query: int, fits: Fits, allowed: Bool[np.ndarray, "*k"]) -> int | None:
         """The flagged fit with the highest correlation, not of the query's own pass."""

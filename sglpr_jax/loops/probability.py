@@ -1,8 +1,9 @@
 """Probability that two scans show one place: a monotone additive model of the evidence.
 
-The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. A second sum of two such
-functions adds what neighbouring pairs say. The functions are monotone and bounded. Therefore a perfect fit of the
-images cannot outweigh other places that fit as well.
+The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. A second sum of such functions
+adds what neighbouring pairs say. It contains the surprise again, because all neighbours may match a lookalike if the
+motion is unknown. The functions are monotone and bounded. Therefore a perfect fit of the images cannot outweigh other
+places that fit as well.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ KNOTS: Mapping[str, tuple[float, ...]] = {
     "ambiguity_ratio": (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
     "along_m": (0.03, 0.06, 0.1, 0.2, 0.4, 1.0, 3.0),
     "deviation": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0),
-    "surprise": (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0),
+    "surprise": (-4.0, -2.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0),
     "alone": (-10.0, -6.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0),
     "support": (-12.0, -6.0, -3.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 13.0, 18.0),
 }
@@ -45,7 +46,7 @@ class Evidence(NamedTuple):
     deviation: Float[np.ndarray, "*n"]
     """Deviation of the pose from the motion, in standard deviations."""
     surprise: Float[np.ndarray, "*n"]
-    """Logarithm of all poses over those that the motion allows. 0 if the motion says nothing."""
+    """Logarithm of all poses over those that the motion allows. It is negative if the motion is unknown."""
 
     @classmethod
     def of(cls, ambiguity_ratio: Any, along_m: Any, deviation: Any, surprise: Any) -> "Evidence":
@@ -60,8 +61,8 @@ class Evidence(NamedTuple):
 
 
 ALL = Evidence._fields
-OF_NEIGHBOURS = ("alone", "support")
-"""Log odds of a pair alone, and what its neighbours say: the sum of their strengths, weighted and signed."""
+TESTED = ("alone", "support", "surprise")
+"""Log odds of a pair alone, what its neighbours say (the sum of their strengths, weighted and signed), and surprise."""
 
 
 class Curve(NamedTuple):
@@ -123,7 +124,7 @@ def _is_curve(curve: Curve) -> bool:
 
 
 _SAME = Curve((-50.0, 50.0), (-50.0, 50.0))
-ADDED = AdditiveModel(dict.fromkeys(OF_NEIGHBOURS, _SAME), 0.0)
+ADDED = AdditiveModel({"alone": _SAME, "support": _SAME}, 0.0)
 """Log odds alone plus the support of the neighbours, as they are."""
 
 
@@ -136,7 +137,7 @@ class LoopModel:
     made_with: str
     """Description of the pairs that the model was fitted to."""
     tested: AdditiveModel = ADDED
-    """Log odds of a pair given its neighbours, by its log odds alone and by their support."""
+    """Log odds of a pair given its neighbours, by the terms of `TESTED`."""
 
     def probability(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """Probability that each pair alone is a loop."""
@@ -148,7 +149,7 @@ class LoopModel:
 
     def tested_log_odds(self, evidence: Evidence, support: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Log odds of each pair, given the support of its neighbours."""
-        return self.tested({"alone": self.log_odds(evidence), "support": support})
+        return self.tested({"alone": self.log_odds(evidence), "support": support, "surprise": evidence.surprise})
 
     def log_odds_without_ambiguity(self, evidence: Evidence) -> Float[np.ndarray, "*n"]:
         """Log odds of each pair alone if no other pose and place fitted as well as the match."""
@@ -176,7 +177,7 @@ class LoopModel:
         try:
             alone, tested = value["alone"], value["tested"]
             return cls(
-                AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, OF_NEIGHBOURS)
+                AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, TESTED)
             )
         except (TypeError, KeyError) as error:
             raise ValueError(f"{source}: expected a loop model, found another value") from error

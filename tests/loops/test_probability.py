@@ -11,8 +11,8 @@ from sglpr_jax.loops.probability import (
     ADDED,
     ALL,
     KNOTS,
-    OF_NEIGHBOURS,
     RISING,
+    TESTED,
     AdditiveModel,
     Evidence,
     LoopModel,
@@ -92,7 +92,7 @@ def test_ambiguity_is_left_out():
 def test_neighbours_add_their_support_to_what_a_pair_says_alone():
     evidence = Evidence.of(0.7, 0.1, 3.0, 2.0)
     np.testing.assert_allclose(FITTED.tested_log_odds(evidence, np.array(2.5)), FITTED.log_odds(evidence) + 2.5)
-    assert FITTED.tested is ADDED and set(default_model().tested.curves) == set(OF_NEIGHBOURS)
+    assert FITTED.tested is ADDED and set(default_model().tested.curves) == set(TESTED)
 
 
 def test_pairs_that_can_be_told_apart_give_finite_curves():
