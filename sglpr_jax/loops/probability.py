@@ -176,9 +176,7 @@ class LoopModel:
         """
         try:
             alone, tested = value["alone"], value["tested"]
-            return cls(
-                AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, TESTED)
-            )
+            return cls(AdditiveModel.from_json(alone, ALL), value["made_with"], AdditiveModel.from_json(tested, TESTED))
         except (TypeError, KeyError) as error:
             raise ValueError(f"{source}: expected a loop model, found another value") from error
         except ValueError as error:

@@ -72,6 +72,16 @@ def test_loops_are_counted_by_scenery_and_drives_are_searched_once(rendered):
         assert "/2" not in again and "town" not in again and "walls" in again
 
 
+def test_the_right_place_of_a_revisit_fits_better_than_lookalikes_in_a_town(rendered, tmp_path):
+    picture = tmp_path / "missing.png"
+    output = printed("quality.missing_evidence", str(rendered), "--sensor", "vlp16", "--out", str(picture))
+    _, revisits, compared, best, lookalike, _ = next(
+        [cell.strip() for cell in line.strip("│").split("│")] for line in output.splitlines() if "town" in line
+    )
+    assert int(revisits) > 10 and float(compared) > 0.9 and float(best) > 0.9 and float(lookalike) < 1
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
 def test_closures_of_maps_and_of_scans_are_scored_alike(capsys):
     """A drive out and back along a line: the way back is revisited, and one closure in each list is wrong."""
     closures = importlib.import_module("benchmarks.quality.map_closures")
