@@ -1,0 +1,152 @@
+"""Run the commands on small simulated data, and compare all that they write with an earlier run, for a refactoring.
+
+    python -m benchmarks.goldens build/before                            # before the change
+    python -m benchmarks.goldens build/after --beside build/before       # after it: every file has the same bytes
+    python -m benchmarks.goldens build/after --beside build/before --within 1e-6    # numbers may differ by this
+
+The commands simulate three towns, a car park, a walker in a yard and two days of one town. They search loops, correct a
+trajectory, build a map and find a scan in it, score two methods, and train two presets for 20 steps. With --beside, the
+map and the descriptors of the earlier run are read, too. Files with times or paths are left out, and so are pages and
+pictures.
+"""
+
+import dataclasses
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+TOWNS = ("08", "00", "06")
+DAYS = ("2012-01-15", "2012-02-04")
+LIDAR = ("--sensor", "vlp16", "--azimuth-steps", "450")
+OF_TIME = ("command.json", "config.json", "environment.json", "throughput.json")
+"""Names of files with times, versions or paths."""
+TEXT = (".csv", ".g2o", ".json", ".jsonl", ".kitti", ".tum", ".txt")
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+SECONDS = re.compile(r'"[a-z_]*(?:seconds|_s|time)": [-+.\de]+')
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """A command line, run in the folder of the goldens."""
+
+    command: str
+    arguments: tuple[str, ...]
+
+    @classmethod
+    def of(cls, line: str) -> "Step":
+        """Split a line at its spaces."""
+        command, *arguments = line.split()
+        return cls(command, tuple(arguments))
+
+
+def steps(before: Path | None) -> Iterator[Step]:
+    """All commands, in order. `before` is the folder of an earlier run whose files the program reads again."""
+    simulate = "simulate --scans 90 " + " ".join(LIDAR)
+    yield Step.of(f"{simulate} --out towns --seq {' '.join(TOWNS)}")
+    yield Step.of(f"{simulate} --out car_park --scenery car_park --seq 00")
+    yield Step.of(f"{simulate} --out yard --scenery yard --carrier backpack --seq 00")
+    yield Step.of(f"{simulate} --out days --sessions {' '.join(DAYS)}")
+    searched = [("towns", seq, ()) for seq in TOWNS] + [("car_park", "00", ()), ("yard", "00", ())]
+    searched += [("towns", "00", ("--odometry", "towns/sequences/00/poses.txt", "--odometry-format", "kitti"))]
+    for number, (data, seq, options) in enumerate(searched):
+        graph = ("--optimize",) if options else ()
+        yield Step("loops", (data, "--seq", seq, "--out", f"loops/{number}-{data}-{seq}", *options, *graph))
+    yield Step("loops", ("days/" + DAYS[0], "days/" + DAYS[1], "--out", "loops/days"))
+    yield Step.of("map towns --seq 00 --poses towns/sequences/00/poses.txt --pose-format kitti --out town.safetensors")
+    scan = "towns/sequences/00/velodyne/000040.bin"
+    yield Step.of(f"relocalize {scan} --map town.safetensors --out pose.json")
+    for method in ("sglpr", "scan-context"):
+        yield Step.of(f"embed --data towns --seq 00 --method {method} --out {method}.npz")
+        yield Step.of(f"evaluate {method}.npz --out {method}")
+    for preset in ("circular", "paper"):
+        training = "--steps 20 --score-every 20"
+        yield Step.of(f"train --data towns --seq 08 --preset {preset} --out train-{preset} {training}")
+    if before is not None:
+        yield Step.of(f"relocalize {scan} --map {before}/town.safetensors --out pose-of-earlier-map.json")
+        yield Step.of(f"evaluate {before}/sglpr.npz --out scores-of-earlier-descriptors")
+
+
+def main(out: tyro.conf.Positional[Path], *, beside: Path | None = None, within: float = 0.0) -> None:
+    """Run the commands, and compare.
+
+    Args:
+        out: new folder for all that is written.
+        beside: folder of an earlier run to compare with.
+        within: largest difference of two numbers, relative to the larger one, or absolute below 1.
+    """
+    if out.exists():
+        raise SystemExit(f"{out}: expected a new folder")
+    out.mkdir(parents=True)
+    root = Path(__file__).parents[1]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    for step in steps(None if beside is None else beside.resolve()):
+        print(step.command, *step.arguments, flush=True)
+        program = (str(root / "bin" / step.command), *step.arguments)
+        done = subprocess.run(program, cwd=out, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"{step.command} failed ({done.returncode}):\n{done.stdout}{done.stderr}")
+    same_map, same_scores = out / "pose-of-earlier-map.json", out / "scores-of-earlier-descriptors"
+    if beside is not None:
+        found = differences(beside, out, within=within)
+        if text_of(same_map) != text_of(out / "pose.json"):
+            found.append("the pose in the earlier map differs from that in the new one")
+        same_map.unlink()
+        shutil.rmtree(same_scores)
+        print(*(found or ["everything is the same"]), sep="\n")
+        if found:
+            raise SystemExit(1)
+
+
+def differences(before: Path, after: Path, *, within: float) -> list[str]:
+    """What differs between two folders, one line for a file."""
+    names = [
+        {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} for folder in (before, after)
+    ]
+    found = [
+        f"{name}: only {where}"
+        for where, some in (("before", names[0] - names[1]), ("after", names[1] - names[0]))
+        for name in sorted(some)
+    ]
+    for name in sorted(names[0] & names[1]):
+        if Path(name).name not in OF_TIME and not same(before / name, after / name, within=within):
+            found.append(f"{name}: differs")
+    return found
+
+
+def same(first: Path, second: Path, *, within: float) -> bool:
+    """Whether two files are equal or, if `within` is not 0, have numbers that nearly are."""
+    if first.suffix in TEXT:
+        one, other = text_of(first), text_of(second)
+        if one == other:
+            return True
+        numbers = [np.array(NUMBER.findall(text), np.float64) for text in (one, other)]
+        words = [NUMBER.sub("#", text) for text in (one, other)]
+        return within > 0 and words[0] == words[1] and _near(*numbers, within=within)
+    if first.suffix == ".npz":
+        with np.load(first) as one, np.load(second) as other:
+            if set(one) != set(other):
+                return False
+            return all(
+                np.array_equal(one[key], other[key]) or _near(one[key], other[key], within=within) for key in one
+            )
+    return first.suffix in (".html", ".png") or first.read_bytes() == second.read_bytes()
+
+
+def _near(one: np.ndarray, other: np.ndarray, *, within: float) -> bool:
+    numeric = one.dtype.kind in "fiu" and other.dtype.kind in "fiu" and one.shape == other.shape
+    return numeric and bool((np.abs(one - other) <= within * np.maximum(1.0, np.abs(one))).all())
+
+
+def text_of(path: Path) -> str:
+    """Text of a file without its durations."""
+    return SECONDS.sub('""', path.read_text())
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
