@@ -4,10 +4,10 @@
     python -m benchmarks.goldens build/after --beside build/before       # after it: every file has the same bytes
     python -m benchmarks.goldens build/after --beside build/before --within 1e-6    # numbers may differ by this
 
-The commands simulate three towns, a car park, a walker in a yard and two days of one town. They search loops, correct a
-trajectory, build a map and find a scan in it, score two methods, and train two presets for 20 steps. With --beside, the
-map and the descriptors of the earlier run are read, too. Files with times or paths are left out, and so are pages and
-pictures.
+The commands simulate three towns, a car park and a walker in a yard. They search loops, also between two halves of a
+town (every second scan), correct a trajectory, build a map and find a scan in it, score two methods, and train two
+presets for 20 steps. With --beside, the map and the descriptors of the earlier run are read, too. Files with times or
+paths are left out, and so are pages and pictures.
 """
 
 import dataclasses
@@ -22,7 +22,9 @@ import numpy as np
 import tyro
 
 TOWNS = ("08", "00", "06")
-DAYS = ("2012-01-15", "2012-02-04")
+SCANS = Path("towns", "sequences", "00", "velodyne")
+SCAN = SCANS / "000040.bin"
+POSE, SCORES = "pose-in-earlier-map.json", "scores-of-earlier-descriptors"
 LIDAR = ("--sensor", "vlp16", "--azimuth-steps", "450")
 OF_TIME = ("command.json", "config.json", "environment.json", "throughput.json")
 """Names of files with times, versions or paths."""
@@ -45,31 +47,31 @@ class Step:
         return cls(command, tuple(arguments))
 
 
-def steps(before: Path | None) -> Iterator[Step]:
-    """All commands, in order. `before` is the folder of an earlier run whose files the program reads again."""
+def simulations() -> Iterator[Step]:
+    """Commands that simulate the data."""
     simulate = "simulate --scans 90 " + " ".join(LIDAR)
     yield Step.of(f"{simulate} --out towns --seq {' '.join(TOWNS)}")
     yield Step.of(f"{simulate} --out car_park --scenery car_park --seq 00")
     yield Step.of(f"{simulate} --out yard --scenery yard --carrier backpack --seq 00")
-    yield Step.of(f"{simulate} --out days --sessions {' '.join(DAYS)}")
-    searched = [("towns", seq, ()) for seq in TOWNS] + [("car_park", "00", ()), ("yard", "00", ())]
-    searched += [("towns", "00", ("--odometry", "towns/sequences/00/poses.txt", "--odometry-format", "kitti"))]
-    for number, (data, seq, options) in enumerate(searched):
-        graph = ("--optimize",) if options else ()
-        yield Step("loops", (data, "--seq", seq, "--out", f"loops/{number}-{data}-{seq}", *options, *graph))
-    yield Step("loops", ("days/" + DAYS[0], "days/" + DAYS[1], "--out", "loops/days"))
+
+
+def steps(before: Path | None) -> Iterator[Step]:
+    """Commands that read the data. `before` is the folder of an earlier run whose files are read again."""
+    for data, seq in (*(("towns", seq) for seq in TOWNS), ("car_park", "00"), ("yard", "00")):
+        yield Step.of(f"loops {data} --seq {seq} --out loops/{data}-{seq}")
+    odometry = "--odometry towns/sequences/00/poses.txt --odometry-format kitti --optimize"
+    yield Step.of(f"loops towns --seq 00 --out loops/odometry {odometry}")
+    yield Step.of("loops halves/0 halves/1 --out loops/halves")
     yield Step.of("map towns --seq 00 --poses towns/sequences/00/poses.txt --pose-format kitti --out town.safetensors")
-    scan = "towns/sequences/00/velodyne/000040.bin"
-    yield Step.of(f"relocalize {scan} --map town.safetensors --out pose.json")
+    yield Step.of(f"relocalize {SCAN} --map town.safetensors --out pose.json")
     for method in ("sglpr", "scan-context"):
         yield Step.of(f"embed --data towns --seq 00 --method {method} --out {method}.npz")
         yield Step.of(f"evaluate {method}.npz --out {method}")
     for preset in ("circular", "paper"):
-        training = "--steps 20 --score-every 20"
-        yield Step.of(f"train --data towns --seq 08 --preset {preset} --out train-{preset} {training}")
+        yield Step.of(f"train --data towns --seq 08 --preset {preset} --out train-{preset} --steps 20 --score-every 20")
     if before is not None:
-        yield Step.of(f"relocalize {scan} --map {before}/town.safetensors --out pose-of-earlier-map.json")
-        yield Step.of(f"evaluate {before}/sglpr.npz --out scores-of-earlier-descriptors")
+        yield Step.of(f"relocalize {SCAN} --map {before}/town.safetensors --out {POSE}")
+        yield Step.of(f"evaluate {before}/sglpr.npz --out {SCORES}")
 
 
 def main(out: tyro.conf.Positional[Path], *, beside: Path | None = None, within: float = 0.0) -> None:
@@ -83,24 +85,32 @@ def main(out: tyro.conf.Positional[Path], *, beside: Path | None = None, within:
     if out.exists():
         raise SystemExit(f"{out}: expected a new folder")
     out.mkdir(parents=True)
-    root = Path(__file__).parents[1]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    for step in simulations():
+        _run(step, out)
+    for number, scan in enumerate(sorted((out / SCANS).iterdir())):
+        half = out / "halves" / str(number % 2)
+        half.mkdir(parents=True, exist_ok=True)
+        shutil.copy(scan, half)
     for step in steps(None if beside is None else beside.resolve()):
-        print(step.command, *step.arguments, flush=True)
-        program = (str(root / "bin" / step.command), *step.arguments)
-        done = subprocess.run(program, cwd=out, env=environment, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise SystemExit(f"{step.command} failed ({done.returncode}):\n{done.stdout}{done.stderr}")
-    same_map, same_scores = out / "pose-of-earlier-map.json", out / "scores-of-earlier-descriptors"
-    if beside is not None:
-        found = differences(beside, out, within=within)
-        if text_of(same_map) != text_of(out / "pose.json"):
-            found.append("the pose in the earlier map differs from that in the new one")
-        same_map.unlink()
-        shutil.rmtree(same_scores)
-        print(*(found or ["everything is the same"]), sep="\n")
-        if found:
-            raise SystemExit(1)
+        _run(step, out)
+    if beside is None:
+        return
+    found = [] if text_of(out / POSE) == text_of(out / "pose.json") else ["the pose in the earlier map differs"]
+    (out / POSE).unlink()
+    shutil.rmtree(out / SCORES)
+    found += differences(beside, out, within=within)
+    print(*(found or ["everything is the same"]), sep="\n")
+    if found:
+        raise SystemExit(1)
+
+
+def _run(step: Step, folder: Path) -> None:
+    print(step.command, *step.arguments, flush=True)
+    program = (str(Path(__file__).parents[1] / "bin" / step.command), *step.arguments)
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{step.command} failed ({done.returncode}):\n{done.stdout}{done.stderr}")
 
 
 def differences(before: Path, after: Path, *, within: float) -> list[str]:

@@ -1,9 +1,9 @@
 """Probability that two scans show one place: a monotone additive model of the evidence.
 
-The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. A second sum of such functions
-adds what neighbouring pairs say. It contains the surprise again, because all neighbours may match a lookalike if the
-motion is unknown. The functions are monotone and bounded. Therefore a perfect fit of the images cannot outweigh other
-places that fit as well.
+The log odds are a sum of piecewise linear functions, one for each field of `Evidence`. Three further functions add what
+neighbouring pairs say. One of them takes the surprise again, because all neighbours may match a lookalike if the motion
+is unknown. The functions are monotone and bounded. Therefore a perfect fit of the images cannot outweigh other places
+that fit as well.
 """
 
 import dataclasses
