@@ -30,7 +30,7 @@ OF_TIME = ("command.json", "config.json", "environment.json", "throughput.json")
 """Names of files with times, versions or paths."""
 TEXT = (".csv", ".g2o", ".json", ".jsonl", ".kitti", ".tum", ".txt")
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
-SECONDS = re.compile(r'"[a-z_]*(?:seconds|_s|time)": [-+.\de]+')
+SECONDS = re.compile(r'"[a-z_]*(?:seconds?|_s|time|wait)": [-+.\de]+')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def steps(before: Path | None) -> Iterator[Step]:
     for method in ("sglpr", "scan-context"):
         yield Step.of(f"embed --data towns --seq 00 --method {method} --out {method}.npz")
         yield Step.of(f"evaluate {method}.npz --out {method}")
-    for preset in ("circular", "paper"):
+    for preset in ("circular", "sglpr"):
         yield Step.of(f"train --data towns --seq 08 --preset {preset} --out train-{preset} --steps 20 --score-every 20")
     if before is not None:
         yield Step.of(f"relocalize {SCAN} --map {before}/town.safetensors --out {POSE}")
@@ -115,18 +115,18 @@ def _run(step: Step, folder: Path) -> None:
 
 def differences(before: Path, after: Path, *, within: float) -> list[str]:
     """What differs between two folders, one line for a file."""
-    names = [
-        {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} for folder in (before, after)
-    ]
-    found = [
-        f"{name}: only {where}"
-        for where, some in (("before", names[0] - names[1]), ("after", names[1] - names[0]))
-        for name in sorted(some)
-    ]
-    for name in sorted(names[0] & names[1]):
-        if Path(name).name not in OF_TIME and not same(before / name, after / name, within=within):
-            found.append(f"{name}: differs")
+    names = [set(map(str, _compared(folder))) for folder in (before, after)]
+    found = [f"{name}: in one folder only" for name in sorted(names[0] ^ names[1])]
+    both = sorted(names[0] & names[1])
+    found += [f"{name}: differs" for name in both if not same(before / name, after / name, within=within)]
     return found
+
+
+def _compared(folder: Path) -> Iterator[Path]:
+    """Files that do not change from run to run, relative to a folder."""
+    for path in folder.rglob("*"):
+        if path.is_file() and path.name not in OF_TIME and "checkpoints" not in path.parts:
+            yield path.relative_to(folder)
 
 
 def same(first: Path, second: Path, *, within: float) -> bool:
