@@ -10,22 +10,24 @@ presets for 20 steps. With --beside, the map and the descriptors of the earlier 
 paths are left out, and so are pages and pictures.
 """
 
-import dataclasses
 import os
 import re
+import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import safetensors.numpy
 import tyro
+from jaxtyping import Shaped
 
 TOWNS = ("08", "00", "06")
 SCANS = Path("towns", "sequences", "00", "velodyne")
 SCAN = SCANS / "000040.bin"
 POSE, SCORES = "pose-in-earlier-map.json", "scores-of-earlier-descriptors"
-LIDAR = ("--sensor", "vlp16", "--azimuth-steps", "450")
+LIDAR = "--sensor vlp16 --azimuth-steps 450"
 OF_TIME = ("command.json", "config.json", "environment.json", "throughput.json")
 """Names of files with times, versions or paths."""
 TEXT = (".csv", ".g2o", ".json", ".jsonl", ".kitti", ".tum", ".txt")
@@ -33,45 +35,32 @@ NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 SECONDS = re.compile(r'"[a-z_]*(?:seconds?|_s|time|wait)": [-+.\de]+')
 
 
-@dataclasses.dataclass(frozen=True)
-class Step:
-    """A command line, run in the folder of the goldens."""
-
-    command: str
-    arguments: tuple[str, ...]
-
-    @classmethod
-    def of(cls, line: str) -> "Step":
-        """Split a line at its spaces."""
-        command, *arguments = line.split()
-        return cls(command, tuple(arguments))
-
-
-def simulations() -> Iterator[Step]:
+def simulations() -> Iterator[str]:
     """Commands that simulate the data."""
-    simulate = "simulate --scans 90 " + " ".join(LIDAR)
-    yield Step.of(f"{simulate} --out towns --seq {' '.join(TOWNS)}")
-    yield Step.of(f"{simulate} --out car_park --scenery car_park --seq 00")
-    yield Step.of(f"{simulate} --out yard --scenery yard --carrier backpack --seq 00")
+    simulate = f"simulate --scans 90 {LIDAR}"
+    yield f"{simulate} --out towns --seq {' '.join(TOWNS)}"
+    yield f"{simulate} --out car_park --scenery car_park --seq 00"
+    yield f"{simulate} --out yard --scenery yard --carrier backpack --seq 00"
 
 
-def steps(before: Path | None) -> Iterator[Step]:
+def steps(before: Path | None) -> Iterator[str]:
     """Commands that read the data. `before` is the folder of an earlier run whose files are read again."""
     for data, seq in (*(("towns", seq) for seq in TOWNS), ("car_park", "00"), ("yard", "00")):
-        yield Step.of(f"loops {data} --seq {seq} --out loops/{data}-{seq}")
+        yield f"loops {data} --seq {seq} --out loops/{data}-{seq}"
     odometry = "--odometry towns/sequences/00/poses.txt --odometry-format kitti --optimize"
-    yield Step.of(f"loops towns --seq 00 --out loops/odometry {odometry}")
-    yield Step.of("loops halves/0 halves/1 --out loops/halves")
-    yield Step.of("map towns --seq 00 --poses towns/sequences/00/poses.txt --pose-format kitti --out town.safetensors")
-    yield Step.of(f"relocalize {SCAN} --map town.safetensors --out pose.json")
+    yield f"loops towns --seq 00 --out loops/odometry {odometry}"
+    yield "loops halves/0 halves/1 --out loops/halves"
+    yield "map towns --seq 00 --poses towns/sequences/00/poses.txt --pose-format kitti --out town.safetensors"
+    yield f"relocalize {SCAN} --map town.safetensors --out pose.json"
     for method in ("sglpr", "scan-context"):
-        yield Step.of(f"embed --data towns --seq 00 --method {method} --out {method}.npz")
-        yield Step.of(f"evaluate {method}.npz --out {method}")
+        yield f"embed --data towns --seq 00 --method {method} --out {method}.npz"
+        yield f"evaluate {method}.npz --out {method}"
     for preset in ("circular", "sglpr"):
-        yield Step.of(f"train --data towns --seq 08 --preset {preset} --out train-{preset} --steps 20 --score-every 20")
+        yield f"train --data towns --seq 08 --preset {preset} --out train-{preset} --steps 20 --score-every 20"
     if before is not None:
-        yield Step.of(f"relocalize {SCAN} --map {before}/town.safetensors --out {POSE}")
-        yield Step.of(f"evaluate {before}/sglpr.npz --out {SCORES}")
+        earlier_map, earlier = (shlex.quote(str(before / name)) for name in ("town.safetensors", "sglpr.npz"))
+        yield f"relocalize {SCAN} --map {earlier_map} --out {POSE}"
+        yield f"evaluate {earlier} --out {SCORES}"
 
 
 def main(out: tyro.conf.Positional[Path], *, beside: Path | None = None, within: float = 0.0) -> None:
@@ -104,13 +93,15 @@ def main(out: tyro.conf.Positional[Path], *, beside: Path | None = None, within:
         raise SystemExit(1)
 
 
-def _run(step: Step, folder: Path) -> None:
-    print(step.command, *step.arguments, flush=True)
-    program = (str(Path(__file__).parents[1] / "bin" / step.command), *step.arguments)
+def _run(line: str, folder: Path) -> None:
+    """Run a command line in the folder of the goldens."""
+    print(line, flush=True)
+    command, *arguments = shlex.split(line)
+    program = (str(Path(__file__).parents[1] / "bin" / command), *arguments)
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}
     done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"{step.command} failed ({done.returncode}):\n{done.stdout}{done.stderr}")
+        raise SystemExit(f"{command} failed ({done.returncode}):\n{done.stdout}{done.stderr}")
 
 
 def differences(before: Path, after: Path, *, within: float) -> list[str]:
@@ -131,30 +122,35 @@ def _compared(folder: Path) -> Iterator[Path]:
 
 def same(first: Path, second: Path, *, within: float) -> bool:
     """Whether two files are equal or, if `within` is not 0, have numbers that nearly are."""
+    if first.suffix in (".html", ".png") or first.read_bytes() == second.read_bytes():
+        return True
     if first.suffix in TEXT:
         one, other = text_of(first), text_of(second)
-        if one == other:
-            return True
         numbers = [np.array(NUMBER.findall(text), np.float64) for text in (one, other)]
-        words = [NUMBER.sub("#", text) for text in (one, other)]
-        return within > 0 and words[0] == words[1] and _near(*numbers, within=within)
-    if first.suffix == ".npz":
-        with np.load(first) as one, np.load(second) as other:
-            if set(one) != set(other):
-                return False
-            return all(
-                np.array_equal(one[key], other[key]) or _near(one[key], other[key], within=within) for key in one
-            )
-    return first.suffix in (".html", ".png") or first.read_bytes() == second.read_bytes()
+        return one == other or (NUMBER.sub("#", one) == NUMBER.sub("#", other) and _near(*numbers, within=within))
+    if first.suffix in (".npz", ".safetensors"):
+        one, other = _arrays(first), _arrays(second)
+        equal = {key: np.array_equal(one[key], other[key]) for key in set(one) & set(other)}
+        return set(one) == set(other) and all(equal[key] or _near(one[key], other[key], within=within) for key in one)
+    return False
 
 
-def _near(one: np.ndarray, other: np.ndarray, *, within: float) -> bool:
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a file."""
+    if path.suffix == ".safetensors":
+        return safetensors.numpy.load_file(path)
+    with np.load(path) as file:
+        return dict(file)
+
+
+def _near(one: Shaped[np.ndarray, "..."], other: Shaped[np.ndarray, "..."], *, within: float) -> bool:
+    """Whether numbers differ by at most `within`, relative to the first ones, or absolutely below 1."""
     numeric = one.dtype.kind in "fiu" and other.dtype.kind in "fiu" and one.shape == other.shape
-    return numeric and bool((np.abs(one - other) <= within * np.maximum(1.0, np.abs(one))).all())
+    return within > 0 and numeric and bool((np.abs(one - other) <= within * np.maximum(1.0, np.abs(one))).all())
 
 
 def text_of(path: Path) -> str:
-    """Text of a file without its durations."""
+    """Text of a file without its durations and rates."""
     return SECONDS.sub('""', path.read_text())
 
 

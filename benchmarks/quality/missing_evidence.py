@@ -1,7 +1,8 @@
 """Say which evidence is missing where places repeat: how well the right place of each revisit fits, and a lookalike.
 
     python -m benchmarks.quality.repeating_scans --seeds 13 --out build/test
-    python -m benchmarks.quality.missing_evidence build/test --out build/missing.png
+    python -m benchmarks.quality.missing_evidence build/test
+    python -m benchmarks.quality.missing_evidence build/test --sceneries tunnel walls --out build/missing.png
 
 For each scenery the table has the revisits, the share of them that was compared with the right place, the share for
 which this place fits best, the best wrong fit over the right one (median), and the stated uncertainty of the position
@@ -9,6 +10,7 @@ along the least certain direction. The picture shows a typical revisit of each s
 best lookalike: cells of both are white, those of the query alone are cyan and those of the place red.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +18,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -29,39 +31,37 @@ from sglpr_jax.loops.compared_image import within_reach
 from sglpr_jax.loops.comparison import Fits
 from sglpr_jax.loops.config import VerificationConfig
 from sglpr_jax.loops.overlay import overlaid
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.transforms import transform, travelled
 from sglpr_jax.loops.verification import refined
 
 VERIFICATION = VerificationConfig()
 
 
 class Revisit(NamedTuple):
-    """A scan at a place that was seen before, with the best fit at its true pose and the best at a wrong one."""
+    """A scan that was compared with its right place: the best fit at the true pose, and the best at a wrong one."""
 
     drive: RenderedDrive
     query: int
     fits: Fits
-    right: int | None
-    """Row of the fit. None if the scan was not compared with this place."""
+    right: int
+    """Row of the fit."""
     wrong: int | None
 
     @property
     def ratio(self) -> float:
-        """Correlation of the best wrong fit over that of the right one."""
-        if self.right is None or self.wrong is None:
-            return 0.0 if self.right is not None else np.inf
+        """Correlation of the best wrong fit over that of the right one. 0 without a wrong fit."""
+        if self.wrong is None:
+            return 0.0
         return float(self.fits.peaks.correlation[self.wrong] / self.fits.peaks.correlation[self.right])
 
     @property
     def along_m(self) -> float:
         """Stated uncertainty of the right pose along its least certain direction, in metres."""
-        if self.right is None:
-            return np.nan
         images = self.image(self.query), self.image(int(self.fits.frames[self.right]))
         found = refined(*images, self.fits.peaks.one(self.right), config=VERIFICATION)
         return float(jax.device_get(found.along_m)) / self.drive.scale
 
-    def image(self, frame: int) -> np.ndarray:
+    def image(self, frame: int) -> UInt8[np.ndarray, "m m"]:
         """Compared cells of a scan."""
         return np.asarray(within_reach(self.drive.seen[frame].image, VERIFICATION))
 
@@ -89,44 +89,51 @@ def main(
         out: picture to write; its suffix is the format (extra viz).
         weights: the model that described the scans.
     """
-    params, found = sglpr_jax.load(weights), dict[str, list[Revisit]]()
+    params, found, counts = sglpr_jax.load(weights), dict[str, list[Revisit]](), Counter[str]()
     for path in track(sorted(drives.glob(f"*-{sensor}-*.npz")), description="compare"):
         drive = read(path)
-        if not sceneries or drive.about["scenery"] in sceneries:
+        scenery = drive.about["scenery"]
+        if not sceneries or scenery in sceneries:
             frames = [one.fits for one in compared(drive, params, drives / "compared")]
-            found.setdefault(drive.about["scenery"], []).extend(_revisits(drive, frames))
+            count, some = _revisits(drive, frames)
+            counts[scenery] += count
+            found.setdefault(scenery, []).extend(some)
     table = Table("scenery", "revisits", "compared", "fits best", "lookalike", "along (m)")
     shown = {}
     for scenery, some in found.items():
-        seen = sorted((one for one in some if one.right is not None), key=lambda one: one.ratio)
-        if not seen:
-            table.add_row(scenery, str(len(some)), "0.00", "", "", "")
+        if not some:
+            table.add_row(scenery, str(counts[scenery]), *[""] * 4)
             continue
-        ratios = [one.ratio for one in seen]
-        shown[scenery] = seen[len(seen) // 2]
-        best, along_m = np.mean(np.array(ratios) < 1), np.median([one.along_m for one in seen[:: len(seen) // 20 + 1]])
-        shares = (len(seen) / len(some), best, np.median(ratios), along_m)
-        table.add_row(scenery, str(len(some)), *(f"{share:.2f}" for share in shares))
+        some.sort(key=lambda one: one.ratio)
+        shown[scenery] = some[len(some) // 2]
+        best = np.mean([one.ratio < 1 for one in some])
+        along_m = np.median([one.along_m for one in some[:: len(some) // 20 + 1]])
+        shares = (len(some) / counts[scenery], best, shown[scenery].ratio, along_m)
+        table.add_row(scenery, str(counts[scenery]), *(f"{share:.2f}" for share in shares))
     Console().print(table)
     if out is not None:
         _draw(shown, out)
 
 
-def _revisits(drive: RenderedDrive, frames: Sequence[Fits]) -> list[Revisit]:
+def _revisits(drive: RenderedDrive, frames: Sequence[Fits]) -> tuple[int, list[Revisit]]:
+    """Number of revisits of a drive, and those that were compared with their right place."""
     poses, found = drive.world_from_lidar, []
-    for query in np.flatnonzero(revisits(poses[:, :3, 3], REVISIT_M * drive.scale, WAY_M * drive.scale)).tolist():
+    way_m = travelled(poses)
+    queries = np.flatnonzero(revisits(poses[:, :3, 3], REVISIT_M * drive.scale, WAY_M * drive.scale)).tolist()
+    for query in queries:
         fits = frames[query]
         peaks = zip(fits.peaks.x, fits.peaks.y, fits.peaks.yaw, strict=True)
         each = np.array([transform(*map(float, peak)) for peak in peaks]).reshape(-1, 4, 4)
         errors = pose_errors([(query, frame) for frame in fits.frames.tolist()], each, poses)
-        way_m = np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3]), axis=1))
         before = way_m[fits.frames] <= way_m[query] - WAY_M * drive.scale
-        rows = (_best(fits, errors.right & before), _best(fits, errors.wrong))
-        found.append(Revisit(drive, query, fits, *rows))
-    return found
+        right = _best(fits, errors.right & before)
+        if right is not None:
+            found.append(Revisit(drive, query, fits, right, _best(fits, errors.wrong)))
+    return len(queries), found
 
 
-def _best(fits: Fits, allowed: np.ndarray) -> int | None:
+def _best(fits: Fits, allowed: Bool[np.ndarray, " k"]) -> int | None:
+    """Row of the allowed fit with the highest correlation."""
     return int(np.argmax(np.where(allowed, fits.peaks.correlation, -1.0))) if allowed.any() else None
 
 
