@@ -12,7 +12,7 @@ Command: bin/train --seq 06 --data KITTI_BEV --preset circular
 """
 
 from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(

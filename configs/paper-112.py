@@ -13,7 +13,7 @@ Command: bin/train --seq 08 --data IMAGES --preset paper-112
 
 import dataclasses
 
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.presets import load_preset
 
 CONFIG = dataclasses.replace(load_preset("paper"), model=model_preset("paper-112"))

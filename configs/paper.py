@@ -8,7 +8,7 @@ Expect: these numbers were not measured here. The 200,000 steps require a GPU: a
 Command: bin/train --seq 08 --data KITTI --preset paper
 """
 
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(

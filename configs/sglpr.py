@@ -11,7 +11,7 @@ Command: bin/train --seq 08 --data TOWNS --preset sglpr
 """
 
 from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(

@@ -8,7 +8,7 @@ Command: bin/train --seq 08 --preset tiny
 """
 
 from sglpr_jax.data.sampling.config import TupleConfig
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig
 
 CONFIG = TrainConfig(

@@ -13,7 +13,7 @@
   `IncrementalTrajectory`; `scan_odometry`, and `slam` for all of it; `PlaceMap` for scans of another day
 - train: `preset`, `train`; initialise with `init`, store with `save`, publish with `for_places`, `average`,
   `save_program`
-- simulate recordings with labels: `simulate`
+- simulate recordings with labels: `simulate`, `simulate_recording`, `simulate_repeating`; `SENSORS`, `CARRIERS`
 - images and classes: `Grid`, `rasterize`, `density_bev`, `rotate_image`, `taxonomy`, `to_classes` and more
 - configure a model: `ModelConfig`, its backbones `SwinConfig`, `CircularConfig`, `SglprConfig`, its `HeadConfig`
 """

@@ -15,27 +15,17 @@ from .bev import (
 from .bev import (
     rotate_points as rotate_points,
 )
-from .data import (
-    Record as Record,
-)
-from .data import (
-    Recording as Recording,
-)
-from .data import (
-    open_recording as open_recording,
-)
-from .data import (
-    read_scan as read_scan,
-)
-from .data import (
-    recording_names as recording_names,
-)
 from .data.density_image import density_bev as density_bev
 from .data.deskew import deskew as deskew
 from .data.deskew import deskewed as deskewed
+from .data.formats.scan_files import read_scan as read_scan
 from .data.gravity import GroundFilter as GroundFilter
 from .data.mounting import Mounting as Mounting
 from .data.mounting import estimate_mounting as estimate_mounting
+from .data.readers import open_recording as open_recording
+from .data.readers import recording_names as recording_names
+from .data.recording import Record as Record
+from .data.recording import Recording as Recording
 from .data.scaled import scaled as scaled
 from .data.submap import SubmapBuilder as SubmapBuilder
 from .data.submap import submaps as submaps
@@ -45,26 +35,21 @@ from .grid import Grid as Grid
 from .labels import CATEGORIES as CATEGORIES
 from .labels import taxonomy as taxonomy
 from .labels import to_classes as to_classes
+from .loops.closure import Loop as Loop
 from .loops.detector import LoopDetector as LoopDetector
-from .loops.find import find_loops as find_loops
-from .loops.find_between import find_loops_between as find_loops_between
-from .loops.incremental import IncrementalTrajectory as IncrementalTrajectory
-from .loops.loop import Loop as Loop
-from .loops.odometry import read_odometry as read_odometry
-from .loops.optimization import optimize_trajectory as optimize_trajectory
-from .loops.places import PlaceMap as PlaceMap
-from .loops.scan_odometry import scan_odometry as scan_odometry
-from .loops.slam import slam as slam
+from .loops.search import find_loops as find_loops
+from .loops.search_between import find_loops_between as find_loops_between
+from .maps.place_map import PlaceMap as PlaceMap
 from .models.average import average as average
-from .models.backbones.circular_config import CircularConfig as CircularConfig
-from .models.backbones.sglpr_config import SglprConfig as SglprConfig
-from .models.backbones.swin_config import SwinConfig as SwinConfig
+from .models.config import MODELS as MODELS
+from .models.config import CircularConfig as CircularConfig
 from .models.config import HeadConfig as HeadConfig
 from .models.config import ModelConfig as ModelConfig
+from .models.config import SglprConfig as SglprConfig
+from .models.config import SwinConfig as SwinConfig
+from .models.config import model_preset as model_preset
+from .models.export import save_program as save_program
 from .models.params import Params as Params
-from .models.presets import MODELS as MODELS
-from .models.presets import model_preset as model_preset
-from .models.program import save_program as save_program
 from .models.sglpr import (
     Outputs as Outputs,
 )
@@ -87,6 +72,11 @@ from .models.shipped import shipped_weights as shipped_weights
 from .models.weights import for_places as for_places
 from .models.weights_file import load as load
 from .models.weights_file import save as save
+from .odometry.kiss_icp import scan_odometry as scan_odometry
+from .pose_graph.incremental import IncrementalTrajectory as IncrementalTrajectory
+from .pose_graph.odometry_files import read_odometry as read_odometry
+from .pose_graph.optimize import optimize_trajectory as optimize_trajectory
+from .pose_graph.slam import slam as slam
 from .retrieval.descriptor_file import DescriptorFile as DescriptorFile
 from .retrieval.embed import embed as embed
 from .retrieval.embed import scan_image as scan_image
@@ -94,6 +84,10 @@ from .retrieval.fleet_index import FleetIndex as FleetIndex
 from .retrieval.index import Index as Index
 from .retrieval.nearest import Nearest as Nearest
 from .retrieval.nearest import nearest as nearest
+from .sim.carriers import CARRIERS as CARRIERS
+from .sim.recording import simulate_recording as simulate_recording
+from .sim.repeating import simulate_repeating as simulate_repeating
+from .sim.sensor import SENSORS as SENSORS
 from .sim.simulation import simulate as simulate
 from .training.presets import preset as preset
 from .training.recipe import TrainResult as TrainResult

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from sglpr_jax.poses import distances
 from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S, POSITIVE_M
+from sglpr_jax.se3 import distances
 
 BLOCK = 32
 """Number of queries whose positions are compared at a time, so that the distances fit in the cache."""

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from sglpr_jax.data.formats.scan_files import read_labels
-from sglpr_jax.data.record import Record, image_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording, image_record
 
 
 def of_scans(clouds: Mapping[Path, np.ndarray], **fields: Any) -> Recording:

@@ -13,6 +13,7 @@ PUBLIC = [(name, getattr(sglpr_jax, name)) for name in sglpr_jax.__all__]
 CALLABLES = [(name, member) for name, member in PUBLIC if callable(member)]
 FUNCTIONS = [(name, inspect.signature(member)) for name, member in CALLABLES if not inspect.isclass(member)]
 INPUTS_NOT_OPTIONS = {
+    ("simulate_recording", "name"),
     ("open_recording", "name"),
     ("describe", "labels"),
     ("forward", "labels"),

@@ -9,9 +9,7 @@ import pytest
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.fields import Bounds, Positive, Share, Sizes, check_fields
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, SglprConfig, SwinConfig
 from sglpr_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 

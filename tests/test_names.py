@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sglpr_jax.names import MOST_BYTES, MOST_SHOWN, file_name, path_inside, printable
+from sglpr_jax.files import MOST_BYTES, MOST_SHOWN, file_name, path_inside, printable
 
 HOSTILE = ("../../escaped", "/etc/passwd", "a/b", "a\\b", "", ".", "..", "a\0b", "a\nb")
 HOSTILE += ("x" * 2**20, "é" * 100, "\ud800")

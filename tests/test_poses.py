@@ -10,9 +10,9 @@ import pytest
 
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.readers.kitti import read_trajectory
-from sglpr_jax.poses import are_rotations, distances, positions_from_camera
-from sglpr_jax.revisits import EXCLUDED_FRAMES, database_end, revisits
-from sglpr_jax.same_place import POSITIVE_M
+from sglpr_jax.revisits import database_end, revisits
+from sglpr_jax.same_place import EXCLUDED_FRAMES, POSITIVE_M
+from sglpr_jax.se3 import are_rotations, distances, positions_from_camera
 
 coordinates = st.floats(-1e4, 1e4)
 

@@ -3,8 +3,7 @@
 import dataclasses
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.config import HeadConfig, SwinConfig
 from sglpr_jax.training.presets import load_preset
 
 TINY = load_preset("tiny")

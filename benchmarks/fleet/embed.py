@@ -20,7 +20,7 @@ import tyro
 
 import sglpr_jax
 from sglpr_jax.methods.registry import network
-from sglpr_jax.retrieval.place_store import embed_to_store
+from sglpr_jax.retrieval.parquet import embed_to_store
 
 
 def main(

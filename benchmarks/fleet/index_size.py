@@ -21,7 +21,7 @@ from jaxtyping import Float32
 from benchmarks.fleet.places import Drives, random_places
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.fleet_index import FleetIndex
-from sglpr_jax.retrieval.place_rows import place_rows
+from sglpr_jax.retrieval.parquet import place_rows
 
 BLOCK = 50_000
 """Number of places that are drawn at a time. A block is a recording."""

@@ -15,7 +15,7 @@ import tyro
 import sglpr_jax
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 from sglpr_jax.retrieval.overlaps import overlaps
-from sglpr_jax.retrieval.place_rows import place_rows
+from sglpr_jax.retrieval.parquet import place_rows
 from sglpr_jax.sim.sessions import plan_sessions
 
 DATES = ("2026-05-01", "2026-06-01")

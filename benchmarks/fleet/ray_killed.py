@@ -18,7 +18,7 @@ import tyro
 
 import sglpr_jax
 from benchmarks.fleet.embed import Describer, described
-from sglpr_jax.retrieval.place_store import read_places, stored_places
+from sglpr_jax.retrieval.parquet import read_places, stored_places
 
 
 def main(

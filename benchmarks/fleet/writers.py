@@ -16,7 +16,7 @@ import tyro
 from benchmarks.fleet.places import random_places
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.fleet_index import FleetIndex
-from sglpr_jax.retrieval.place_rows import place_rows
+from sglpr_jax.retrieval.parquet import place_rows
 
 WIDTH = 256
 POLL_S = 0.05

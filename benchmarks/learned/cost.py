@@ -18,8 +18,8 @@ import tyro
 
 from benchmarks.learned.data import TEST, folders
 from benchmarks.learned.entries import Entry, entry
-from sglpr_jax.data import Recording, open_recording
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.files import write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED

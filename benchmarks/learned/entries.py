@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 
 import sglpr_jax
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.describe import apply_network
@@ -22,7 +22,7 @@ from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.weights_file import LAST, RANDOM, load_variables, method_of
 from sglpr_jax.methods.method import Method, RecordMethod, Takes
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network, trained_method
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.reproduce.compared import content_of
 from sglpr_jax.training.learned.run_files import SCORES_FILE

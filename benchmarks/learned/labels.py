@@ -18,10 +18,10 @@ from jaxtyping import Int
 import sglpr_jax
 from benchmarks.learned.data import HELD_OUT, TEST, TRAIN, folders
 from sglpr_jax.bev import uncropped
-from sglpr_jax.data import open_recording, recording_names
 from sglpr_jax.data.density_grid import SIZE
 from sglpr_jax.data.density_image import values_of_points
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Record
 from sglpr_jax.files import replacing
 from sglpr_jax.labels import to_raw
 from sglpr_jax.retrieval.semantic_maps import semantic_map

@@ -9,7 +9,7 @@ rate. A CPU core does some hundred steps in an hour. Here the other places of a 
 
 import dataclasses
 
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.training.config import OptimizerConfig
 from sglpr_jax.training.presets import load_preset
 

@@ -20,7 +20,8 @@ import tyro
 from benchmarks.learned.data import TEST, folders
 from benchmarks.learned.entries import Entry, entry
 from benchmarks.learned.verified import images_of, verified
-from sglpr_jax.data import Recording, open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
 from sglpr_jax.evaluation.protocols.bevplace_recall_at_1 import bevplace_recall_at_1
 from sglpr_jax.evaluation.protocols.pairs_f1max import PAIRS_F1MAX

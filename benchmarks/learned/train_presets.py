@@ -27,7 +27,8 @@ from benchmarks.learned.clock import UPRIGHT, Clock
 from benchmarks.learned.data import HELD_OUT, TRAIN_IMAGES, folders
 from sglpr_jax.cli.peers import RATES
 from sglpr_jax.cli.runtime import stop_on_signal
-from sglpr_jax.data import Recording, open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import write_json
 from sglpr_jax.retrieval.distances import distance_function
 from sglpr_jax.training.config import TrainConfig, without_untrained_head

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.protocols.nearest import nearest_frames
 from sglpr_jax.evaluation.protocols.source import TopK
-from sglpr_jax.loops.verification import align_all
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.registration.bev_alignment import align_all
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.revisits import database_end
 

@@ -28,17 +28,16 @@ from benchmarks.quality.covariance import ALIAS_DEG, ALIAS_M, STEPS, revisits, t
 from benchmarks.quality.loops import LOOP_M, OTHER_M, REVISIT_M, drifted
 from sglpr_jax.data.choices import Gravity
 from sglpr_jax.data.mounted import mounted
-from sglpr_jax.data.readable import only
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scan_stream import only
+from sglpr_jax.loops.acceptance import settled
+from sglpr_jax.loops.closure import Loop, planar_loop
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.find import FoundLoops, find_loops
-from sglpr_jax.loops.joint import settled
-from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.registration import register
-from sglpr_jax.loops.seen import square_image
-from sglpr_jax.loops.transforms import inverse, yaw_of
-from sglpr_jax.loops.verification import align
+from sglpr_jax.loops.keyframes import square_image
+from sglpr_jax.loops.search import FoundLoops, find_loops
+from sglpr_jax.registration.bev_alignment import align
+from sglpr_jax.registration.gicp import register
+from sglpr_jax.se3 import inverse, yaw_of
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS

@@ -9,11 +9,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from sglpr_jax.data import Recording, open_recording
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.protocols.top1_f1max import top1_f1max
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.registry import handcrafted
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.retrieval.embed import embed
 from sglpr_jax.revisits import revisits
 

@@ -25,13 +25,11 @@ from jaxtyping import Float, Float32
 import sglpr_jax
 from benchmarks.quality.map_drives import DRIVE_S, Drive, driven, noisy
 from sglpr_jax.data.readers import cloud_map
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.loop_files import write_tum
-from sglpr_jax.loops.optimization import trajectory_error
-from sglpr_jax.loops.scan_odometry import scan_odometry
-from sglpr_jax.loops.transforms import inverse
-from sglpr_jax.poses import distances
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.odometry.kiss_icp import scan_odometry
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.pose_graph.optimize import trajectory_error
+from sglpr_jax.se3 import distances, inverse
 
 NEAR_M, RIGHT_M, RIGHT_DEG = 5.0, 0.5, 2.0
 FAR_M = 60.0

@@ -24,12 +24,12 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.registration import register
-from sglpr_jax.loops.seen import square_image
-from sglpr_jax.loops.transforms import inverse, moved_covariance
-from sglpr_jax.loops.upright import upright_from_lidar
-from sglpr_jax.loops.verification import align
+from sglpr_jax.data.levelling import upright_from_lidar
+from sglpr_jax.loops.closure import Loop, planar_loop
+from sglpr_jax.loops.keyframes import square_image
+from sglpr_jax.registration.bev_alignment import align
+from sglpr_jax.registration.gicp import register
+from sglpr_jax.se3 import inverse, moved_covariance
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS, Sensor

@@ -19,10 +19,8 @@ from jaxtyping import Float
 
 import sglpr_jax
 from sglpr_jax.data.deskew import deskew
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.transforms import inverse, transformed
-from sglpr_jax.poses import distances
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.se3 import distances, inverse, transformed
 from sglpr_jax.sim.drive import plan_path, poses_on
 from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
 from sglpr_jax.sim.world import World, build_world

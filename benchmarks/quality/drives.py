@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from benchmarks.quality.loops import drifted
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.scaled import scaled_poses
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.checkpoint import columns, compared_of
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import inverse, yaw_of
-from sglpr_jax.loops.unfinished import columns, compared_of
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.models.params import Params
+from sglpr_jax.se3 import inverse, yaw_of
 
 Odometry = Literal["none", "exact", "drifting"]
 RIGHT, WRONG = (1.5, 6.0), (3.0, 15.0)

@@ -30,12 +30,12 @@ from scipy.special import expit
 import sglpr_jax
 from benchmarks.quality.drives import STOREY_M, Odometry, compared, finder_of, pose_errors, read
 from sglpr_jax.files import write_json
+from sglpr_jax.loops.calibration import calibration_error, reliability
+from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.consistency import agree_along
-from sglpr_jax.loops.loop import planar_loop
 from sglpr_jax.loops.probability import ALL, DEFAULT, TESTED, Evidence, LoopModel, fit
-from sglpr_jax.loops.reliability import calibration_error, reliability
 from sglpr_jax.loops.sequence import neighbour_weights
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.se3 import transform
 
 PAIRS = 300.0
 """The drives of a scenery with one kind of revisits and odometry count as this number of pairs."""

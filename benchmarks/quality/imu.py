@@ -23,8 +23,7 @@ from sglpr_jax.data.gravity import IMU_TILT_DEG
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
 from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.scenery import SCENERIES

@@ -23,24 +23,24 @@ from rich.progress import track
 from rich.table import Table
 
 import sglpr_jax
-from sglpr_jax.data import Recording
 from sglpr_jax.data.formats.pose_files import read_poses
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.protocols import TopK, protocol_named
+from sglpr_jax.loops.acceptance import settled
+from sglpr_jax.loops.calibration import Bin, reliability_of
 from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.closure import Loop, Rejected, planar_loop
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.joint import settled
-from sglpr_jax.loops.loop import Loop, Rejected, planar_loop
-from sglpr_jax.loops.optimization import optimized, trajectory_error
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.reliability import Bin, reliability_of
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.spectra import query_spectra
-from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.verification import refined
 from sglpr_jax.models.params import Params
+from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
+from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_spectra import query_spectra
 from sglpr_jax.same_place import EXCLUDED_FRAMES
+from sglpr_jax.se3 import inverse, transform
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
 

@@ -26,9 +26,8 @@ from rich.table import Table
 
 import sglpr_jax
 from benchmarks.quality.loops import LOOP_M, OTHER_M, REVISIT_M, SUCCESS_DEG, SUCCESS_M, revisits
-from sglpr_jax.loops.find import find_loops
-from sglpr_jax.loops.transforms import inverse
-from sglpr_jax.poses import distances
+from sglpr_jax.loops.search import find_loops
+from sglpr_jax.se3 import distances, inverse
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
 

@@ -27,12 +27,12 @@ import sglpr_jax
 from benchmarks.quality.drives import RenderedDrive, compared, pose_errors, read
 from benchmarks.quality.repeating import REVISIT_M, WAY_M, revisits
 from sglpr_jax.evaluation import figures
-from sglpr_jax.loops.compared_image import within_reach
+from sglpr_jax.evaluation.overlay import overlaid
 from sglpr_jax.loops.comparison import Fits
-from sglpr_jax.loops.config import VerificationConfig
-from sglpr_jax.loops.overlay import overlaid
-from sglpr_jax.loops.transforms import transform, travelled
-from sglpr_jax.loops.verification import refined
+from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_spectra import within_reach
+from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.se3 import transform, travelled
 
 VERIFICATION = VerificationConfig()
 

@@ -18,7 +18,7 @@ import sglpr_jax
 from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.mounting import estimate_mounting
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.poses import distances
+from sglpr_jax.se3 import distances
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 

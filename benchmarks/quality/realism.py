@@ -17,9 +17,10 @@ from benchmarks.quality.scan_statistics import (
     scan_measures,
     total_variation,
 )
-from sglpr_jax.data import Recording, open_recording, recording_names
 from sglpr_jax.data.density_grid import MAX_COUNT
 from sglpr_jax.data.density_image import density_image
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.figures import save
 from sglpr_jax.labels import to_classes
 

@@ -29,11 +29,11 @@ from rich.table import Table
 
 import sglpr_jax
 from benchmarks.quality.drives import STOREY_M, Odometry, compared, pose_errors, read
-from sglpr_jax.loops import optimization
+from sglpr_jax.loops.acceptance import accepted
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.joint import accepted
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import trajectory_error
+from sglpr_jax.pose_graph import optimize
+from sglpr_jax.pose_graph.optimize import trajectory_error
 
 REVISIT_M, WAY_M = 3.0, 30.0
 
@@ -132,7 +132,7 @@ def _moved(
     odometry: Float[np.ndarray, "n 4 4"], loops: Sequence[Loop], poses: Float[np.ndarray, "n 4 4"]
 ) -> dict[str, float]:
     """How far the optimisation moves the odometry at most, and its RMS error before and after, in metres."""
-    corrected = optimization.optimized(odometry, tuple(loops))
+    corrected = optimize.optimized(odometry, tuple(loops))
     before, after = (trajectory_error(each, poses[:, :3, 3]) for each in (odometry, corrected.poses))
     return {"moved_m": corrected.moved_m, "before_m": before, "after_m": after}
 

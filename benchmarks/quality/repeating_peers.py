@@ -26,15 +26,14 @@ import sglpr_jax
 from benchmarks.quality.drives import distances
 from benchmarks.quality.map_closures import peer_python, run_peer
 from benchmarks.quality.repeating import REVISIT_M, WAY_M, revisits
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.loops.keyframes import Seen, StoredScans
 from sglpr_jax.methods.handcrafted.scan_context import NUMBERS, scan_context, scan_context_distance
 from sglpr_jax.models.params import Params
-from sglpr_jax.poses import distances as all_distances
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import distances as all_distances
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.sceneries import REPEATING

@@ -10,7 +10,7 @@ from sglpr_jax.bev import rasterize, rasterize_labels
 from sglpr_jax.data.density_grid import RESOLUTION_M
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.labels import CATEGORIES
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 
 GRID = model_preset("sglpr").grid
 

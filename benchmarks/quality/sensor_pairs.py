@@ -18,12 +18,11 @@ from jaxtyping import Bool, Float
 
 import sglpr_jax
 from benchmarks.quality.submaps import APART_M, PASSES, RIGHT_M, Drive, rendered, scored, submaps_of_passes
-from sglpr_jax.data.readable import only
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import inverse, yaw_of
-from sglpr_jax.poses import distances
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.se3 import distances, inverse, yaw_of
 
 SENSORS = ("vlp16", "os0-32", "os1-64", "hdl64e", "mid360", "avia")
 WELL_M, WELL_DEG = 0.5, 2.0

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.quality.range_images import range_image_paths, read_range_image
-from sglpr_jax.data import Record, open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Record
 from sglpr_jax.evaluation.figures import save, segmentation_panel
 from sglpr_jax.evaluation.report import to_json
 from sglpr_jax.evaluation.scoring import score

@@ -34,8 +34,8 @@ from benchmarks.quality.loops import LOOP_M, OTHER_M, revisits
 from benchmarks.quality.map_closures import peer_python
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.loop_files import read_loops_jsonl, write_tum
-from sglpr_jax.poses import distances
+from sglpr_jax.pose_graph.files import read_loops_jsonl, write_tum
+from sglpr_jax.se3 import distances
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 

@@ -19,12 +19,12 @@ from jaxtyping import Float
 import sglpr_jax
 from benchmarks.quality.two_recordings import Poses, Search, judged, report
 from sglpr_jax.data.formats.pose_files import read_poses
-from sglpr_jax.data.readable import only
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.find import prepared, searched
-from sglpr_jax.loops.find_between import between_searches
-from sglpr_jax.loops.transforms import inverse, travelled
+from sglpr_jax.loops.search import prepared, searched
+from sglpr_jax.loops.search_between import between_searches
 from sglpr_jax.models.params import Params
+from sglpr_jax.se3 import inverse, travelled
 
 NEAR_M, COMMON_M = 4.0, 50.0
 """Scans of one place are at most this far apart, over at least this length of path, in metres."""

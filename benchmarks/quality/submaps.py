@@ -20,11 +20,10 @@ from numpy.lib.format import open_memmap
 
 import sglpr_jax
 from benchmarks.quality.loops import drifted
-from sglpr_jax.data.readable import only
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.files import replacing
-from sglpr_jax.poses import distances
+from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import PlanarPath, plan_path, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
 from sglpr_jax.sim.sensor import SENSORS

@@ -24,15 +24,15 @@ from jaxtyping import Float
 import sglpr_jax
 from benchmarks.quality.drives import Odometry
 from benchmarks.quality.loops import drifted
-from sglpr_jax.data import Record, Recording
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.loops.acceptance import settled
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.find_between import FoundBetween, between_searches
-from sglpr_jax.loops.joint import settled
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import inverse, yaw_of
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.search_between import FoundBetween, between_searches
 from sglpr_jax.models.params import Params
+from sglpr_jax.se3 import inverse, yaw_of
 
 OTHER_M = 20.0
 """A loop whose scans are farther apart is wrong."""

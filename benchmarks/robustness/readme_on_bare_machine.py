@@ -30,7 +30,7 @@ NOT_INSTALLED = ("bin/test", "bin/docs", "pip install")
 ODOMETRY = """
 from pathlib import Path
 import sglpr_jax
-from sglpr_jax.loops.loop_files import write_tum
+from sglpr_jax.pose_graph.files import write_tum
 poses = sglpr_jax.read_odometry("KITTI/sequences/08/poses.txt", format="kitti")
 write_tum(Path("odometry.tum"), poses, sglpr_jax.open_recording("KITTI", "08").times)
 """

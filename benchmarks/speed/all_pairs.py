@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.names import NETWORK
 from sglpr_jax.methods.registry import method_named

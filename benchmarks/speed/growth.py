@@ -21,7 +21,7 @@ from benchmarks.speed.inputs import random_scans
 from sglpr_jax.bev import rasterize
 from sglpr_jax.data.density_image import density_image
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index

@@ -11,9 +11,9 @@ import time
 import numpy as np
 import tyro
 
-from sglpr_jax.loops.incremental import IncrementalTrajectory
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
+from sglpr_jax.se3 import transform
 from sglpr_jax.sim.recording import simulate_recording
 
 SCANS = 240

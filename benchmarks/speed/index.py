@@ -20,7 +20,7 @@ from benchmarks.speed.ratio import Contender, Job, alternate, report
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.fleet_index import FleetIndex
 from sglpr_jax.retrieval.index import Index
-from sglpr_jax.retrieval.place_rows import place_rows
+from sglpr_jax.retrieval.parquet import place_rows
 
 BLOCK = 100_000
 """Places that are drawn and added at a time: nobody holds all of them twice."""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.loops.transforms import quaternions
+from sglpr_jax.se3 import quaternions
 
 
 class FolderPublisher:

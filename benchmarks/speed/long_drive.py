@@ -26,12 +26,12 @@ from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query, Stored
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.motion import Link
-from sglpr_jax.loops.pose_search import Peak
+from sglpr_jax.loops.keyframes import Seen, square_image
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.seen import Seen, square_image
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
-from sglpr_jax.loops.verification import Alignment
+from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.bev_search import Peak
+from sglpr_jax.se3 import inverse, transform, yaw_of
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import HDL64E
 

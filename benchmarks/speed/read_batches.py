@@ -10,8 +10,9 @@ import numpy as np
 import tyro
 
 from benchmarks.speed.ratio import report
-from sglpr_jax.data import Recording, open_recording, recording_names
-from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.data.packed import packed
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.training.batches import TupleBatches, tuple_pool
 from sglpr_jax.training.presets import load_preset

@@ -21,7 +21,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from sglpr_jax.models.presets import MODELS
+from sglpr_jax.models.config import MODELS
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import SENSORS
 

@@ -4,9 +4,7 @@ from torch import Tensor, nn
 
 from benchmarks.torch_peer.torch_circular import CircularDecoder, CircularNet
 from benchmarks.torch_peer.torch_swin import PatchExpand, SwinUnet, Windows
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
-from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.config import CircularConfig, ModelConfig, SglprConfig
 
 
 class Swin(nn.Module):

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.torch_peer.torch_layers import Convolution, means, repeated
-from sglpr_jax.models.backbones.circular_config import CircularConfig
+from sglpr_jax.models.config import CircularConfig
 
 
 class CircularBlock(nn.Module):

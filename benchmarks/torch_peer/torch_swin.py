@@ -8,10 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sglpr_jax.models.backbones.attention import BLOCKED, relative_position_index, shift_mask
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.backbones.swin_layers import MLP_RATIO
+from sglpr_jax.models.config import SglprConfig, SwinConfig
+from sglpr_jax.models.swin import BLOCKED, MLP_RATIO, relative_position_index, shift_mask
 
 
 class Windows(NamedTuple):

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sglpr_jax.cli.runtime import cache_folder, progress_bar
-from sglpr_jax.data import Recording, readers
 from sglpr_jax.data import leave_one_out as split
-from sglpr_jax.data.readable import readable
+from sglpr_jax.data import readers
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import readable
 
 if TYPE_CHECKING:
-    from sglpr_jax.sim import Simulated
+    from sglpr_jax.sim.simulation import Simulated
 
 
 def dataset_root(data: Path | None, *, write: bool = True) -> Path:
@@ -49,8 +50,8 @@ def cached_sessions() -> Path:
 
 
 def simulate(root: Path, **options: Any) -> "Simulated":
-    """Run `sim.simulate`, with a message about the size and a progress bar."""
-    from sglpr_jax import sim
+    """Run `sim.simulation.simulate`, with a message about the size and a progress bar."""
+    from sglpr_jax.sim import simulation
 
     with contextlib.ExitStack() as opened:
         bars = []
@@ -59,7 +60,7 @@ def simulate(root: Path, **options: Any) -> "Simulated":
             _announce(dataset)
             bars.append(opened.enter_context(progress_bar("simulate", dataset.scans * len(dataset.names))))
 
-        return sim.simulate(root, **options, on_start=start, on_progress=lambda done: bars[0](done))
+        return simulation.simulate(root, **options, on_start=start, on_progress=lambda done: bars[0](done))
 
 
 def _announce(dataset: "Simulated") -> None:

@@ -3,7 +3,8 @@
 import dataclasses
 from typing import Any
 
-from sglpr_jax.loops.config import DetectorConfig, DriftModel
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.odometry.config import DriftModel
 
 
 def detector_config(command: Any) -> DetectorConfig:

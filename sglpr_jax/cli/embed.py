@@ -14,7 +14,7 @@ from sglpr_jax.fields import CountOrNone, Size
 from sglpr_jax.methods.names import LEARNED_NAMES, NETWORK, AnyMethodName
 
 if TYPE_CHECKING:
-    from sglpr_jax.data import Recording
+    from sglpr_jax.data.recording import Recording
     from sglpr_jax.methods.method import Method
 
 
@@ -65,7 +65,7 @@ def embed_recording(command: EmbedCommand) -> str:
     """Run the command. Returns the path of the descriptor file, or the address of the file in the store."""
     from sglpr_jax.data.scaled import scaled  # slow imports, not needed for --help
     from sglpr_jax.retrieval.embed import embed
-    from sglpr_jax.retrieval.place_store import embed_to_store
+    from sglpr_jax.retrieval.parquet import embed_to_store
 
     _check_weights(command)
     in_store = "://" in command.out or command.out.endswith("/")

@@ -84,7 +84,7 @@ def evaluate_file(command: EvaluateCommand) -> Path:
 
 def _evaluate_recording(command: EvaluateCommand, folder: Path) -> list[Path]:
     """Score the methods, print the table and write the results. Returns the paths written."""
-    from sglpr_jax.data.formats.trajectory import read_trajectory
+    from sglpr_jax.data.formats.pose_files import read_trajectory
     from sglpr_jax.evaluation import figures
     from sglpr_jax.evaluation.inputs.methods import read_methods
     from sglpr_jax.evaluation.page.recording_pictures import check_same_frames, poses_of, take_pictures

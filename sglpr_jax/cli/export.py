@@ -53,9 +53,9 @@ class ExportCommand:
 
 def export(command: ExportCommand) -> Path:
     """Run the command. Returns the output folder. Raises FileExistsError if it exists."""
-    from sglpr_jax.data import open_recording, recording_names  # slow imports, not needed for --help
+    from sglpr_jax.data.readers import open_recording, recording_names
+    from sglpr_jax.models.export import save_program
     from sglpr_jax.models.params import Params
-    from sglpr_jax.models.program import save_program
     from sglpr_jax.models.weights_file import save
     from sglpr_jax.retrieval.whiten import whiten
 

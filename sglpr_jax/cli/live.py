@@ -13,16 +13,10 @@ from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.runtime import parse_command, run, stop_on_signal
 from sglpr_jax.data.choices import PoseFormat, ScanFormat, SensorHeight, TimeUnit
 from sglpr_jax.fields import NotNegative
-from sglpr_jax.loops.choices import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, MIN_PROBABILITY
-from sglpr_jax.loops.config import (
-    CandidateConfig,
-    ConsistencyConfig,
-    DetectorConfig,
-    DriftModel,
-    SequenceConfig,
-    VerificationConfig,
-)
+from sglpr_jax.loops.config import MIN_PROBABILITY, CandidateConfig, ConsistencyConfig, DetectorConfig, SequenceConfig
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.odometry.config import DRIFT_DEG_PER_100M, DRIFT_HEIGHT_PERCENT, DRIFT_PERCENT, DriftModel
+from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
     from sglpr_jax.live.live_map import LiveMap
@@ -111,7 +105,7 @@ class LiveCommand:
 
 def live(command: LiveCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.unfinished import alone  # slow import, not needed for --help
+    from sglpr_jax.loops.checkpoint import alone  # slow import, not needed for --help
 
     _check(command)
     with alone(command.out):

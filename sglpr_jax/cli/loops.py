@@ -20,27 +20,27 @@ from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_sign
 from sglpr_jax.cli.scan_odometry import AUTO, check_auto, open_with_scan_odometry, remove_odometry
 from sglpr_jax.cli.several_loops import search_several
 from sglpr_jax.data.choices import ScaleChoice
-from sglpr_jax.loops.choices import (
+from sglpr_jax.loops.config import (
+    MIN_PROBABILITY,
+    CandidateConfig,
+    ConsistencyConfig,
+    Degenerate,
+    DetectorConfig,
+    SequenceConfig,
+)
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.odometry.config import (
     DRIFT_DEG_PER_100M,
     DRIFT_HEIGHT_PERCENT,
     DRIFT_PERCENT,
-    MIN_PROBABILITY,
-    Degenerate,
-    OdometryFormat,
-)
-from sglpr_jax.loops.config import (
-    CandidateConfig,
-    ConsistencyConfig,
-    DetectorConfig,
     DriftModel,
     OdometryConfig,
-    SequenceConfig,
-    VerificationConfig,
+    OdometryFormat,
 )
-from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.registration.config import VerificationConfig
 
 if TYPE_CHECKING:
-    from sglpr_jax.data import Recording
+    from sglpr_jax.data.recording import Recording
 
 UNFINISHED = "unfinished"
 """Checkpoint directory of a running command, inside the output folder."""
@@ -138,7 +138,7 @@ class LoopsCommand:
 
 def loops_of_recording(command: LoopsCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.unfinished import alone  # slow import, not needed for --help
+    from sglpr_jax.loops.checkpoint import alone  # slow import, not needed for --help
 
     _check(command)
     config = detector_config(command)
@@ -150,8 +150,8 @@ def loops_of_recording(command: LoopsCommand) -> int:
 
 def _check(command: LoopsCommand) -> None:
     """Raises ValueError or ImportError before the search, if it would end in an error or overwrite an input."""
-    from sglpr_jax.loops.folder import TRAJECTORIES
-    from sglpr_jax.loops.optimization import check_installed
+    from sglpr_jax.pose_graph.folder import TRAJECTORIES
+    from sglpr_jax.pose_graph.optimize import check_installed
 
     recordings, files = command.recordings, command.odometry_files
     if not recordings:
@@ -188,13 +188,12 @@ def _is_trajectory(path: Path, out: Path) -> bool:
 def _search(command: LoopsCommand, config: DetectorConfig) -> int:
     from sglpr_jax.evaluation.page.of_loops import PAGE, loops_page
     from sglpr_jax.evaluation.rerun_file import write_rerun
-    from sglpr_jax.loops.explanation import why_none
-    from sglpr_jax.loops.find import can_register, find_loops
-    from sglpr_jax.loops.folder import write_found
-    from sglpr_jax.loops.optimization import optimize_trajectory
-    from sglpr_jax.loops.reasons import why_rejected
-    from sglpr_jax.loops.unfinished import remove
+    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.loops.closure import why_rejected
+    from sglpr_jax.loops.search import can_register, find_loops, why_none
     from sglpr_jax.models.weights_file import load
+    from sglpr_jax.pose_graph.folder import write_found
+    from sglpr_jax.pose_graph.optimize import optimize_trajectory
 
     source, (root,) = command.source, command.recordings
     params = load(command.weights)

@@ -12,17 +12,17 @@ from sglpr_jax.cli.runtime import parse_command, progress_bar, run, stop_on_sign
 from sglpr_jax.cli.scan_odometry import AUTO, ENDING, check_auto, odometry_of, with_deskew
 from sglpr_jax.data.choices import ScaleChoice
 from sglpr_jax.fields import NotNegative
-from sglpr_jax.loops.choices import SPACING_M, OdometryFormat
-from sglpr_jax.loops.config import OdometryConfig
+from sglpr_jax.loops.config import SPACING_M
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.odometry.config import OdometryConfig, OdometryFormat
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from sglpr_jax.data import Recording
     from sglpr_jax.data.choices import Scale
-    from sglpr_jax.loops.places import PlaceMap
+    from sglpr_jax.data.recording import Recording
+    from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.models.params import Params
 
 UNFINISHED = ".unfinished"
@@ -81,8 +81,8 @@ class MapCommand:
 
 def write_map(command: MapCommand) -> int:
     """Run the command. Returns the exit status."""
-    from sglpr_jax.loops.unfinished import alone
-    from sglpr_jax.models.weights_file import load  # slow imports, not needed for --help
+    from sglpr_jax.loops.checkpoint import alone
+    from sglpr_jax.models.weights_file import load
 
     if command.out.suffix != ".safetensors":
         raise ValueError(f"expected --out to end in .safetensors, found {command.out}")
@@ -95,10 +95,10 @@ def write_map(command: MapCommand) -> int:
 
 def _add_places(command: MapCommand, params: "Params") -> int:
     from sglpr_jax.files import naming
-    from sglpr_jax.loops.map_recording import map_recording
-    from sglpr_jax.loops.place_names import poses_by_id
-    from sglpr_jax.loops.places import PlaceMap
-    from sglpr_jax.loops.unfinished import remove
+    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.maps.build import map_recording
+    from sglpr_jax.maps.place_file import poses_by_id
+    from sglpr_jax.maps.place_map import PlaceMap
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.retrieval.index_rows import check_scale
 
@@ -145,7 +145,7 @@ def _add_places(command: MapCommand, params: "Params") -> int:
 
 def _opened(command: MapCommand) -> "tuple[Recording, Float[np.ndarray, 'n 4 4'], Scale]":
     """The recording, deskewed and with submaps, the poses of its scans and the scale. Odometry of scans is written."""
-    from sglpr_jax.loops.loop_files import write_tum
+    from sglpr_jax.pose_graph.files import write_tum
 
     if command.poses != AUTO:
         given = open_with_poses(command.source, command.recording, command.poses, format=command.pose_format)
@@ -163,7 +163,7 @@ def _opened(command: MapCommand) -> "tuple[Recording, Float[np.ndarray, 'n 4 4']
 
 def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict[str, "np.ndarray"]) -> "PlaceMap":
     """The existing map with the places of the new one, in the frame that the flag states."""
-    from sglpr_jax.loops.map_alignment import align_maps, check_one_frame, without_known_places
+    from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
 
     if command.frame != "same":
         print("comparing up to 300 of the new places with the existing map", file=sys.stderr)
@@ -187,7 +187,7 @@ def _added(command: MapCommand, before: "PlaceMap", new: "PlaceMap", drive: dict
 
 def _holds_more(path: Path, places: int) -> bool:
     """Whether the path already holds a map with more places. A smaller map must not replace it."""
-    from sglpr_jax.loops.places import PlaceMap
+    from sglpr_jax.maps.place_map import PlaceMap
 
     try:
         return len(PlaceMap.load(path)) > places

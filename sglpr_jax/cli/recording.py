@@ -16,13 +16,13 @@ from sglpr_jax.data.choices import (
     TimeUnit,
 )
 from sglpr_jax.fields import NotNegative, Positive
-from sglpr_jax.loops.choices import OdometryFormat
+from sglpr_jax.odometry.config import OdometryFormat
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from sglpr_jax.data import Recording
+    from sglpr_jax.data.recording import Recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +144,7 @@ def open_with_poses(
     cloud map, the scans are those that its LiDAR would measure at the poses.
     """
     from sglpr_jax.data.formats.cloud_files import is_cloud_file
-    from sglpr_jax.loops.odometry import at_scans, is_own, own_odometry, read_odometry
+    from sglpr_jax.pose_graph.odometry_files import at_scans, is_own, own_odometry, read_odometry
 
     if is_cloud_file(root):
         return own_odometry(source.open(root, poses=path, pose_format=format), root)

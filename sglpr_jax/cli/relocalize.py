@@ -13,12 +13,12 @@ from sglpr_jax.cli.recording import OdometrySubmapOptions, RecordingOptions
 from sglpr_jax.cli.runtime import console, parse_command, run
 from sglpr_jax.data.choices import Scale, ScanFormat, SensorHeight
 from sglpr_jax.fields import CountOrNone
-from sglpr_jax.loops.choices import CANDIDATES, PlaceCount
+from sglpr_jax.loops.config import CANDIDATES, PlaceCount
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.same_place import NEGATIVE_M
 
 if TYPE_CHECKING:
-    from sglpr_jax.loops.relocated import Relocated
+    from sglpr_jax.maps.place_map import Relocated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,8 +63,8 @@ class RelocalizeCommand:
 def relocalize(command: RelocalizeCommand) -> "list[Relocated]":
     """Run the command. Returns the answers, the most probable first."""
     from sglpr_jax.files import check_writable, naming, write_json  # slow imports, not needed for --help
-    from sglpr_jax.loops.places import PlaceMap
-    from sglpr_jax.loops.query import query_of, read_query
+    from sglpr_jax.maps.place_map import PlaceMap
+    from sglpr_jax.maps.query import query_of, read_query
     from sglpr_jax.models.weights import weights_hash
     from sglpr_jax.models.weights_file import load
     from sglpr_jax.retrieval.index_rows import check_scale

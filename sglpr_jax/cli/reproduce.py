@@ -76,7 +76,7 @@ def parse(arguments: list[str] | None = None) -> ReproduceCommand:
 def reproduce(command: ReproduceCommand) -> Path:
     """Run the command. Returns the output folder."""
     from sglpr_jax.cli.datasets import dataset_root  # slow imports, not needed for --help
-    from sglpr_jax.data import recording_names
+    from sglpr_jax.data.readers import recording_names
     from sglpr_jax.reproduce.check import check
     from sglpr_jax.reproduce.plan import make_plan, time_a_step
     from sglpr_jax.reproduce.reproduction import chosen_experiments

@@ -27,7 +27,7 @@ from sglpr_jax.cli.config_file import ConfigFlags, flag_values
 from sglpr_jax.cli.defaults import default_command
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.fields import check_value, field_types, has_bounds
-from sglpr_jax.names import printable
+from sglpr_jax.files import printable
 
 _TABLE_WIDTH = 140
 _INSTALLED_AS = "sglpr-"

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from sglpr_jax.cli.recording import report_bad_scan, resolved_scale
 from sglpr_jax.cli.runtime import progress_bar, stop_on_signal
-from sglpr_jax.loops.config import OdometryConfig
+from sglpr_jax.odometry.config import OdometryConfig
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from sglpr_jax.data import Recording
     from sglpr_jax.data.choices import Scale
+    from sglpr_jax.data.recording import Recording
 
 AUTO = "auto"
 """Value of a flag for poses that are computed from the scans."""
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 def check_auto() -> None:
     """Raise ImportError if the extra `odometry` is not installed."""
-    from sglpr_jax.loops.scan_odometry import check_installed  # slow import, not needed for --help
+    from sglpr_jax.odometry.kiss_icp import check_installed  # slow import, not needed for --help
 
     check_installed()
 
@@ -63,7 +63,7 @@ def odometry_of(
       kept_in: Checkpoint file.
       skip_bad: Whether unreadable scans are reported and skipped.
     """
-    from sglpr_jax.loops.scan_odometry import about, scan_odometry
+    from sglpr_jax.odometry.kiss_icp import about, scan_odometry
 
     if not recording.has_images:
         print(about(recording, config, scale=scale), file=sys.stderr)

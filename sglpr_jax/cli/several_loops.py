@@ -14,20 +14,20 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from sglpr_jax.data import Recording
+    from sglpr_jax.data.recording import Recording
     from sglpr_jax.loops.config import DetectorConfig
-    from sglpr_jax.loops.find_between import FoundRecordings
+    from sglpr_jax.loops.search_between import FoundRecordings
 
 
 def search_several(command: Any, config: "DetectorConfig", *, unfinished: Path) -> int:
     """Search several recordings and write the results. Returns the exit status. `command` is a `LoopsCommand`."""
     from sglpr_jax.evaluation.page.of_loops import PAGE
     from sglpr_jax.evaluation.page.of_recordings import recordings_page
-    from sglpr_jax.loops.find_between import find_loops_between
-    from sglpr_jax.loops.joint_optimization import optimize_recordings
-    from sglpr_jax.loops.several_folder import write_several
-    from sglpr_jax.loops.unfinished import remove
+    from sglpr_jax.loops.checkpoint import remove
+    from sglpr_jax.loops.search_between import find_loops_between
     from sglpr_jax.models.weights_file import load
+    from sglpr_jax.pose_graph.folder import write_several
+    from sglpr_jax.pose_graph.optimize import optimize_recordings
 
     params = load(command.weights)
     if command.odometry == AUTO:
@@ -83,7 +83,7 @@ def _opened(command: Any) -> "tuple[list[Recording], list[Float[np.ndarray, 'n 4
 
 def _report(found: "FoundRecordings") -> None:
     """Print the results, and why a recording has no loops of its own."""
-    from sglpr_jax.loops.explanation import why_none
+    from sglpr_jax.loops.search import why_none
 
     print(found)
     for one in found.recordings:

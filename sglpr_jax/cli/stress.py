@@ -48,7 +48,7 @@ class StressCommand:
 
 def run_stress_test(command: StressCommand) -> Path:
     """Run the command. Returns the output folder."""
-    from sglpr_jax.data.corruption.corruptions import (
+    from sglpr_jax.data.corruption import (
         chosen_corruptions,  # slow imports, not needed for --help
     )
     from sglpr_jax.evaluation import figures

@@ -18,13 +18,13 @@ from sglpr_jax.cli.runtime import (
     stop_on_signal,
 )
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, SensorHeight
+from sglpr_jax.files import file_name
 from sglpr_jax.methods.names import BESIDE, BesideName
-from sglpr_jax.names import file_name
 from sglpr_jax.training.config import TrainConfig, without_untrained_head
 from sglpr_jax.training.presets import load_preset, preset_names
 
 if TYPE_CHECKING:
-    from sglpr_jax.data import Recording
+    from sglpr_jax.data.recording import Recording
     from sglpr_jax.training.recipe import TrainResult
 
 SETTINGS = ("seq", "data", "also", "pseudo_labels", "preset", "weights", "train_seq", "pose_source")

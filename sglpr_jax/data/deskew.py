@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from sglpr_jax.data.given_poses import poses_of_scans
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 
 TICK_S = 2e-5
 """Resolution of the times of points, in seconds. A point at 50 m moves by 3 mm in this time if the sensor turns by 180

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.poses import are_rotations
+from sglpr_jax.se3 import are_rotations
 
 
 def poses_of_scans(

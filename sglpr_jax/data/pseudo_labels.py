@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sglpr_jax.data.recording import Recording
-from sglpr_jax.names import file_name
+from sglpr_jax.files import file_name
 
 
 def with_pseudo_labels(recordings: Sequence[Recording], folder: Path) -> list[Recording]:

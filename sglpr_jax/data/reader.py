@@ -25,7 +25,7 @@ class ReadOptions:
     times: Path | None = None
     """File with one time per line."""
     time_unit: TimeUnit = "auto"
-    """Unit of the times in `times` and `poses`."""
+    """Unit of the times in `times` and `se3`."""
     pose_topic: str | None = None
     """Topic of the poses in a bag that has several."""
     imu_topic: str | None = None

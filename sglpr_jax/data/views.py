@@ -19,10 +19,9 @@ from sglpr_jax.bev import (
     rotate_labels,
     rotate_points,
 )
-from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.density_grid import check_density_grid
 from sglpr_jax.data.density_image import check_density_counts, density_bev, density_label_bev
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.grid import Grid, ImageKind
 
 _POINTS_STEP = 16384

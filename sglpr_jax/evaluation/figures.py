@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from sglpr_jax.evaluation.protocols import Decision
-from sglpr_jax.files import replacing
+from sglpr_jax.files import MOST_SHOWN, printable, replacing
 from sglpr_jax.labels import Taxonomy, taxonomy
 from sglpr_jax.metrics import PrecisionRecallCurve
-from sglpr_jax.names import MOST_SHOWN, printable
 
 if TYPE_CHECKING:
     import matplotlib.axes

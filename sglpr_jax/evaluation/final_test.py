@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, report
 from sglpr_jax.evaluation.protocols import Result
 from sglpr_jax.evaluation.scoring import score

@@ -5,7 +5,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from sglpr_jax.names import printable
+from sglpr_jax.files import printable
 
 MOST_SHOWN = 300
 """Maximum number of characters of a line of a cell."""

@@ -10,11 +10,11 @@ from jaxtyping import Float, Float32
 
 from sglpr_jax.evaluation.page.of_loops import overlay_of, wrong_loops
 from sglpr_jax.files import replacing
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import OptimizedTrajectory
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.transforms import transformed, travelled
+from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
+from sglpr_jax.se3 import transformed, travelled
 
 KEYFRAME_M = 5.0
 """Distance between two scans in the file, in metres."""

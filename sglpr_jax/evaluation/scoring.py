@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from rich.console import Console, ConsoleOptions
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation import report
 from sglpr_jax.evaluation.false_positives import FalsePositive, worst_false_positives
 from sglpr_jax.evaluation.inputs import Input, read_input
@@ -21,8 +21,7 @@ from sglpr_jax.evaluation.inputs.arrays import as_descriptors, as_trajectory
 from sglpr_jax.evaluation.plain_table import PlainTable
 from sglpr_jax.evaluation.protocols import Result, ScoredPairs, TopK, kind_of, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import chosen_protocols
-from sglpr_jax.files import naming
-from sglpr_jax.names import printable
+from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
 

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from rich.console import Console, ConsoleOptions
 from rich.table import Table
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures, report
 from sglpr_jax.evaluation.segmentation import (
     SegmentationResult,

@@ -16,8 +16,7 @@ from sglpr_jax.evaluation.protocols.choice import ALL
 from sglpr_jax.evaluation.protocols.source import positions_of
 from sglpr_jax.evaluation.published import NCLT_DATABASE, TABLE_3
 from sglpr_jax.evaluation.report import PrintsItself, format_score, table, to_json
-from sglpr_jax.files import naming
-from sglpr_jax.names import printable
+from sglpr_jax.files import naming, printable
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile, check_same_method
 
 APART_M = 25.0

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data import Recording
-from sglpr_jax.data.corruption.corrupted import corrupted
-from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION, Corruption, chosen_corruptions
+from sglpr_jax.data.corruption import CLEAN, ROTATION, Corruption, chosen_corruptions, corrupted
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import Result, protocol_named, protocols_taking
 from sglpr_jax.evaluation.protocols.choice import ALL, check_names

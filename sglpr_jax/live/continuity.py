@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.live.report import Report
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.se3 import inverse
 
 FASTEST_M_PER_S, SLACK_M = 60.0, 1.0
 """Maximum speed of a vehicle, and an additional distance between two scans, in metres."""

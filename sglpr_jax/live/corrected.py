@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from sglpr_jax.live.live_map import LiveMap
 from sglpr_jax.live.report import Report
-from sglpr_jax.loops.incremental import IncrementalTrajectory
+from sglpr_jax.pose_graph.incremental import IncrementalTrajectory
 
 
 class CorrectedTrajectory:

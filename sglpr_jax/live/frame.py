@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 
 
 class LiveFrame(NamedTuple):

@@ -19,9 +19,9 @@ from sglpr_jax.live.loop_log import LoopLog
 from sglpr_jax.live.mounting import FirstScans
 from sglpr_jax.live.report import Report
 from sglpr_jax.live.scan_bytes import LiveScan, from_bytes, to_bytes
+from sglpr_jax.loops.arguments import given_pose
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.given import given_pose
-from sglpr_jax.loops.loop import Loop
 
 FORMAT = "sglpr-jax live 3"
 JOURNAL, LOOPS = "journal.bin", "loops.jsonl"

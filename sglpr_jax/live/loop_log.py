@@ -6,8 +6,8 @@ from pathlib import Path
 
 from sglpr_jax.files import parse_json, writing
 from sglpr_jax.live.report import Report
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.loop_files import loop_lines, write_loops_jsonl
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.pose_graph.files import loop_lines, write_loops_jsonl
 
 
 class LoopLog:

@@ -7,7 +7,7 @@ import numpy as np
 from sglpr_jax.files import write_all
 from sglpr_jax.live.corrected import CorrectedTrajectory
 from sglpr_jax.live.live_map import LiveMap
-from sglpr_jax.loops.loop_files import write_joint_g2o, write_loops_csv, write_rejected_jsonl, write_tum
+from sglpr_jax.pose_graph.files import write_joint_g2o, write_loops_csv, write_rejected_jsonl, write_tum
 
 GRAPH, TABLE, REJECTED = "loops.g2o", "loops.csv", "rejected.jsonl"
 TRAJECTORY, CORRECTED = "trajectory.tum", "trajectory-optimized.tum"

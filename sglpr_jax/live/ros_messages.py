@@ -13,12 +13,10 @@ from jaxtyping import Float
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.livox import CUSTOM_MSG, read_custom_msg
-from sglpr_jax.data.formats.point_cloud2 import read_point_cloud2
-from sglpr_jax.data.formats.ros_message import Header, RosMessage
+from sglpr_jax.data.formats.ros_messages import CUSTOM_MSG, Header, RosMessage, read_custom_msg, read_point_cloud2
 from sglpr_jax.files import in_short
 from sglpr_jax.live.frame import LoopEdge
-from sglpr_jax.loops.transforms import quaternions
+from sglpr_jax.se3 import quaternions
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 CLOUDS = (CLOUD, CUSTOM_MSG[1])

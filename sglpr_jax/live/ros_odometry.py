@@ -7,10 +7,16 @@ from collections import defaultdict, deque
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.ros_message import RosMessage
-from sglpr_jax.data.formats.ros_poses import POSES, StampedPose, read_transforms
-from sglpr_jax.data.formats.ros_tracks import Track, fixed_transform, tracks_of
-from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.formats.ros_messages import (
+    POSES,
+    RosMessage,
+    StampedPose,
+    Track,
+    fixed_transform,
+    read_transforms,
+    tracks_of,
+)
+from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
 from sglpr_jax.live.report import Report
 from sglpr_jax.live.ros_messages import TRANSFORMS
 from sglpr_jax.live.ros_wire import Received

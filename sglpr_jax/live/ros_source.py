@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from sglpr_jax.data.record import found_record
+from sglpr_jax.data.recording import found_record
 from sglpr_jax.live.frame import LiveFrame
 from sglpr_jax.live.latest import Latest
 from sglpr_jax.live.report import Report

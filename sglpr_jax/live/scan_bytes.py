@@ -13,8 +13,8 @@ from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.files import in_short
 from sglpr_jax.loops.candidates import Compared
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.unfinished import COLUMNS, columns, compared_of
+from sglpr_jax.loops.checkpoint import COLUMNS, columns, compared_of
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.schema import Column, check_about, check_columns
 
 FORMAT = "sglpr-jax live scan 3"

@@ -6,26 +6,26 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from sglpr_jax.data.levelling import Mountings, upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.growing import GrowingArray
-from sglpr_jax.loops.background import Background
-from sglpr_jax.loops.compared_image import within_reach
+from sglpr_jax.loops.arguments import check_is
 from sglpr_jax.loops.comparison import NO_FITS, Candidate, Comparer, Fits, Query
-from sglpr_jax.loops.config import MOTION_DRIFT, CandidateConfig, DriftModel, VerificationConfig
-from sglpr_jax.loops.given import check_is
-from sglpr_jax.loops.motion import Link, Motion
-from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
-from sglpr_jax.loops.odometry_check import OdometryCheck
-from sglpr_jax.loops.pose_search import Peak, search_near
-from sglpr_jax.loops.seen import Seen, described
-from sglpr_jax.loops.spectra import query_spectra
-from sglpr_jax.loops.stored_scans import StoredScans, image_spectrum
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
-from sglpr_jax.loops.verification import refined
+from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.keyframes import Seen, StoredScans, described, image_spectrum
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.odometry.bev_odometry import Link, Motion
+from sglpr_jax.odometry.config import MOTION_DRIFT, DriftModel
+from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.registration.background import Background
+from sglpr_jax.registration.bev_alignment import refined
+from sglpr_jax.registration.bev_search import Peak, search_near
+from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import inverse, transform, yaw_of
 
 FLAT_M = 1e-6
 """Maximum difference in height of odometry that does not measure height, in metres."""

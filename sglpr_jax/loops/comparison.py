@@ -14,14 +14,15 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Complex64, Float, Float32, Int, UInt8
 
-from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
+from sglpr_jax.loops.closure import Planar, compose, inverted
+from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.drift import floor_deviations, planar_deviations, planar_spread
-from sglpr_jax.loops.motion import Motion
-from sglpr_jax.loops.planar import Planar, compose, inverted
-from sglpr_jax.loops.pose_search import NO_PEAKS, Peak, search_spectra
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.shortlist import coarse_correlations
-from sglpr_jax.loops.verification import Alignment, refined
+from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.registration.bev_alignment import Alignment, refined
+from sglpr_jax.registration.bev_search import NO_PEAKS, Peak, coarse_correlations, search_spectra
+from sglpr_jax.registration.config import VerificationConfig
 
 BATCH, COARSE_BATCH = 8, 32
 """Number of matches of a batch, of the exact and of the coarse comparison."""

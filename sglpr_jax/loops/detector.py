@@ -9,14 +9,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import expit, logit
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
+from sglpr_jax.loops.arguments import given_pose, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
+from sglpr_jax.loops.closure import Loop, Reason, Rejected, planar_loop
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.config import DetectorConfig
-from sglpr_jax.loops.given import given_pose, given_record, given_time
-from sglpr_jax.loops.loop import Loop, Reason, Rejected, planar_loop
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import LoopModel, default_model
-from sglpr_jax.loops.seen import Seen
 from sglpr_jax.loops.sequence import Pair, tested_log_odds, verdict
 from sglpr_jax.models.params import Params
 
@@ -127,7 +127,7 @@ class LoopDetector:
           seen: Descriptor and image, or None for a scan that cannot be read.
           time: Time of the scan, in seconds.
           odometry: Pose of the LiDAR in a fixed frame.
-          compared: Comparisons of an earlier run (`loops.unfinished`).
+          compared: Comparisons of an earlier run (`loops.checkpoint`).
           continues: See `add`.
         """
         candidates = self.finder.add_seen(seen, time=time, odometry=odometry, compared=compared, continues=continues)

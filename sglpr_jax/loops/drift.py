@@ -5,13 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.driven_path import Between, DrivenPath
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.mountings import AnyMounting
-from sglpr_jax.loops.planar import Planar, compose, frames_of, planar, planar_loops, wrapped
-from sglpr_jax.loops.transforms import travelled
-from sglpr_jax.loops.upright import upright_poses
+from sglpr_jax.data.levelling import AnyMounting, upright_poses
+from sglpr_jax.loops.closure import Loop, Planar, compose, frames_of, planar, planar_loops, wrapped
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import Between, DrivenPath
+from sglpr_jax.se3 import travelled
 
 GRAPH_M = 100.0
 """Travelled distance at which the drift of a pose graph equals that of the model, in metres."""

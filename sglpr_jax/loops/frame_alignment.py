@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.loops.config import DriftModel, SequenceConfig
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.planar import frames_of
-from sglpr_jax.loops.transforms import adjoint, inverse, moved_covariance
+from sglpr_jax.loops.closure import Loop, frames_of
+from sglpr_jax.loops.config import SequenceConfig
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import adjoint, inverse, moved_covariance
 
 ROUNDS = 20
 """Maximum number of Gauss-Newton steps."""

@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import logit
 
-from sglpr_jax.loops.config import ConsistencyConfig, DriftModel, SequenceConfig
+from sglpr_jax.data.levelling import AnyMounting
+from sglpr_jax.loops.closure import Loop, Reason
+from sglpr_jax.loops.config import ConsistencyConfig, SequenceConfig
 from sglpr_jax.loops.consistency import agree_along
-from sglpr_jax.loops.driven_path import DrivenPath
-from sglpr_jax.loops.loop import Loop, Reason
-from sglpr_jax.loops.mountings import AnyMounting
 from sglpr_jax.loops.probability import Evidence, LoopModel
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import DrivenPath
 
 BLOCK = 64
 """Number of pairs that are tested at a time, to limit memory."""

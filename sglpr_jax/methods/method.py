@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Shaped
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.grid import Grid, ImageKind
 
 Takes = Literal["images", "points", "labelled points"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
@@ -18,9 +18,9 @@ from sglpr_jax.methods.learned.method import LearnedMethod
 from sglpr_jax.methods.learned.weights_file import load_variables, method_of, variables_hash
 from sglpr_jax.methods.method import HandcraftedMethod, ImageMethod, Method, RecordMethod, ScanMethod
 from sglpr_jax.methods.names import NETWORK, SHIPPED, UNTRAINED
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
 from sglpr_jax.models.weights import weights_hash

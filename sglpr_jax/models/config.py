@@ -1,18 +1,215 @@
-"""Configuration of a model as plain values: the static part of its parameters.
-
-This file holds what all models share. Each backbone has its own configuration beside its layers. None of these files
-imports JAX, so a command line can list all fields quickly.
-"""
+"""Configuration of the paper's Swin-Unet."""
 
 import dataclasses
-from typing import Literal
+import math
+import typing
+from pathlib import Path
+from typing import Any, Literal
 
 from sglpr_jax.categories import RAW_IDS, Categories
 from sglpr_jax.data.density_grid import check_density_grid
-from sglpr_jax.fields import NotNegative, Size, SizeOrNone, Sizes, check_fields
+from sglpr_jax.fields import (
+    Depths,
+    NotNegative,
+    Share,
+    Size,
+    SizeOrNone,
+    Sizes,
+    check_fields,
+    field_types,
+    is_config,
+    read_value,
+    require,
+)
+from sglpr_jax.files import naming
 from sglpr_jax.grid import Grid, ImageKind
-from sglpr_jax.models.backbones.config import BackboneConfig
-from sglpr_jax.models.backbones.swin_config import SwinConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class SwinConfig:
+    """Swin-Unet with the paper's values as defaults. Stage i has `embed_dim` * 2**i channels."""
+
+    kind: Literal["swin"] = "swin"
+    patch: Size = 4
+    """Edge of a token's patch, in pixels of the image."""
+    embed_dim: Size = 96
+    depths: Depths = (2, 2, 2, 2)
+    """Number of blocks of each stage."""
+    heads: Sizes = (3, 6, 12, 24)
+    """Number of attention heads of each stage."""
+    window: Size = 7
+    """Edge of an attention window, in tokens."""
+    drop_path: Share = 0.2
+    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
+    block."""
+
+    def __post_init__(self):
+        check_fields(self)
+        check_stages(self.embed_dim, self.depths, self.heads)
+
+    @property
+    def token(self) -> tuple[int, int]:
+        """Rows and columns of the image that one token represents."""
+        return self.patch, self.patch
+
+    @property
+    def width(self) -> int:
+        """Channels of the tokens."""
+        return self.embed_dim
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        """The image's rows and columns must be a multiple of this, the size of one token of the coarsest stage."""
+        return (self.patch * 2 ** (len(self.depths) - 1),) * 2
+
+    @property
+    def needs_polar(self) -> bool:
+        """Always False: windows fit any image."""
+        return False
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Maps to draw as heat maps. Normalised maps are left out, because they have the same strength everywhere."""
+        last = len(self.depths) - 1
+        return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
+
+
+def check_stages(embed_dim: int, depths: tuple[int, ...], heads: tuple[int, ...]) -> None:
+    """Raises ValueError unless each stage has blocks and a number of heads that divides its channels.
+
+    Stage i has `embed_dim` * 2**i channels.
+    """
+    if not depths or len(depths) != len(heads):
+        raise ValueError(
+            f"expected at least one stage, and a number of heads for each, found depths {depths}, heads {heads}"
+        )
+    for i, number in enumerate(heads):
+        if embed_dim * 2**i % number:
+            raise ValueError(
+                f"heads: expected a divisor of the {embed_dim * 2**i} channels of stage {i}, found {number}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class CircularConfig:
+    """Circular convolutions on the polar image, with one block for each width."""
+
+    kind: Literal["circular"] = "circular"
+    average: Size = 2
+    """Edge of the squares of polar pixels that are averaged before the first block. Without averaging, the resampling
+    skips cells."""
+    fine: Sizes = ()
+    """Channels of additional blocks at the full number of sectors. The output of the i-th joins the input of the i-th
+    block of `widths`."""
+    widths: Sizes = (16, 32, 64, 96, 128, 160, 160)
+    """Channels of each block."""
+    strides: Sizes = (2, 2, 1, 2, 1, 1, 1)
+    """Stride of each block along the radius."""
+    means: Sizes = (1, 1, 2, 1, 2, 1, 1)
+    """Number of neighbouring sectors that are averaged into one after each block."""
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.widths:
+            raise ValueError("widths: expected at least one block, found ()")
+        if not len(self.widths) == len(self.strides) == len(self.means):
+            raise ValueError(
+                "expected equal numbers of widths, strides and means of the circular CNN, found "
+                f"widths {self.widths}, strides {self.strides}, means {self.means}"
+            )
+        if len(self.fine) > len(self.widths):
+            raise ValueError(
+                f"fine: expected at most one value for each width of the circular CNN, {self.widths}, found {self.fine}"
+            )
+
+    @property
+    def token(self) -> tuple[int, int]:
+        """Rows and columns of the polar image that one pixel of the last map represents."""
+        return self.average * math.prod(self.strides), self.average * math.prod(self.means)
+
+    @property
+    def width(self) -> int:
+        """Channels of the last map."""
+        return self.widths[-1]
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        """Numbers that must divide the rows and columns of the image: how many of its pixels one pixel of the last map
+        covers."""
+        return self.token
+
+    @property
+    def needs_polar(self) -> bool:
+        """Always True: the convolutions are circular."""
+        return True
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Maps to draw as heat maps: those of the first, the middle and the last block."""
+        last = len(self.widths) - 1
+        return {f"block {i + 1}": f"circular_block{i}" for i in sorted({0, last // 2, last})}
+
+
+@dataclasses.dataclass(frozen=True)
+class SglprConfig:
+    """Swin-Unet whose tokens come from circular convolutions on the polar image."""
+
+    kind: Literal["sglpr"] = "sglpr"
+    stem: CircularConfig = CircularConfig(fine=(14,), widths=(16, 32, 64), strides=(2, 2, 1), means=(1, 1, 2))
+    """Circular CNN that makes the tokens. Its last map has one pixel for each token."""
+    embed_dim: Size = 64
+    depths: Depths = (2, 2)
+    """Number of blocks of each stage."""
+    heads: Sizes = (2, 4)
+    """Number of attention heads of each stage."""
+    window: Size = 4
+    """Edge of an attention window, in tokens."""
+    mlp_ratio: Size = 2
+    """Hidden units of a block's MLP per channel; 4 in the paper."""
+    drop_path: Share = 0.0
+    """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
+    block."""
+
+    def __post_init__(self):
+        check_fields(self)
+        check_stages(self.embed_dim, self.depths, self.heads)
+
+    @property
+    def token(self) -> tuple[int, int]:
+        """Rows and columns of the polar image that one token represents."""
+        return self.stem.token
+
+    @property
+    def width(self) -> int:
+        """Channels of the tokens."""
+        return self.embed_dim
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        """The image's rows and columns must be a multiple of this, the size of one token of the coarsest stage."""
+        rows, columns = self.token
+        coarsest = 2 ** (len(self.depths) - 1)
+        return rows * coarsest, columns * coarsest
+
+    @property
+    def needs_polar(self) -> bool:
+        """Always True: the convolutions and windows wrap around."""
+        return True
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Maps to draw as heat maps: the stem, the first and last stage of the encoder, and the decoder."""
+        stem, last = len(self.stem.widths) - 1, len(self.depths) - 1
+        return {
+            "stem": f"circular_block{stem}",
+            "encoder, first": "enc0_out",
+            "encoder, last": f"enc{last}_out",
+            "decoder": f"dec{last}_out",
+        }
+
+
+BackboneConfig = SwinConfig | CircularConfig | SglprConfig
+
 
 WHITENING_POWER = 0.4
 """Default power of whitening: each principal component is divided by its spread raised to this power."""
@@ -47,7 +244,7 @@ class HeadConfig:
     pooling: Literal["netvlad", "mean", "spectrum"] = "netvlad"
     """Pooling of the map into one vector. `mean`: average pooling and a linear layer replace NetVLAD (table 4).
     `spectrum`: amplitudes of the map's Fourier transform along the sectors of a polar image
-    (models/heads/spectrum.py)."""
+    (models/place_head.py)."""
     clusters: Size = 64
     """Number of NetVLAD clusters."""
     descriptor_size: Size = 256
@@ -180,3 +377,125 @@ class ModelConfig:
         if self.head.reads_features:
             return {**self.backbone.pictures, **self.head.pictures}
         return self.head.pictures or {"input of the place head": "raw_input"}
+
+
+RENAMED = {"rings": "circular"}
+"""Kinds of backbones in files of earlier versions, and their names today."""
+REMOVED = (("backbone.stem", []),)
+"""Fields, with their values, that files of earlier versions have and today's configuration has not."""
+ADDED_LATER = {"head.means": (), "head.whiten": False, "backbone.fine": (), "backbone.stem.fine": ()}
+"""Values of fields that are missing in files of earlier versions."""
+
+
+def config_from_dict(values: Any, *, source: Path | str) -> ModelConfig:
+    """Rebuild a configuration from the output of `dataclasses.asdict`.
+
+    Every field is required, except the fields in `ADDED_LATER`.
+
+    Raises:
+      ValueError: If a field is missing, unknown or invalid. The message names `source`, the field, and the expected and
+        the found value.
+    """
+    with naming(source):
+        return _read(ModelConfig, values, field="")
+
+
+def _read(annotation: Any, value: Any, field: str) -> Any:
+    """Converts a value to a field's type, and dictionaries to dataclasses."""
+    value = _of_today(value, f"{field}." if field else "")
+    if is_config(annotation):
+        return _read_dataclass(annotation, value, field)
+    members = typing.get_args(annotation)
+    if any(map(is_config, members)):
+        return _read(_member(members, value, field), value, field)
+    return read_value(value, annotation, field)
+
+
+def _of_today(value: Any, prefix: str) -> Any:
+    """The fields of a file of an earlier version, without removed ones and with the present name of its `kind`."""
+    if not isinstance(value, dict):
+        return value
+    known = {name: one for name, one in value.items() if (prefix + name, one) not in REMOVED}
+    old = known.get("kind")
+    return {**known, "kind": RENAMED[old]} if isinstance(old, str) and old in RENAMED else known
+
+
+def _read_dataclass(expected: Any, value: Any, field: str) -> Any:
+    require(value, isinstance(value, dict), f"the fields of a {expected.__name__}", field)
+    prefix = f"{field}." if field else ""
+    annotations = field_types(expected)
+    older = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER}
+    value = {**older, **value}
+    unknown, missing = (min(map(str, names), default=None) for names in _differing(value, annotations))
+    every = f"the fields of a {expected.__name__} ({', '.join(annotations)})"
+    require(unknown, unknown is None, every, field)
+    if missing is not None:
+        raise ValueError(f"{field}{': ' if field else ''}expected {every}, found no {missing!r}")
+    read = {name: _read(annotations[name], one, prefix + name) for name, one in value.items()}
+    try:
+        return expected(**read)
+    except ValueError as error:  # the fields are inconsistent
+        raise ValueError(f"{prefix.removesuffix('.')}{': ' if prefix else ''}{error}") from error
+
+
+def _differing(value: dict[str, Any], annotations: dict[str, Any]) -> tuple[set[str], set[str]]:
+    return set(value) - set(annotations), set(annotations) - set(value)
+
+
+def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:
+    """The configuration of a union that has the `kind` of the value."""
+    configs: dict[str, Any] = {member.kind: member for member in members}
+    names = " or ".join(member.__name__ for member in members)
+    require(value, isinstance(value, dict), f"the fields of a {names}", field)
+    kind = value.get("kind")
+    require(kind, isinstance(kind, str) and kind in configs, f"a kind, {' or '.join(configs)}", field)
+    return configs[kind]
+
+
+_PAPER = ModelConfig()
+_POLAR = ModelConfig(
+    grid=Grid(resolution_m=0.4, height=128, width=128),
+    image="density",
+    field="circle",
+    blind_m=2.6,
+    range_channel=True,
+    polar=(64, 256),
+    backbone=SglprConfig(),
+    head=HeadConfig(tap="tokens", channels=(96, 128, 160), strides=(2, 1, 1), means=(1, 2, 1)),
+    detail=32,
+)
+
+MODELS: dict[str, ModelConfig] = {
+    # The default: the paper's parts in a form that follows rotations. Circular convolutions, then windows, CBAM and
+    # NetVLAD, on polar images of the window of the ready-made KITTI images (+-25.6 m).
+    "sglpr": _POLAR,
+    # A circular CNN with NetVLAD: less computation, without CBAM and attention.
+    "circular": dataclasses.replace(
+        _POLAR,
+        backbone=CircularConfig(),
+        head=HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=()),
+    ),
+    # The paper's model with a literal head: three 3 x 3 convolutions of stride 2 on 224 x 224 x 96.
+    "paper": _PAPER,
+    # All stages of the paper's Swin-Unet and its window, with cells of 0.4 m as in the ready-made KITTI images.
+    "paper-112": dataclasses.replace(
+        _PAPER, grid=Grid(resolution_m=0.4, height=112, width=112), image="density", backbone=SwinConfig(patch=2)
+    ),
+    # For tests: every part of the model, with little computation.
+    "tiny": ModelConfig(
+        grid=Grid(resolution_m=1.6, height=32, width=32),
+        backbone=SwinConfig(embed_dim=8, depths=(1, 1), heads=(1, 2), window=4, drop_path=0.1),
+        head=HeadConfig(channels=(8, 8, 16), kernels=(4, 3, 3), strides=(4, 2, 1), clusters=4),
+    ),
+}
+
+
+def model_preset(name: str) -> ModelConfig:
+    """Return the model configuration with this name.
+
+    Raises:
+      ValueError: If there is no preset with this name. The message lists all names.
+    """
+    if name not in MODELS:
+        raise ValueError(f"expected a model preset ({', '.join(MODELS)}), found {name!r}")
+    return MODELS[name]

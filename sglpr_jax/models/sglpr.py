@@ -1,4 +1,4 @@
-"""The whole SG-LPR network (figure 2): a shared backbone, the place head, and the segmentation head for training."""
+"""Maps the configuration of a backbone to its layers. Configurations do not import layers, which require JAX."""
 
 from typing import Any, NamedTuple
 
@@ -8,16 +8,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.models.backbones.build import build
-from sglpr_jax.models.backbones.interface import Backbone, Seen
-from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.heads.place import PlaceHead
-from sglpr_jax.models.heads.raw_input import raw_input
-from sglpr_jax.models.heads.segmentation import segmentation_head
+from sglpr_jax.models.backbone import Backbone, Seen
+from sglpr_jax.models.circular import CircularBackbone
+from sglpr_jax.models.config import BackboneConfig, CircularConfig, ModelConfig, SglprConfig, SwinConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.place_head import PlaceHead, raw_input
+from sglpr_jax.models.segmentation_head import segmentation_head
+from sglpr_jax.models.swin_on_circular import SglprBackbone
+from sglpr_jax.models.swin_unet import SwinBackbone
+
+
+def build(config: BackboneConfig, *, circular: bool) -> Backbone:
+    """Return the layers of a backbone. With `circular=True` the first and last columns of the image are neighbours."""
+    match config:
+        case SwinConfig():
+            return SwinBackbone(config, circular)
+        case CircularConfig():
+            return CircularBackbone(config)
+        case SglprConfig():
+            return SglprBackbone(config)
 
 
 class Outputs(NamedTuple):

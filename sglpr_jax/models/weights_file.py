@@ -13,8 +13,7 @@ import safetensors
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
 from sglpr_jax.files import check_holds_only, in_short, read_json, replacing
-from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.config_dict import config_from_dict
+from sglpr_jax.models.config import ModelConfig, config_from_dict
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.shipped import weights_folder
 from sglpr_jax.models.weights import as_tree, by_name, hash_of, weight_shapes

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from sglpr_jax.data import recording_names
+from sglpr_jax.data.readers import recording_names
 from sglpr_jax.evaluation import figures
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.registry import method_with_weights

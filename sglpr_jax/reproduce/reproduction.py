@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.protocols import PROTOCOLS
 from sglpr_jax.files import write_json, write_text

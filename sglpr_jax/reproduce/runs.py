@@ -5,17 +5,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sglpr_jax.data import Recording, open_recording, recording_names
 from sglpr_jax.data.choices import PoseChoice
-from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION
+from sglpr_jax.data.corruption import CLEAN, ROTATION
+from sglpr_jax.data.readers import open_recording, recording_names
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.evaluation.learning_curves import LearningCurves
-from sglpr_jax.files import read_json, write_json
+from sglpr_jax.files import file_name, read_json, write_json
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.method import Method
 from sglpr_jax.methods.registry import handcrafted, method_with_weights, network
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights_file import load
-from sglpr_jax.names import file_name
 from sglpr_jax.progress import Progress, no_progress
 from sglpr_jax.reproduce.experiments import VARIANTS, variant_config
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile

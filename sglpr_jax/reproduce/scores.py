@@ -5,7 +5,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.evaluation.protocols import PROTOCOLS, Result
 from sglpr_jax.evaluation.protocols.bevplace_nclt_recall import bevplace_nclt_recall
 from sglpr_jax.evaluation.published import TABLES

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sglpr_jax.retrieval.index_rows import check_asked, checked_rows
-from sglpr_jax.retrieval.place_rows import KEY, about_of, check_made_alike, usable
+from sglpr_jax.retrieval.parquet import KEY, about_of, check_made_alike, usable
 
 if TYPE_CHECKING:
     import pyarrow

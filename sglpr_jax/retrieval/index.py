@@ -33,7 +33,8 @@ from sglpr_jax.retrieval.index_rows import (
     new_places,
     places_of,
 )
-from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, are_recent
+from sglpr_jax.revisits import are_recent
+from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 from sglpr_jax.schema import check_about, check_columns, check_texts
 
 FORMAT = "sglpr-jax index 1"

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.views import rotated
 from sglpr_jax.methods.learned.describe import check_descriptors

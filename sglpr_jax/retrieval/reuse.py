@@ -1,5 +1,6 @@
 """Descriptor files of a method and a corruption, reused only if they were made with the same settings."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -9,9 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data import Recording
-from sglpr_jax.data.corruption.corrupted import corrupted
-from sglpr_jax.data.corruption.corruptions import CLEAN, ROTATION, Corruption
+from sglpr_jax.data.corruption import CLEAN, ROTATION, Corruption, corrupted
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.files import json_in_short
 from sglpr_jax.methods.method import Method
 from sglpr_jax.progress import Progress, no_progress
@@ -123,3 +123,25 @@ def _checked(path: Path, wanted: dict[str, Any]) -> DescriptorFile:
                 f"{json_in_short(found.get(name))}; choose another --out, or delete the file"
             )
     return file
+
+
+def scans_sample(recording: Recording) -> str:
+    """Hash the bytes of the first, the middle and the last scan file, or the points of these scans of a bag.
+
+    Sizes and times of files may agree by chance.
+    """
+    digest = hashlib.sha256()
+    for row in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
+        path = recording.paths[row]
+        if path.is_file():
+            digest.update(path.read_bytes())
+        elif recording.containers:
+            digest.update(_points(recording, row))
+    return digest.hexdigest()[:16]
+
+
+def _points(recording: Recording, row: int) -> bytes:
+    """Points of a scan as bytes. Empty if the scan cannot be read, which the search reports."""
+    with contextlib.suppress(ValueError, OSError):
+        return recording.points(row).tobytes()
+    return b""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.params import Params

@@ -76,7 +76,7 @@ class Carrier:
     def halted(self, rng: np.random.Generator, path: PlanarPath, *, poses: int) -> PlanarPath:
         """Inserts the halts into the drive along `path`, which must not stand.
 
-        The number of poses is a multiple of `poses`. The heading stays that of the path where the carrier reverses.
+        The number of poses is a multiple of `se3`. The heading stays that of the path where the carrier reverses.
         """
         if self.halt_every_s is None:
             return path

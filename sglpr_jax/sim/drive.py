@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times
-from sglpr_jax.poses import positions_from_camera
+from sglpr_jax.se3 import positions_from_camera
 from sglpr_jax.sim.choices import RATE_HZ
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
 from sglpr_jax.sim.routes import ROLES, STEP_M, plan_route, travelled
@@ -79,7 +79,7 @@ def plan_path(
 
 
 def timed(rng: np.random.Generator, line: Float[np.ndarray, "n 2"], *, free_mps: float, poses: int) -> PlanarPath:
-    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `poses`.
+    """Returns the drive along `line`, with a pose about every 0.1 s. The number of poses is a multiple of `se3`.
 
     `free_mps` is the mean speed on free streets, in m/s. The vehicle is slower in corners.
     """
@@ -116,7 +116,7 @@ def read_path(file: Path) -> PlanarPath:
 
 
 def name_of_path(file: Path) -> str:
-    """Name of the drive along a pose file: the stem of the file, or the name of its folder for a `poses.txt`."""
+    """Name of the drive along a pose file: the stem of the file, or the name of its folder for a `se3.txt`."""
     return file.resolve().parent.name if file.name == "poses.txt" else file.stem
 
 

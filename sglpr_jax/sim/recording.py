@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.submap import submaps
 from sglpr_jax.sim.carriers import HANDHELD, VEHICLE, Carrier, Motion
 from sglpr_jax.sim.choices import RATE_HZ

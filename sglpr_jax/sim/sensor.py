@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.poses import are_rotations
+from sglpr_jax.se3 import are_rotations
 from sglpr_jax.sim.ground_cast import GroundView, ground_view, meet_ground
 from sglpr_jax.sim.raycast import COLUMNS, Candidates, Chance, find_candidates, nearest_hit, sector_count
 from sglpr_jax.sim.returns import Surface, echo_returns, mix_edges, nearer, reflectivity, surface_of_shapes

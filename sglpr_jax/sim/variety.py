@@ -9,8 +9,7 @@ import zlib
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from sglpr_jax.data.corruption.corruptions import Corruption, corrupt
-from sglpr_jax.data.corruption.laser_rings import ring_numbers
+from sglpr_jax.data.corruption import Corruption, corrupt, ring_numbers
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.views import rotated
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.batch import Batch, read_batch
 from sglpr_jax.data.sampling.mixing import mix
 from sglpr_jax.data.sampling.tuples import TuplePool

@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from sglpr_jax.data import Recording
-from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.data.packed import packed
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.held_out import hold_out
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.models.params import Params

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.models.params import Params
 from sglpr_jax.training.config import TrainConfig

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 from scipy.spatial.distance import cdist
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.metrics import decision_curve
 from sglpr_jax.models.params import Params

@@ -12,7 +12,7 @@ from unittest import mock
 
 import pytest
 
-from sglpr_jax.sim import Sensor
+from sglpr_jax.sim.sensor import Sensor
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ROOT / "tests" / "tiny.py"

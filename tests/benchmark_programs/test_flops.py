@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from sglpr_jax.models.backbones.swin_layers import SwinBlock
+from sglpr_jax.models.swin import SwinBlock
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import pytest
 
 import sglpr_jax
 from benchmarks.learned.leaderboard_page import page_of
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 
 from .programs import ROOT, TINY, printed
 

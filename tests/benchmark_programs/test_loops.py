@@ -10,7 +10,7 @@ from recordings import of_scans
 import sglpr_jax
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.probability import ALL, default_model
-from sglpr_jax.sim import write_dataset
+from sglpr_jax.sim.dataset import write_dataset
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.repeating import simulate_repeating

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.sim import write_dataset
+from sglpr_jax.sim.dataset import write_dataset
 
 from .programs import SENSOR, printed, table
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sglpr_jax.sim import write_dataset
+from sglpr_jax.sim.dataset import write_dataset
 
 from .programs import SENSOR, TINY, printed, table
 

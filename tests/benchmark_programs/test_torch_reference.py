@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, SglprConfig, SwinConfig, model_preset
 from sglpr_jax.models.sglpr import describe, segment
 from sglpr_jax.training.config import TrainConfig
 

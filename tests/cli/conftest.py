@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.sim import Sensor, write_dataset
+from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.sensor import Sensor
 
 SCANS = 40
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)

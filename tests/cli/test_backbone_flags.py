@@ -3,8 +3,7 @@
 import pytest
 
 from sglpr_jax.cli import reproduce, train
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.swin_config import SwinConfig
+from sglpr_jax.models.config import CircularConfig, SwinConfig
 
 
 @pytest.mark.parametrize(

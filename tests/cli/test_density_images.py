@@ -8,7 +8,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.bev import even_cells
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import rotated
 from sglpr_jax.models.params import Params

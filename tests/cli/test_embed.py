@@ -15,7 +15,7 @@ from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.names import AnyMethodName
 from sglpr_jax.retrieval.distances import distance_function
-from sglpr_jax.retrieval.place_store import read_places, stored_places
+from sglpr_jax.retrieval.parquet import read_places, stored_places
 
 from .conftest import assert_one_line_error
 

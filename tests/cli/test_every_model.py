@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
-from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.sim import write_dataset
+from sglpr_jax.models.config import CircularConfig, HeadConfig, SglprConfig
+from sglpr_jax.sim.dataset import write_dataset
 
 from .conftest import SENSOR, Ended, assert_one_line_error, run_command
 

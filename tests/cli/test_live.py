@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from sglpr_jax.files import half_written
-from sglpr_jax.loops.loop_files import read_g2o, read_loops_jsonl
-from sglpr_jax.loops.transforms import inverse, quaternions
-from sglpr_jax.sim import Sensor
+from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl
+from sglpr_jax.se3 import inverse, quaternions
 from sglpr_jax.sim.recording import simulate_recording
+from sglpr_jax.sim.sensor import Sensor
 
 from .conftest import assert_one_line_error, run_command
 

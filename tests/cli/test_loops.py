@@ -8,14 +8,15 @@ import pytest
 from sglpr_jax.cli.detector_config import detector_config
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
-from sglpr_jax.loops import find
-from sglpr_jax.loops.config import DetectorConfig, DriftModel
-from sglpr_jax.loops.loop import Loop, Rejected
-from sglpr_jax.loops.loop_files import read_g2o, read_loops_jsonl, write_kitti, write_tum
-from sglpr_jax.loops.unfinished import alone
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.loops import search
+from sglpr_jax.loops.checkpoint import alone
+from sglpr_jax.loops.closure import Loop, Rejected
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.models.weights_file import load
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.pose_graph.files import read_g2o, read_loops_jsonl, write_kitti, write_tum
 
 from .conftest import SCANS, assert_one_line_error
 
@@ -43,7 +44,7 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
         "trajectory-optimized.tum",
         "trajectory-optimized.kitti",
     }
-    expected = find.find_loops(open_recording(town, "08"), load("sglpr"), odometry=odometry, config=TWICE)
+    expected = search.find_loops(open_recording(town, "08"), load("sglpr"), odometry=odometry, config=TWICE)
     found = read_loops_jsonl(out / "loops.jsonl")
     assert [(loop.query, loop.match) for loop in found] == [(loop.query, loop.match) for loop in expected.loops]
     assert ended.out.splitlines()[0] == str(expected)
@@ -59,7 +60,7 @@ def test_files_and_page_are_those_of_the_library(command, town, odometry, tmp_pa
 
 @pytest.mark.slow
 def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, town, tmp_path, monkeypatch):
-    find_loops = find.find_loops
+    find_loops = search.find_loops
 
     def stopped(recording, params, *, should_stop, on_progress, **options):
         done = []
@@ -75,7 +76,7 @@ def test_without_odometry_and_stopped_by_ctrl_c_what_was_found_is_kept(command, 
         should_stop.signal = 2
         return True
 
-    monkeypatch.setattr(find, "find_loops", stopped)
+    monkeypatch.setattr(search, "find_loops", stopped)
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == 130
     assert ended.out.startswith("0 loops in 5 of 40 frames of 08")
@@ -89,9 +90,9 @@ def test_a_signal_after_the_last_scan_stops_what_is_left_and_no_more(
 ):
     def ended_meanwhile(recording, params, *, should_stop, **options):
         should_stop.signal = 2
-        return find.FoundLoops(recording, len(recording), (), (), None, unregistered=unregistered)
+        return search.FoundLoops(recording, len(recording), (), (), None, unregistered=unregistered)
 
-    monkeypatch.setattr(find, "find_loops", ended_meanwhile)
+    monkeypatch.setattr(search, "find_loops", ended_meanwhile)
     ended = command("loops", town, "--seq", "08", "--out", tmp_path / "found")
     assert ended.status == status, ended.error
     assert ("run the same command again to continue" in ended.error) == bool(status)
@@ -115,9 +116,9 @@ def test_rejected_pairs_and_missing_loops_are_explained(command, town, tmp_path,
     unsure = Loop(35, 1, np.eye(4), np.diag([4.0, 0.01, 1, 1, 1, 1]), 0.995)
 
     def some(recording, params, **options):
-        return find.FoundLoops(recording, SCANS, (unsure,), (Rejected(unsure, "repeats"),), None)
+        return search.FoundLoops(recording, SCANS, (unsure,), (Rejected(unsure, "repeats"),), None)
 
-    monkeypatch.setattr(find, "find_loops", some)
+    monkeypatch.setattr(search, "find_loops", some)
     run = ("loops", town, "--seq", "08", "--out", tmp_path / "found")
     kept = command(*run)
     repeats = "rejected, repeats (1): Another place, or another pose, fits about as well."
@@ -242,10 +243,10 @@ def test_scans_are_registered_if_they_can_be(
 
     def searched(recording, params, *, registered, **options):
         asked.append(registered)
-        return find.FoundLoops(recording, len(recording), (), (), None)
+        return search.FoundLoops(recording, len(recording), (), (), None)
 
-    monkeypatch.setattr(find, "find_loops", searched)
-    monkeypatch.setattr(find, "is_installed", lambda: installed)
+    monkeypatch.setattr(search, "find_loops", searched)
+    monkeypatch.setattr(search, "is_installed", lambda: installed)
     source = (town, "--seq", "08") if layout == "town" else (images, "--seq", "06")
     ended = command("loops", *source, "--out", tmp_path / "found", *flags)
     assert ended.status == 0 and asked == [registered], ended.error

@@ -7,12 +7,12 @@ import pytest
 from bags import TRANSFORMS, header, transforms, typestore, write_bag
 
 from sglpr_jax.data.formats.pose_files import read_tum
-from sglpr_jax.loops.loop_files import read_g2o, write_tum
-from sglpr_jax.loops.optimization import trajectory_error
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.transforms import inverse, quaternions, transform
-from sglpr_jax.sim import Sensor
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.pose_graph.files import read_g2o, write_tum
+from sglpr_jax.pose_graph.optimize import trajectory_error
+from sglpr_jax.se3 import inverse, quaternions, transform
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
+from sglpr_jax.sim.sensor import Sensor
 
 from .conftest import assert_one_line_error
 

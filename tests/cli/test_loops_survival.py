@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from sglpr_jax.cli.config_file import COMMAND_FILE
-from sglpr_jax.data import open_recording
-from sglpr_jax.loops.loop_files import write_tum
-from sglpr_jax.sim import Sensor, write_dataset
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.sensor import Sensor
 
 pytestmark = pytest.mark.slow
 SCANS = 130

@@ -9,14 +9,14 @@ from rich.console import Console
 
 import sglpr_jax
 from sglpr_jax.cli.relocalize import _table
-from sglpr_jax.data import open_recording
-from sglpr_jax.loops import map_recording as recorded
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.loop_files import write_tum
-from sglpr_jax.loops.map_recording import map_recording
-from sglpr_jax.loops.places import PlaceMap, Relocated
-from sglpr_jax.loops.unfinished import alone
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.loops.checkpoint import alone
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.maps import build as recorded
+from sglpr_jax.maps.build import map_recording
+from sglpr_jax.maps.place_map import PlaceMap, Relocated
 from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.pose_graph.files import write_tum
 from sglpr_jax.retrieval.index import Index
 
 from .conftest import SCANS, assert_one_line_error

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 
 from .conftest import assert_one_line_error
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data import open_recording
-from sglpr_jax.loops.loop_files import write_tum
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.pose_graph.files import write_tum
 
 from .conftest import SCANS, assert_one_line_error
 

@@ -8,7 +8,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.cli.train import parse
-from sglpr_jax.models.presets import MODELS, model_preset
+from sglpr_jax.models.config import MODELS, model_preset
 from sglpr_jax.training.config import TrainConfig
 from sglpr_jax.training.presets import load_preset, preset_names
 

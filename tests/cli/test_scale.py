@@ -5,7 +5,7 @@ import json
 import pytest
 
 import sglpr_jax
-from sglpr_jax.loops.places import PlaceMap
+from sglpr_jax.maps.place_map import PlaceMap
 
 from .conftest import assert_one_line_error
 from .test_submaps import drive  # noqa: F401

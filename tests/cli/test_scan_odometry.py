@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.formats.pose_files import read_tum
-from sglpr_jax.loops import scan_odometry
+from sglpr_jax.odometry import kiss_icp
 from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.sensor import Sensor
 
@@ -69,7 +69,7 @@ def test_a_map_of_scans_alone(command, run, tmp_path):
 
 
 def test_an_interrupted_run_keeps_its_odometry(command, run, tmp_path, monkeypatch):
-    out, compute = tmp_path / "found", scan_odometry.scan_odometry
+    out, compute = tmp_path / "found", kiss_icp.scan_odometry
 
     def stopped(recording, *, should_stop, on_progress, **options):
         def count(done):
@@ -77,7 +77,7 @@ def test_an_interrupted_run_keeps_its_odometry(command, run, tmp_path, monkeypat
 
         return compute(recording, should_stop=should_stop, on_progress=count, **options)
 
-    monkeypatch.setattr(scan_odometry, "scan_odometry", stopped)
+    monkeypatch.setattr(kiss_icp, "scan_odometry", stopped)
     ended = command("loops", *run, "--odometry", "auto", "--out", out)
     assert ended.status == 130
     assert f"odometry of 3 of {SCANS} scans; run the same command again to continue\n" in ended.out

@@ -8,8 +8,8 @@ from sglpr_jax.cli import loops
 from sglpr_jax.cli.loops import LoopsCommand
 from sglpr_jax.cli.runtime import parse_command
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
-from sglpr_jax.loops.loop_files import write_tum
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.se3 import transform
 
 from .conftest import SCANS, assert_one_line_error
 

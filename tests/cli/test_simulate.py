@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
-from sglpr_jax.sim import SENSORS
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.sim.sensor import SENSORS
 
 from .conftest import assert_one_line_error
 

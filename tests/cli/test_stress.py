@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data.corruption.corruptions import CORRUPTIONS
-from sglpr_jax.sim import Sensor, write_dataset
+from sglpr_jax.data.corruption import CORRUPTIONS
+from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.sensor import Sensor
 
 from .conftest import assert_one_line_error
 

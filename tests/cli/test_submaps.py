@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.loops.loop_files import write_tum
+from sglpr_jax.pose_graph.files import write_tum
 
 from .conftest import assert_one_line_error
 

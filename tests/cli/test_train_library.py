@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.models.weights_file import load
 from sglpr_jax.models.whitening import whitened

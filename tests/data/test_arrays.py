@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from laspy.vlrs.vlrlist import VLRList
 
-from sglpr_jax.data.formats import scan_size
+from sglpr_jax.data.formats import cloud_text
 from sglpr_jax.data.formats.arrays import read_npy, read_npz
 from sglpr_jax.data.formats.las import read_las
 from sglpr_jax.data.readers.scan_folder import open_recording
@@ -88,7 +88,7 @@ def test_headers_that_declare_another_size_than_the_file_has(tmp_path, shape):
 
 
 def test_an_archive_that_inflates_is_refused_before_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(scan_size, "MOST_BYTES", 10**6)
+    monkeypatch.setattr(cloud_text, "MOST_BYTES", 10**6)
     monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("memory was allocated"))
     np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**5, 3), np.float32))
     assert (tmp_path / "a.npz").stat().st_size < 10**4

@@ -5,8 +5,8 @@ import pytest
 from bags import FILES, TRANSFORMS, header, transforms, typestore, write_bag
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data import open_recording, recording_names
-from sglpr_jax.data.formats.timed_poses import interpolate, interpolate_turns
+from sglpr_jax.data.poses import interpolate, interpolate_turns
+from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.warning import DataWarning
 
 CLOUD, ODOMETRY, POSE = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"

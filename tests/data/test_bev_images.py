@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data.formats import grey_png
+from sglpr_jax.data.formats import png
 from sglpr_jax.data.readers.bev_images import open_recording, read_image, recording_names
 
 
@@ -106,7 +106,7 @@ def png_of(width: int, height: int, data: bytes, *, interlaced: int = 0) -> byte
 )
 def test_a_png_whose_header_lies_is_refused(tmp_path, monkeypatch, width, height, data, message):
     (tmp_path / "a.png").write_bytes(png_of(width, height, zlib.compress(data)))
-    monkeypatch.setattr(grey_png.Image, "open", lambda path: pytest.fail("the image was opened"))
+    monkeypatch.setattr(png.Image, "open", lambda path: pytest.fail("the image was opened"))
     with pytest.raises(ValueError, match=rf"a\.png: expected an 8-bit grey PNG, found .*{message}"):
         read_image(tmp_path / "a.png")
 
@@ -124,7 +124,7 @@ def test_data_that_inflates_is_not_inflated_beyond_the_declared_size(tmp_path, m
 
         eof = property(lambda self: self._real.eof)
 
-    monkeypatch.setattr(grey_png.zlib, "decompressobj", Inflating)
+    monkeypatch.setattr(png.zlib, "decompressobj", Inflating)
     (tmp_path / "a.png").write_bytes(png_of(64, 64, zlib.compress(bytes(10**7))))
     with pytest.raises(ValueError, match=r"a\.png"):
         read_image(tmp_path / "a.png")
@@ -139,7 +139,7 @@ def test_interlaced_images_are_read_and_must_be_whole(tmp_path, shape):
     data = b"".join(b"\0" + row.tobytes() for part in parts if part.size for row in part)
     path = tmp_path / "a.png"
     path.write_bytes(png_of(shape[1], shape[0], zlib.compress(data), interlaced=1))
-    np.testing.assert_array_equal(grey_png.read_grey_png(path, bits=8), np.rot90(grey, -1))
+    np.testing.assert_array_equal(png.read_grey_png(path, bits=8), np.rot90(grey, -1))
     path.write_bytes(png_of(shape[1], shape[0], zlib.compress(data[:-1]), interlaced=1))
     with pytest.raises(ValueError, match=r"a\.png: .*but the data has another size"):
         read_image(path)

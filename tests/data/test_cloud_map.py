@@ -4,12 +4,11 @@ import laspy
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.cloud_map import TILE_M, tiled_cloud
 from sglpr_jax.data.formats import las
 from sglpr_jax.data.formats.cloud_files import cloud_blocks
-from sglpr_jax.data.readers import cloud_map
+from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
-from sglpr_jax.data.tiled_cloud import TILE_M, tiled_cloud
 from sglpr_jax.data.warning import DataWarning
 
 HEIGHT_M = 1.5
@@ -156,7 +155,7 @@ def test_damaged_and_too_large_maps(tmp_path, monkeypatch):
     way = write_tum(tmp_path / "way.tum", along())
     with pytest.raises(ValueError, match=r"town\.pcd: expected a .pcd file of a map.*points of 24 bytes, found"):
         open_recording(path, poses=way)
-    monkeypatch.setattr("sglpr_jax.data.tiled_cloud.MOST_POINTS", 100)
+    monkeypatch.setattr("sglpr_jax.data.cloud_map.MOST_POINTS", 100)
     with pytest.raises(ValueError, match=r"town\.pcd: expected at most 100 points in voxels of 0\.1 m .*cut the cloud"):
         open_recording(write_pcd(path, street()), poses=way)
     write_pcd(path, np.full((3, 3), np.nan))

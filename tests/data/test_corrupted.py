@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from recordings import with_points
 
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.corruption.corrupted import corrupted
-from sglpr_jax.data.corruption.corruptions import CORRUPTIONS, ROTATION, Corruption
+from sglpr_jax.data.corruption import CORRUPTIONS, ROTATION, Corruption, corrupted
+from sglpr_jax.data.readers import open_recording
 
 ON_POINTS = [corruption for corruption in CORRUPTIONS if corruption != ROTATION]
 by_name = pytest.mark.parametrize("corruption", ON_POINTS, ids=lambda corruption: corruption.name)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sglpr_jax.bev import rotate_points
-from sglpr_jax.data.corruption.corruptions import (
+from sglpr_jax.data.corruption import (
     CLEAN,
     CORRUPTIONS,
     ROTATION,

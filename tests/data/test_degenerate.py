@@ -10,15 +10,14 @@ import pytest
 from recordings import of_images, of_scans
 
 import sglpr_jax
-from sglpr_jax.data.degenerate import check_cloud
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.data.views import view
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.registry import handcrafted
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 
 GOOD = np.random.default_rng(0).uniform(-15, 15, (400, 3)).astype(np.float32)
 BAD = {

@@ -7,8 +7,8 @@ import pytest
 from bags import CLOUD, FILES, TRANSFORMS, cloud, header, transforms, typestore, write_bag
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.warning import DataWarning
 
 IMU, DURATION_S, BEGIN_S = "sensor_msgs/msg/Imu", 40.0, 1000.0

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.categories import RAW_NAMES
-from sglpr_jax.data.formats.label_images import label_image_pixels, read_label_image
+from sglpr_jax.data.formats.png import label_image_pixels, read_label_image
 from sglpr_jax.data.readers.bev_images import read_image
 
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data import open_recording, read_scan
-from sglpr_jax.data.corruption.laser_rings import keep_rings, ring_numbers
-from sglpr_jax.data.formats.scan_files import read_scan_records
+from sglpr_jax.data.corruption import keep_rings, ring_numbers
+from sglpr_jax.data.formats.scan_files import read_scan, read_scan_records
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.sim.sensor import HDL64E_DEG
 
 

@@ -6,9 +6,8 @@ from bags import FILES, header, typestore, write_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.formats.livox import read_custom_msg
-from sglpr_jax.data.formats.ros_message import RosMessage
+from sglpr_jax.data.formats.ros_messages import RosMessage, read_custom_msg
+from sglpr_jax.data.readers import open_recording
 
 DRIVERS = ("livox_ros_driver", "livox_ros_driver2")
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data.formats.lzf import decompress_lzf
+from sglpr_jax.data.formats.pcd import decompress_lzf
 
 
 def compress(data: bytes) -> bytes:

@@ -11,11 +11,11 @@ from recordings import of_images, of_scans
 
 import sglpr_jax
 from sglpr_jax.data import mounted as mounted_module
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.density_image import density_bev
 from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting, common_mounting, estimate_mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool
@@ -23,7 +23,7 @@ from sglpr_jax.data.views import view
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.grid import Grid
 from sglpr_jax.methods.registry import handcrafted
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 
 
 def street(seed: int, *, height: float = MODEL_HEIGHT_M, n: int = 6000) -> np.ndarray:

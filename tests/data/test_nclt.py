@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sglpr_jax.bev import rasterize
-from sglpr_jax.data import open_recording, read_scan, recording_names
-from sglpr_jax.data.corruption.corrupted import corrupted
-from sglpr_jax.data.corruption.corruptions import Corruption
+from sglpr_jax.data.corruption import Corruption, corrupted
 from sglpr_jax.data.formats.bin_records import NCLT_RECORD
-from sglpr_jax.data.formats.timed_poses import nearest_rows
+from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
-from sglpr_jax.data.readers import nclt
+from sglpr_jax.data.poses import nearest_rows
+from sglpr_jax.data.readers import nclt, open_recording, recording_names
 from sglpr_jax.grid import Grid
 
 DATE = "2012-01-15"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 
 MICRO = 1532402927647951
 TWICE = f"samples/LIDAR_TOP/n015__LIDAR_TOP__{MICRO}.pcd.bin"

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 
 
 def test_kitti(kitti_root):

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.cache import packed as packing
-from sglpr_jax.data.cache.packed import packed
-from sglpr_jax.data.corruption.corrupted import corrupted
-from sglpr_jax.data.corruption.corruptions import CORRUPTIONS
+from sglpr_jax.data import packed as packing
+from sglpr_jax.data.corruption import CORRUPTIONS, corrupted
+from sglpr_jax.data.packed import packed
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording, recording_names
-from sglpr_jax.data.cache.packed import packed
+from sglpr_jax.data.packed import packed
+from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.retrieval.reuse import fingerprint
 
 POINTS = np.array([[4.0, 10.0, -1.0], [-3.0, 20.0, 2.0]])

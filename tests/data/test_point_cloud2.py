@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from clouds import CODES, DRIVERS, cloud, points_of
 
-from sglpr_jax.data.formats.point_cloud2 import described_fields, read_point_cloud2
+from sglpr_jax.data.formats.ros_messages import described_fields, read_point_cloud2
 from sglpr_jax.data.warning import DataWarning
 
 

@@ -8,11 +8,11 @@ from bags import CLOUD, FILES, cloud, write_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.pcd import pcd_records
 from sglpr_jax.data.formats.ply import ply_records
 from sglpr_jax.data.point_times import TimeField
-from sglpr_jax.data.record import Record, scan_record
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.recording import Record, scan_record
 
 POINTS, EPOCH_S = 200, 1_700_000_000.25
 WITHIN = np.linspace(0, 0.0997, POINTS)

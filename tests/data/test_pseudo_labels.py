@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.pseudo_labels import with_pseudo_labels
-from sglpr_jax.names import file_name
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.files import file_name
 
 
 def write_map(path, raw: int) -> None:

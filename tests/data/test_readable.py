@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from recordings import of_images, of_scans, with_points
 
-from sglpr_jax.data.readable import readable
+from sglpr_jax.data.scan_stream import readable
 
 CLOUDS = {Path(f"{i}.bin"): np.full((5, 3), i + 1, np.float32) for i in range(4)}
 

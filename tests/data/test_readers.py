@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording, readers, recording_names
+from sglpr_jax.data import readers
+from sglpr_jax.data.readers import open_recording, recording_names
 
 MULE = """
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.recording import Recording
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.corruption.corrupted import corrupted
-from sglpr_jax.data.corruption.corruptions import Corruption
+from sglpr_jax.data.corruption import Corruption, corrupted
 from sglpr_jax.data.formats import bin_records, scan_files
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats import record_size
-from sglpr_jax.data.formats.bin_records import read_records
-from sglpr_jax.data.formats.record_size import find_record, unusual_record
+from sglpr_jax.data.formats import bin_records
+from sglpr_jax.data.formats.bin_records import find_record, read_records, unusual_record
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.readers import kitti
 from sglpr_jax.data.readers.scan_folder import open_recording
@@ -113,7 +112,7 @@ def test_a_file_that_fails_while_it_is_read_does_not_hide_it(tmp_path, monkeypat
             raise OSError(5, "Input/output error")
         return read_records(path, format)
 
-    monkeypatch.setattr(record_size, "read_records", read)
+    monkeypatch.setattr(bin_records, "read_records", read)
     assert find_record(sorted(tmp_path.iterdir()))[0] == "float32x6"
 
 
@@ -184,8 +183,8 @@ def test_own_scans_in_the_layout_of_kitti(kitti_root):
 
 def test_the_share_that_differs_from_turn_to_turn():
     a, b = np.arange(100.0), np.arange(100.0) + 25
-    assert record_size._apart(a, b) == pytest.approx(0.25)
-    assert record_size._apart(a, a) == 0
+    assert bin_records._apart(a, b) == pytest.approx(0.25)
+    assert bin_records._apart(a, a) == 0
 
 
 @pytest.mark.parametrize("format", ["float32x3", "float64x5"])

@@ -11,10 +11,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from sglpr_jax.data import open_recording, recording_names
-from sglpr_jax.data.formats import inflation
-from sglpr_jax.data.readable import readable
-from sglpr_jax.data.readers import ros
+from sglpr_jax.data.formats import ros_bag
+from sglpr_jax.data.readers import open_recording, recording_names, ros
+from sglpr_jax.data.scan_stream import readable
 
 
 def write(
@@ -123,8 +122,8 @@ def test_compressed_bags(tmp_path, name):
 def test_parts_that_inflate_beyond_the_bound_are_refused(tmp_path, name, monkeypatch):
     kind, compression = COMPRESSIONS[name]
     path = write(tmp_path / KINDS[kind], kind, compression=compression)
-    monkeypatch.setattr(inflation, "MOST_BYTES", 100)
-    monkeypatch.setattr(inflation, "INFLATION", 1)
+    monkeypatch.setattr(ros_bag, "MOST_BYTES", 100)
+    monkeypatch.setattr(ros_bag, "INFLATION", 1)
     most = "1 times the size" if "files" in name else "100 "
     with pytest.raises(ValueError, match=rf"expected an intact ROS bag, found .*at most {most}"):
         open_recording(path)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 
 OXFORD = ("pointcloud_20m_10overlap", "pointcloud_locations_20m_10overlap.csv")
 DISTRICT = ("pointcloud_25m_25", "pointcloud_centroids_25.csv")

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
-from sglpr_jax.data.formats.pose_files import read_times, read_tum
-from sglpr_jax.data.formats.ros_tracks import Stamps
-from sglpr_jax.data.formats.timed_poses import match_times
-from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.formats.pose_files import read_times, read_trajectory, read_tum
+from sglpr_jax.data.formats.ros_messages import Stamps
+from sglpr_jax.data.poses import match_times
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.times import PER_SECOND, check_jumps, counts_rows, doubt, times_of, unit_change
 from sglpr_jax.data.warning import DataWarning
 

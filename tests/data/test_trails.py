@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.trails import on_trail
+from sglpr_jax.data.cloud_map import on_trail
 
 
 def plane(x, y, step=0.1):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.formats.pose_files import read_trajectory
 from sglpr_jax.data.warning import DataWarning
 
 KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n"

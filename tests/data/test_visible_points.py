@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sglpr_jax.data.visible_points import BEHIND_M, NEAREST_M, RAY_DEG, visible_points
+from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, RAY_DEG, visible_points
 
 SPACING_M = 0.1
 CLOUDS = arrays(np.float32, st.tuples(st.integers(0, 60), st.just(3)), elements=st.floats(-30, 30, width=16))

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 import sglpr_jax
-from sglpr_jax.loops.loop_files import write_tum
 from sglpr_jax.methods.registry import method_named
-from sglpr_jax.sim import Sensor, write_dataset
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.sensor import Sensor
 
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 

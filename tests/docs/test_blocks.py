@@ -11,7 +11,7 @@ import pytest
 import tyro
 
 import sglpr_jax
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
 
 from .pages import PAGES, ROOT, blocks, command_lines, name_of
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.evaluation.inputs.agreement import check_agreement
 from sglpr_jax.evaluation.inputs.methods import read_methods

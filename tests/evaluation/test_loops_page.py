@@ -8,12 +8,12 @@ from recordings import of_images
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.page.of_loops import loops_page
+from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import Candidate
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop, Rejected
-from sglpr_jax.loops.optimization import OptimizedTrajectory
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
+from sglpr_jax.se3 import transform
 
 from .test_page import Parsed
 

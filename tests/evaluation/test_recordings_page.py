@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from sglpr_jax.evaluation.page.of_recordings import recordings_page
-from sglpr_jax.loops.find_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.frame_alignment import FrameAlignment
-from sglpr_jax.loops.joint_optimization import OptimizedRecordings
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import OptimizedTrajectory
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.search_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.pose_graph.optimize import OptimizedRecordings, OptimizedTrajectory
+from sglpr_jax.se3 import transform
 
 from .test_loops_page import found as one_found  # noqa: F401
 from .test_page import Parsed

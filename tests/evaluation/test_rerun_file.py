@@ -11,11 +11,11 @@ from recordings import of_images
 
 from sglpr_jax.evaluation import rerun_file
 from sglpr_jax.evaluation.rerun_file import write_rerun
-from sglpr_jax.loops.find import FoundLoops, find_loops
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import OptimizedTrajectory
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.search import FoundLoops, find_loops
 from sglpr_jax.models.weights_file import load
+from sglpr_jax.pose_graph.optimize import OptimizedTrajectory
+from sglpr_jax.se3 import transform
 from sglpr_jax.sim.recording import simulate_recording
 
 

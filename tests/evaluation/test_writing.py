@@ -7,8 +7,7 @@ import pytest
 from sglpr_jax.evaluation.page.writing import write_evaluation, write_sessions
 from sglpr_jax.evaluation.scoring import Evaluation, evaluate_methods, score
 from sglpr_jax.evaluation.sessions import evaluate_sessions
-from sglpr_jax.files import WriteError
-from sglpr_jax.names import printable
+from sglpr_jax.files import WriteError, printable
 
 NAMES = ["top1-f1max", "pairs-10-f1max"]
 

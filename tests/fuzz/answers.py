@@ -13,14 +13,14 @@ from sglpr_jax.cli.export import ExportCommand, export
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
 from sglpr_jax.evaluation.inputs.methods import read_methods
 from sglpr_jax.evaluation.scoring import evaluate_methods
-from sglpr_jax.loops.places import PlaceMap
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import as_tree, by_name, for_places, weights_hash
 from sglpr_jax.models.weights_file import CONFIG_FILE, WEIGHTS_FILE, load
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import transform
 
 from .archives import ABOUT, NPZ, arrays_of, change_about, npz
 from .damage import BYTES

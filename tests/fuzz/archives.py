@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.data.sampling.descriptor_cache import DescriptorCache
 from sglpr_jax.evaluation.inputs import read_input
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile

@@ -15,8 +15,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import read_scan
+from sglpr_jax.data.readers import open_recording
 
 from .archives import npy, npz
 from .damage import BYTES, Damage, declare, drop_word, extreme, flip_header

@@ -11,8 +11,8 @@ import numpy as np
 from loops.kept import WANTED, keep, recalled
 from recordings import of_scans
 
-from sglpr_jax.data.corruption.corruptions import CLEAN
-from sglpr_jax.loops.unfinished import ENDING
+from sglpr_jax.data.corruption import CLEAN
+from sglpr_jax.loops.checkpoint import ENDING
 from sglpr_jax.methods.method import ScanMethod
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.reuse import SETTINGS, _settings, embed_or_reuse

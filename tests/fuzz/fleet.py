@@ -5,7 +5,7 @@ from typing import Any
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.fleet_index import FleetIndex
-from sglpr_jax.retrieval.place_rows import place_rows
+from sglpr_jax.retrieval.parquet import place_rows
 
 from .continued import files_of
 from .road import DESCRIPTORS, POSITIONS, TIMES, FolderRoad, N

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from sglpr_jax.data.cache.packed import open_pack, packed
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.loop_files import (
+from sglpr_jax.data.packed import open_pack, packed
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.pose_graph.files import (
     read_g2o,
     read_loops_csv,
     read_loops_jsonl,
@@ -23,9 +23,8 @@ from sglpr_jax.loops.loop_files import (
     write_loops_csv,
     write_loops_jsonl,
 )
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.transforms import transform
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import transform
 
 from .damage import BYTES, Damage, Damaged, change_json, change_word, drop_word, safetensors_file, safetensors_parts
 from .road import DESCRIPTORS, POSITIONS, TIMES, N, Road, as_whole, plain

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data.formats.pose_files import read_times
-from sglpr_jax.data.formats.trajectory import Trajectory, read_trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory, read_times, read_trajectory
 from sglpr_jax.data.readers.nclt import read_ground_truth
 from sglpr_jax.evaluation.inputs import read_input
 

@@ -12,9 +12,7 @@ import safetensors.numpy
 
 from sglpr_jax.files import read_json
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.config_dict import config_from_dict
+from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, config_from_dict
 from sglpr_jax.models.weights import by_name, hash_of, weight_shapes
 from sglpr_jax.models.weights_file import CHECKSUM, CONFIG_FILE, WEIGHTS_FILE, load
 from sglpr_jax.training.config import TrainConfig

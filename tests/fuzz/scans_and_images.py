@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sglpr_jax.data.formats.grey_png import read_grey_png
-from sglpr_jax.data.formats.label_images import read_label_image
+from sglpr_jax.data.formats.png import read_grey_png, read_label_image
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.recording import scan_record
 from sglpr_jax.labels import to_classes
 
 from .damage import (

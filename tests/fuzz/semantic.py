@@ -12,7 +12,7 @@ from PIL import Image
 
 from sglpr_jax.cli.recording import RecordingOptions
 from sglpr_jax.cli.segment import SegmentCommand, segment_recording
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import as_tree, weight_shapes
 from sglpr_jax.models.weights_file import save

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 
 from .damage import BYTES, Damage
 from .road import FolderRoad

@@ -8,8 +8,9 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.live.frame import LiveFrame
-from sglpr_jax.sim import Sensor, recording
+from sglpr_jax.sim import recording
 from sglpr_jax.sim.recording import SimulatedRecording
+from sglpr_jax.sim.sensor import Sensor
 
 SCANS = 130
 SENSOR = Sensor(elevations_deg=tuple(np.linspace(2, -24, 16)), azimuth_steps=180)

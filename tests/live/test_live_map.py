@@ -12,8 +12,8 @@ from sglpr_jax.live.live_map import JOURNAL, LOOPS, LiveMap
 from sglpr_jax.live.results import write_results
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.loop_files import read_loops_jsonl
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.pose_graph.files import read_loops_jsonl
+from sglpr_jax.se3 import inverse
 from tests.live.conftest import SCANS, live_frame
 
 CONFIG = DetectorConfig(min_probability=0.5)

@@ -10,7 +10,7 @@ from sglpr_jax.live.continuity import HOLD_S, WAIT_S, Continuity
 from sglpr_jax.live.latest import Latest
 from sglpr_jax.live.mounting import SCANS, FirstScans
 from sglpr_jax.live.report import AGAIN_S, Reports
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.se3 import transform
 
 
 def at(x: float, y: float = 0.0) -> np.ndarray:

@@ -12,7 +12,7 @@ from sglpr_jax.files import WriteError
 from sglpr_jax.live.frame import FrameStatus, LoopEdge
 from sglpr_jax.live.sinks import SinkOptions, open_sink
 from sglpr_jax.live.sinks.rerun import RerunSink
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.se3 import transform
 
 STATUS = FrameStatus(7, 1_700_000_000.25, 0.012, 0.02, 3, 8, 40_000)
 PLACED = LoopEdge(7, 2, 70.0, 20.0, np.eye(4), np.eye(6), 0.97, transform(3.0, 4.0, 0.0), np.eye(4), 0.01)

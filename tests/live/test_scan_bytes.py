@@ -10,9 +10,9 @@ from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.live.scan_bytes import LiveScan, from_bytes, to_bytes
 from sglpr_jax.loops.candidates import Compared
 from sglpr_jax.loops.comparison import NO_FITS, Fits
-from sglpr_jax.loops.motion import Link
-from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.registration.bev_search import Peak
 
 DRAW = np.random.default_rng(0)
 FITS = Fits(np.array([1, 4]), Peak(*DRAW.normal(size=(5, 2))))

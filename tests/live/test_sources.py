@@ -10,8 +10,8 @@ import pytest
 from sglpr_jax.live.sinks import SinkOptions, open_sink
 from sglpr_jax.live.sources import SourceOptions, folder, open_source
 from sglpr_jax.live.sources.growing_poses import GrowingPoses
-from sglpr_jax.loops.loop_files import write_tum
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.pose_graph.files import write_tum
+from sglpr_jax.se3 import transform
 from tests.bags import CLOUD, cloud, header, typestore, write_bag
 
 POINTS = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)

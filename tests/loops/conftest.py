@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.comparison import Candidate, Comparer
-from sglpr_jax.loops.loop import Loop
 from sglpr_jax.loops.probability import Evidence
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
-from sglpr_jax.loops.verification import Alignment
-from sglpr_jax.sim import Sensor, recording
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.se3 import inverse, transform, yaw_of
+from sglpr_jax.sim import recording
 from sglpr_jax.sim.recording import SimulatedRecording
+from sglpr_jax.sim.sensor import Sensor
 
 SCANS = 240
 LAPS_FRAMES = 120

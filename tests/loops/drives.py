@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
-from sglpr_jax.loops.verification import Alignment
+from sglpr_jax.loops.closure import Loop, planar_loop
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.se3 import inverse, transform, yaw_of
 
 LOOP_COVARIANCE = np.diag([0.1, 0.1, np.radians(0.3)]) ** 2
 

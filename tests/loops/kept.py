@@ -4,16 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.loops import unfinished
+from sglpr_jax.loops import checkpoint
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import NO_FITS, Fits
-from sglpr_jax.loops.motion import Link
-from sglpr_jax.loops.pose_search import Peak
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.loops.keyframes import Seen, StoredScans
+from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.registration.bev_search import Peak
 from sglpr_jax.retrieval.index import Index
 
-WANTED = {"format": unfinished.FORMAT, "name": "08", "recording": "a"}
+WANTED = {"format": checkpoint.FORMAT, "name": "08", "recording": "a"}
 EMPTY = Index.empty(4, weights_hash="w")
 
 
@@ -46,14 +45,14 @@ def recalled(folder: Path, wanted: dict) -> list:
         found.append((seen, compared))
         finder.frames += 1
 
-    kept = unfinished.Unfinished.opened(folder, wanted)
+    kept = checkpoint.Unfinished.opened(folder, wanted)
     kept.recall(finder, lambda frame: None, add, missing=True)
     return found
 
 
 def keep(folder: Path, wanted: dict, *, seed: int = 0, stops: tuple[int, ...] = (5,)) -> Path:
     """Keep frames in a folder, with a file for the frames before each stop. Returns the first file."""
-    kept = unfinished.Unfinished.opened(folder, wanted)
+    kept = checkpoint.Unfinished.opened(folder, wanted)
     for frame, (seen, compared) in enumerate(fake_frames(seed, frames=stops[-1]), start=1):
         kept.keep(seen, compared, index=EMPTY)
         if frame in stops:

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 from recordings import of_images
 
-from sglpr_jax.data import Recording
-from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.find_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.frame_alignment import aligned_frames
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.transforms import inverse, transform, travelled
+from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.loops.search_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import inverse, transform, travelled
 
 from .drives import along, loop_at
 

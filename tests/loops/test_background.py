@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.loops import background as background_module
-from sglpr_jax.loops.background import Background, ring_medians
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.models.params import Params
+from sglpr_jax.registration import background as background_module
+from sglpr_jax.registration.background import Background, ring_medians
 
 CELLS, CELL_M, RINGS_M = 152, 0.4, (4.0, 6.0, 9.0, 13.0)
 RING_COUNT = 80

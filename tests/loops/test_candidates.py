@@ -6,7 +6,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.grid import Grid
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.seen import Seen
+from sglpr_jax.loops.keyframes import Seen
 
 from .scenes import seen_from
 

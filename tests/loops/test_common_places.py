@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from sglpr_jax.loops.common_places import MIN_LOOPS, Joined, accepted_between
-from sglpr_jax.loops.config import ConsistencyConfig, DriftModel
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.transforms import transform, travelled
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.config import ConsistencyConfig
+from sglpr_jax.loops.consistency import MIN_LOOPS, Joined, accepted_between
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import transform, travelled
 
 from .drives import loop_at
 from .pairs import loops_between, two_drives

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from sglpr_jax.loops.comparison import Candidate, Comparer, Query
-from sglpr_jax.loops.config import CandidateConfig, DriftModel, VerificationConfig
-from sglpr_jax.loops.motion import Motion
-from sglpr_jax.loops.spectra import query_spectra
-from sglpr_jax.loops.stored_scans import StoredScans
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.keyframes import StoredScans
+from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.registration.bev_spectra import query_spectra
+from sglpr_jax.registration.config import VerificationConfig
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import transform
 
 from .scenes import place, seen_from
 

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sglpr_jax.loops.closure import Loop, planar_loop
 from sglpr_jax.loops.consistency import BLOCK, agree, largest_consistent_set
-from sglpr_jax.loops.loop import Loop, planar_loop
-from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.verification import Alignment
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.se3 import inverse, transform
 
 
 def square_drive(laps: int = 2, side: int = 50) -> np.ndarray:

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
+from sglpr_jax.loops.acceptance import LITTLE_OVERLAP
 from sglpr_jax.loops.candidates import CandidateFinder, Compared
-from sglpr_jax.loops.compared_image import within_reach
+from sglpr_jax.loops.closure import UNKNOWN_HEIGHT_M
 from sglpr_jax.loops.comparison import NO_FITS
-from sglpr_jax.loops.config import CandidateConfig, DetectorConfig, VerificationConfig
+from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.find import find_loops
-from sglpr_jax.loops.joint import LITTLE_OVERLAP
-from sglpr_jax.loops.loop import UNKNOWN_HEIGHT_M
+from sglpr_jax.loops.keyframes import Seen, square_image
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.loops.seen import Seen, square_image
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.loops.search import find_loops
+from sglpr_jax.registration.bev_spectra import within_reach
+from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.se3 import inverse, transform, yaw_of
 
 NOW = CandidateConfig(recent_m=1e-9)
 

@@ -8,15 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.closure import Loop, inverted
 from sglpr_jax.loops.drift import deviations, floor_deviations, planar_deviations, step_deviations
-from sglpr_jax.loops.driven_path import DrivenPath
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.loop_files import read_g2o, write_g2o
-from sglpr_jax.loops.planar import inverted
-from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.upright import upright_from_lidar
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.pose_graph.files import read_g2o, write_g2o
+from sglpr_jax.se3 import inverse, transform
 
 from .drives import along, drifted, town, true_loops
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.loops.driven_path import DrivenPath
-from sglpr_jax.loops.transforms import travelled
+from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.se3 import travelled
 
 from .drives import along, town
 

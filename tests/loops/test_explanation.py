@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 from recordings import of_images
 
+from sglpr_jax.loops.closure import MEANING, Loop, Reason, Rejected, counted, listed, why_rejected
 from sglpr_jax.loops.config import CandidateConfig
-from sglpr_jax.loops.explanation import why_none
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop, Reason, Rejected
-from sglpr_jax.loops.reasons import MEANING, counted, listed, why_rejected
+from sglpr_jax.loops.search import FoundLoops, why_none
 
 LOOP = Loop(5, 0, np.eye(4), np.eye(6), 0.995)
 

@@ -10,19 +10,19 @@ from recordings import of_scans
 
 import sglpr_jax
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
+from sglpr_jax.data.levelling import check_level
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import find
+from sglpr_jax.loops import search
+from sglpr_jax.loops.acceptance import check_odometry
 from sglpr_jax.loops.candidates import Compared
+from sglpr_jax.loops.closure import Loop, Rejected
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.joint import check_odometry
-from sglpr_jax.loops.loop import Loop, Rejected
+from sglpr_jax.loops.keyframes import Seen
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import inverse, transform
-from sglpr_jax.loops.upright import check_level
+from sglpr_jax.se3 import inverse, transform
 
 N = 40
 ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 10.0), "everything")
@@ -65,8 +65,8 @@ def found(params, there_and_back, compare_only, monkeypatch):
 
     def found(odometry):
         detector = searched(params, compare_only, there_and_back, odometry)
-        monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
-        return find.find_loops(recording, params, odometry=odometry, config=CONFIG, registered=False)
+        monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
+        return search.find_loops(recording, params, odometry=odometry, config=CONFIG, registered=False)
 
     return found
 
@@ -116,8 +116,8 @@ def test_loops_that_contradict_the_odometry_are_rejected_and_do_not_keep_the_tru
     wrong = {one.loop.query for one in detector.rejected}
     assert len(wrong) >= 7 and wrong <= set(alike) and not true & wrong and len(true) >= N - 1
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
-    monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
-    whole = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG, registered=False)
+    monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
+    whole = search.find_loops(recording, params, odometry=there_and_back, config=CONFIG, registered=False)
     assert {one.loop.query for one in whole.rejected} == wrong and len(whole.loops) >= N - 1
     assert {one.reason for one in whole.rejected} == {"contradicts the odometry"}
     assert str(whole).endswith(f"{len(wrong)} rejected (contradicts the odometry: {len(wrong)})")

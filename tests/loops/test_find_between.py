@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data.readable import only
-from sglpr_jax.loops.find_between import find_loops_between
-from sglpr_jax.loops.motion import GAP_M, Motion
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.data.scan_stream import only
+from sglpr_jax.loops.search_between import find_loops_between
+from sglpr_jax.odometry.bev_odometry import GAP_M, Motion
+from sglpr_jax.se3 import inverse, transform, yaw_of
 
 SCANS = 26
 

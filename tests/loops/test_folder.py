@@ -8,15 +8,15 @@ import pytest
 from recordings import of_images
 
 from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
-from sglpr_jax.data.readable import only
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
 from sglpr_jax.files import WriteError
-from sglpr_jax.loops import folder
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.loop import Loop, Rejected
-from sglpr_jax.loops.loop_files import read_g2o, read_loops_csv, read_loops_jsonl
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.closure import Loop, Rejected
+from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.pose_graph import folder
+from sglpr_jax.pose_graph.files import read_g2o, read_loops_csv, read_loops_jsonl
+from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.se3 import transform
 
 
 @pytest.fixture

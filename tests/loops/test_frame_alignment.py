@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.loops.config import DriftModel
+from sglpr_jax.loops.closure import Loop
 from sglpr_jax.loops.frame_alignment import aligned_frames
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, travelled, yaw_of
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import inverse, moved_covariance, transform, travelled, yaw_of
 
 from .pairs import loops_between, two_drives
 

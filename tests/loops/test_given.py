@@ -11,19 +11,19 @@ from recordings import of_scans
 import sglpr_jax
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.warning import DataWarning
+from sglpr_jax.loops.arguments import check_is, given_pose, given_poses, given_record, given_time
 from sglpr_jax.loops.candidates import CandidateFinder
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.find import find_loops
-from sglpr_jax.loops.given import check_is, given_pose, given_poses, given_record, given_time
-from sglpr_jax.loops.map_recording import map_recording
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.loops.search import find_loops
+from sglpr_jax.maps.build import map_recording
+from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.weights import weights_hash
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import transform
 
 POSES = [np.eye(4).tolist(), transform(1.0, 0.0, 0.5)]
 FLAT = np.zeros((2, 4, 4))

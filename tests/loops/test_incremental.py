@@ -5,10 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.incremental import LOOP_EVERY_M, IncrementalTrajectory
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import optimized, trajectory_error
-from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.pose_graph.incremental import LOOP_EVERY_M, IncrementalTrajectory
+from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
+from sglpr_jax.se3 import inverse, transform
 
 from .conftest import LOOP_COVARIANCE
 

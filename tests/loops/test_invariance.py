@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.views import rotated
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
-from sglpr_jax.sim import Sensor
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.se3 import inverse, transform, yaw_of
 from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.sensor import Sensor
 
 SCANS = 160
 SENSOR = Sensor(elevations_deg=tuple(np.linspace(10, -24, 24)), azimuth_steps=480)

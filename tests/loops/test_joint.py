@@ -9,14 +9,15 @@ import pytest
 from recordings import of_scans
 
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import joint
-from sglpr_jax.loops.config import DetectorConfig, DriftModel
+from sglpr_jax.loops import acceptance
+from sglpr_jax.loops.acceptance import accepted, check_odometry, stretches
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.drift import deviations
-from sglpr_jax.loops.joint import accepted, check_odometry, stretches
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.optimization import optimized, trajectory_error
-from sglpr_jax.loops.registration import Registration
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.pose_graph.optimize import optimized, trajectory_error
+from sglpr_jax.registration.gicp import Registration
+from sglpr_jax.se3 import transform
 
 from .drives import along, drifted, rooms, town, true_loops, wrong_loops
 
@@ -148,10 +149,10 @@ def test_scans_that_overlap_little_are_a_loop_if_both_poses_agree(monkeypatch, o
     def registered(query, match, *, initial, initial_covariance):
         return Registration(initial @ transform(off_m, 0.0, 0.0), 1e-4 * np.eye(6), overlap)
 
-    monkeypatch.setattr(joint, "register", registered)
+    monkeypatch.setattr(acceptance, "register", registered)
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2)})
     loop = Loop(1, 0, np.eye(4), 0.01 * np.eye(6), 0.99)
-    loops, rejected = joint.settled(recording, [loop], None, DetectorConfig(), registered=True)
+    loops, rejected = acceptance.settled(recording, [loop], None, DetectorConfig(), registered=True)
     (found,) = loops if kept else [one.loop for one in rejected]
     assert found.overlap == overlap and found.match_from_query[0, 3] == off_m
     assert [one.reason for one in rejected] == ([] if kept else ["little overlap"])

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.find_between import FoundRecordings
-from sglpr_jax.loops.joint_optimization import optimize_recordings, placements
-from sglpr_jax.loops.optimization import trajectory_error
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.loops.search_between import FoundRecordings
+from sglpr_jax.pose_graph.optimize import optimize_recordings, placements, trajectory_error
+from sglpr_jax.se3 import inverse
 
 from .drives import drifted
 from .pairs import found_pair, two_drives

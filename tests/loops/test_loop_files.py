@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.data.formats.pose_files import read_kitti, read_tum
-from sglpr_jax.data.formats.trajectory import read_trajectory
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.loop_files import (
+from sglpr_jax.data.formats.pose_files import read_kitti, read_trajectory, read_tum
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.pose_graph.files import (
     read_g2o,
     read_loops_csv,
     read_loops_jsonl,
@@ -19,7 +18,7 @@ from sglpr_jax.loops.loop_files import (
     write_loops_jsonl,
     write_tum,
 )
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.se3 import inverse
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.data.readable import only
-from sglpr_jax.loops.map_alignment import align_maps, check_one_frame, without_known_places
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.data.scan_stream import only
+from sglpr_jax.maps.alignment import align_maps, check_one_frame, without_known_places
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.se3 import inverse, transform, yaw_of
 
 SCANS = 26
 WORLD_FROM_OTHER = transform(40.0, -25.0, 2.0)

@@ -10,10 +10,9 @@ from sglpr_jax.loops.candidates import CandidateFinder, Compared
 from sglpr_jax.loops.comparison import NO_FITS
 from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.stored_scans import StoredScans
-from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.loops.keyframes import Seen, StoredScans
 from sglpr_jax.retrieval.index import Index
+from sglpr_jax.se3 import inverse, transform
 
 LIMIT = 150
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.config import MotionConfig
-from sglpr_jax.loops.motion import UNKNOWN_M, Link, Motion
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.odometry.bev_odometry import UNKNOWN_M, Link, Motion
+from sglpr_jax.odometry.config import MotionConfig
+from sglpr_jax.se3 import transform
 
 
 def link(

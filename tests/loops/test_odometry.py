@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
-from sglpr_jax.loops.loop_files import write_g2o, write_kitti, write_tum
-from sglpr_jax.loops.odometry import at_scans, read_odometry
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.pose_graph.files import write_g2o, write_kitti, write_tum
+from sglpr_jax.pose_graph.odometry_files import at_scans, read_odometry
+from sglpr_jax.se3 import transform
 
 
 @pytest.fixture

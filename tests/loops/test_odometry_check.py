@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.config import DriftModel
-from sglpr_jax.loops.motion import Link
-from sglpr_jax.loops.odometry_check import OdometryCheck
-from sglpr_jax.loops.transforms import inverse, transform, yaw_of
+from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.drift_check import OdometryCheck
+from sglpr_jax.se3 import inverse, transform, yaw_of
 
 from .drives import along, drifted
 

@@ -9,11 +9,11 @@ from recordings import of_images
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.loop_files import read_g2o, write_g2o
-from sglpr_jax.loops.optimization import MOST_RISEN_M, optimize_trajectory, optimized, trajectory_error
-from sglpr_jax.loops.transforms import from_quaternions, inverse, transform
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.search import FoundLoops
+from sglpr_jax.pose_graph.files import read_g2o, write_g2o
+from sglpr_jax.pose_graph.optimize import MOST_RISEN_M, optimize_trajectory, optimized, trajectory_error
+from sglpr_jax.se3 import from_quaternions, inverse, transform
 
 from .conftest import LAPS_FRAMES, LOOP_COVARIANCE
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sglpr_jax.loops.overlay import overlaid
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.evaluation.overlay import overlaid
+from sglpr_jax.se3 import transform
 
 from .scenes import place, relative, seen_from
 

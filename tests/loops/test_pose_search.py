@@ -5,10 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.loops.compared_image import cells, merged, prepared
-from sglpr_jax.loops.config import VerificationConfig
-from sglpr_jax.loops.pose_search import search, search_near, search_spectra
-from sglpr_jax.loops.spectra import lower_half, match_spectra, query_spectra, rotations, spectrum
+from sglpr_jax.registration.bev_search import search, search_near, search_spectra
+from sglpr_jax.registration.bev_spectra import (
+    cells,
+    lower_half,
+    match_spectra,
+    merged,
+    prepared,
+    query_spectra,
+    rotations,
+    spectrum,
+)
+from sglpr_jax.registration.config import VerificationConfig
 
 from .scenes import place, relative, seen_from
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from recordings import of_scans
 
-from sglpr_jax.data.readable import only
-from sglpr_jax.loops.query import query_of, read_query
+from sglpr_jax.data.scan_stream import only
+from sglpr_jax.maps.query import query_of, read_query
 
 
 def test_a_frame_has_the_number_of_the_whole_recording():

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_poses
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.loops.joint import MIN_OVERLAP
-from sglpr_jax.loops.loop import is_degenerate, position_deviation
-from sglpr_jax.loops.registration import coarse_pose, overlap, register
-from sglpr_jax.loops.transforms import inverse, transform, transformed
+from sglpr_jax.loops.acceptance import MIN_OVERLAP
+from sglpr_jax.loops.closure import is_degenerate, position_deviation
+from sglpr_jax.registration.gicp import coarse_pose, overlap, register
+from sglpr_jax.se3 import inverse, transform, transformed
 
 
 def error_of(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:

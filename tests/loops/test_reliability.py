@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from sglpr_jax.loops.calibration import EDGES, calibration_error, reliability, reliability_of
 from sglpr_jax.loops.comparison import Candidate
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
-from sglpr_jax.loops.reliability import EDGES, calibration_error, reliability, reliability_of
 
 
 def test_bins_are_counted():

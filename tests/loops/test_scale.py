@@ -9,13 +9,13 @@ from recordings import of_scans
 
 import sglpr_jax
 from sglpr_jax.data.scaled import scaled_poses
-from sglpr_jax.loops import find
-from sglpr_jax.loops.config import DetectorConfig, DriftModel
+from sglpr_jax.loops import search
+from sglpr_jax.loops.closure import Loop, Search, divided_loop, scaled_config, scaled_drift
+from sglpr_jax.loops.config import DetectorConfig
 from sglpr_jax.loops.drift import deviations
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.scale import Search, divided_loop, scaled_config, scaled_drift
-from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import inverse, transform
 
 from .drives import loop_at
 from .test_find import CONFIG, N, searched
@@ -41,8 +41,8 @@ def test_loops_of_scaled_scans_are_in_metres(params, compare_only, there_and_bac
     large = scaled_poses(there_and_back, float(SCALE))
     detector = searched(params, compare_only, large, large)
     recording = of_scans({Path(f"{i}.bin"): np.zeros((1, 3), np.float32) for i in range(2 * N)})
-    monkeypatch.setattr(find, "LoopDetector", lambda *_, **__: detector)
-    found = find.find_loops(recording, params, odometry=there_and_back, config=CONFIG, registered=False, scale=SCALE)
+    monkeypatch.setattr(search, "LoopDetector", lambda *_, **__: detector)
+    found = search.find_loops(recording, params, odometry=there_and_back, config=CONFIG, registered=False, scale=SCALE)
     assert len(found.loops) >= N - 1 and str(found).endswith(", scale 4")
     for loop, one in zip(found.loops, sorted(detector.loops, key=lambda one: one.query), strict=False):
         true = inverse(there_and_back[loop.match]) @ there_and_back[loop.query]

@@ -10,15 +10,15 @@ from recordings import of_images, of_scans, with_points
 from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.point_times import TimeField
-from sglpr_jax.data.readable import only
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import kept_poses, scan_odometry
-from sglpr_jax.loops.config import DetectorConfig, OdometryConfig
-from sglpr_jax.loops.optimization import trajectory_error
-from sglpr_jax.loops.slam import slam
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.odometry import kept_poses, kiss_icp
+from sglpr_jax.odometry.config import OdometryConfig
+from sglpr_jax.pose_graph.optimize import trajectory_error
+from sglpr_jax.pose_graph.slam import slam
+from sglpr_jax.se3 import inverse
 
 SCANS = 30
 ELSEWHERE = (150, 151)
@@ -40,7 +40,7 @@ def start(street) -> Recording:
 
 def test_poses_follow_the_street(street):
     recording, done = only(street, range(SCANS)), []
-    poses = scan_odometry.scan_odometry(recording, on_progress=done.append)
+    poses = kiss_icp.scan_odometry(recording, on_progress=done.append)
     assert recording.positions is not None
     assert trajectory_error(poses, recording.positions) < 0.15 and np.ptp(recording.positions, axis=0).max() > 50
     np.testing.assert_array_equal(poses[0], np.eye(4))
@@ -51,28 +51,26 @@ def test_a_stopped_run_resumes_with_the_same_poses(start, tmp_path, monkeypatch)
     kept, done, aligned = tmp_path / "kept.npz", [], []
     monkeypatch.setattr(kept_poses, "SCANS", 3)
     options = {"kept_in": kept, "on_progress": done.append}
-    part = scan_odometry.scan_odometry(start, should_stop=lambda: len(done) == 7, **options)
+    part = kiss_icp.scan_odometry(start, should_stop=lambda: len(done) == 7, **options)
     assert len(part) == 7 and kept.exists()
-    align = scan_odometry._FrontEnd._aligned
-    monkeypatch.setattr(
-        scan_odometry._FrontEnd, "_aligned", lambda self, *given: aligned.append(1) or align(self, *given)
-    )
-    whole = scan_odometry.scan_odometry(start, **options)
+    align = kiss_icp._FrontEnd._aligned
+    monkeypatch.setattr(kiss_icp._FrontEnd, "_aligned", lambda self, *given: aligned.append(1) or align(self, *given))
+    whole = kiss_icp.scan_odometry(start, **options)
     np.testing.assert_array_equal(whole[:7], part)
     assert len(aligned) == 5
-    np.testing.assert_allclose(whole, scan_odometry.scan_odometry(start), atol=1e-6)  # sums of threads in any order
-    np.testing.assert_array_equal(scan_odometry.scan_odometry(start, **options), whole)
+    np.testing.assert_allclose(whole, kiss_icp.scan_odometry(start), atol=1e-6)  # sums of threads in any order
+    np.testing.assert_array_equal(kiss_icp.scan_odometry(start, **options), whole)
     assert len(aligned) == 5 + 12
 
 
 def test_a_checkpoint_of_something_else_is_not_used(start, tmp_path):
     few, kept = only(start, range(3)), tmp_path / "kept.npz"
-    found = scan_odometry.scan_odometry(few, kept_in=kept)
+    found = kiss_icp.scan_odometry(few, kept_in=kept)
     with pytest.warns(DataWarning, match=r"kept.npz: expected poses of these scans and settings, found others; the od"):
-        scan_odometry.scan_odometry(few, kept_in=kept, config=OdometryConfig(max_range_m=60.0))
+        kiss_icp.scan_odometry(few, kept_in=kept, config=OdometryConfig(max_range_m=60.0))
     kept.write_bytes(kept.read_bytes()[:100])
     with pytest.warns(DataWarning, match=r"kept.npz: expected poses of unfinished odometry, found 100 bytes"):
-        again = scan_odometry.scan_odometry(few, kept_in=kept)
+        again = kiss_icp.scan_odometry(few, kept_in=kept)
     np.testing.assert_allclose(again, found, atol=1e-6)
 
 
@@ -80,21 +78,21 @@ def test_scans_that_do_not_overlap_are_named(street):
     rows = (*range(8), SCANS, SCANS + 1)
     said = r"street: expected scans that overlap the previous ones, found 1 that do not, first scan 000150 \(\d\d%\)"
     with pytest.warns(DataWarning, match=said):
-        assert len(scan_odometry.scan_odometry(only(street, rows))) == len(rows)
+        assert len(kiss_icp.scan_odometry(only(street, rows))) == len(rows)
 
 
 def test_poses_of_scans_with_few_points_are_extrapolated(start):
     blocked = start.paths[8]
     half = with_points(start, lambda path: start.points(start.paths.index(path))[:: 2000 if path == blocked else 1])
     with pytest.warns(DataWarning, match=r"100 points or more in each scan, found fewer in 1, first in scan 000008;"):
-        poses = scan_odometry.scan_odometry(half)
+        poses = kiss_icp.scan_odometry(half)
     np.testing.assert_allclose(inverse(poses[7]) @ poses[8], inverse(poses[6]) @ poses[7], atol=1e-9)
     assert trajectory_error(poses, np.asarray(start.positions)) < 0.15
     none = with_points(start, lambda path: start.points(0)[:50])
     with pytest.raises(
         ValueError, match=r"street: expected scans with 100 points or more for odometry, found at most "
     ):
-        scan_odometry.scan_odometry(none)
+        kiss_icp.scan_odometry(none)
 
 
 def test_unreadable_scans_are_skipped_or_an_error(start):
@@ -104,16 +102,16 @@ def test_unreadable_scans_are_skipped_or_an_error(start):
         return start.points(start.paths.index(path))
 
     bad, broken = [], with_points(start, points)
-    poses = scan_odometry.scan_odometry(broken, on_bad_scan=lambda scan, error: bad.append(scan))
+    poses = kiss_icp.scan_odometry(broken, on_bad_scan=lambda scan, error: bad.append(scan))
     assert bad == ["000005"] and trajectory_error(poses, np.asarray(start.positions)) < 0.15
     with pytest.raises(ValueError, match="broken"):
-        scan_odometry.scan_odometry(broken)
+        kiss_icp.scan_odometry(broken)
 
 
 def test_scaled_scans_give_poses_in_metres(start):
-    poses = scan_odometry.scan_odometry(start, scale=2)
+    poses = kiss_icp.scan_odometry(start, scale=2)
     assert trajectory_error(poses, np.asarray(start.positions)) < 0.5
-    assert ", points up to 50 m, voxels of 0.5 m, without" in scan_odometry.about(start, OdometryConfig(), scale=2)
+    assert ", points up to 50 m, voxels of 0.5 m, without" in kiss_icp.about(start, OdometryConfig(), scale=2)
 
 
 def test_poses_are_those_at_the_times_of_the_scans(start):
@@ -122,7 +120,7 @@ def test_poses_are_those_at_the_times_of_the_scans(start):
     true[:, 0, 3] = np.arange(len(start)) ** 2
     times = 0.1 * np.arange(len(start))
     late = only(of_scans(dict.fromkeys(start.paths[1:], np.zeros((1, 3))), times=times[1:]), range(len(start) - 1))
-    found = scan_odometry._at_times_of_scans(true[1:], late, np.full(len(late), 0.1))
+    found = kiss_icp._at_times_of_scans(true[1:], late, np.full(len(late), 0.1))
     np.testing.assert_allclose(found[2:, 0, 3] - found[1, 0, 3], true[2:-1, 0, 3] - true[1, 0, 3], atol=1e-6)
 
 
@@ -140,20 +138,20 @@ def test_the_motion_within_scans_is_removed():
     timed = dataclasses.replace(
         plain, read=lambda path, *_: Record(points=clouds[path], time_field=TimeField("t", stamps))
     )
-    still, moved = (scan_odometry.scan_odometry(one)[:, 0, 3] for one in (timed, plain))
+    still, moved = (kiss_icp.scan_odometry(one)[:, 0, 3] for one in (timed, plain))
     np.testing.assert_allclose(still, 3 * times**2, atol=0.06)
     assert moved[-1] - 3 * times[-1] ** 2 > 0.3
-    assert scan_odometry.about(timed, OdometryConfig(), scale=1).endswith("motion within scans removed")
+    assert kiss_icp.about(timed, OdometryConfig(), scale=1).endswith("motion within scans removed")
 
 
 def test_images_and_a_missing_library_are_clear_errors(start, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="08: expected scans for odometry, found ready-made images"):
-        scan_odometry.scan_odometry(of_images({tmp_path / "0.png": np.zeros((4, 4), np.float32)}))
+        kiss_icp.scan_odometry(of_images({tmp_path / "0.png": np.zeros((4, 4), np.float32)}))
     with pytest.raises(ValueError, match=r"expected min_range_m < max_range_m = 5, found 6"):
         OdometryConfig(max_range_m=5.0, min_range_m=6.0)
     monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", None)
     with pytest.raises(ImportError, match=r"kiss-icp: pip install 'sglpr-jax\[odometry\]'"):
-        scan_odometry.scan_odometry(start)
+        kiss_icp.scan_odometry(start)
 
 
 @pytest.mark.slow

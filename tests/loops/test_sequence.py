@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from sglpr_jax.loops import sequence
-from sglpr_jax.loops.config import DriftModel, SequenceConfig
-from sglpr_jax.loops.driven_path import DrivenPath
-from sglpr_jax.loops.loop import Loop
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.config import SequenceConfig
 from sglpr_jax.loops.probability import AdditiveModel, Curve, Evidence, LoopModel
 from sglpr_jax.loops.sequence import Pair, neighbour_weights, verdict
-from sglpr_jax.loops.transforms import inverse, transform
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.se3 import inverse, transform
 
 REPEATS = Curve((0.5, 1.0), (8.0, 0.0))
 SURPRISE = Curve((0.0, 9.0), (0.0, 9.0))

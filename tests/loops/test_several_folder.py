@@ -8,12 +8,11 @@ import pytest
 
 from sglpr_jax.data.formats.pose_files import read_tum
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.folder import write_found
-from sglpr_jax.loops.joint_optimization import OptimizedRecordings
-from sglpr_jax.loops.loop import Rejected
-from sglpr_jax.loops.loop_files import read_g2o, read_loops_csv, read_loops_jsonl
-from sglpr_jax.loops.several_folder import FIRST_VERTEX, unique_names, vertices, write_several
-from sglpr_jax.loops.transforms import inverse
+from sglpr_jax.loops.closure import Rejected
+from sglpr_jax.pose_graph.files import read_g2o, read_loops_csv, read_loops_jsonl
+from sglpr_jax.pose_graph.folder import FIRST_VERTEX, unique_names, vertices, write_found, write_several
+from sglpr_jax.pose_graph.optimize import OptimizedRecordings
+from sglpr_jax.se3 import inverse
 
 from .pairs import found_pair
 

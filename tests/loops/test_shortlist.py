@@ -7,12 +7,12 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.loops.config import CandidateConfig, VerificationConfig
-from sglpr_jax.loops.pose_search import search
-from sglpr_jax.loops.seen import Seen
-from sglpr_jax.loops.shortlist import coarse_correlations
-from sglpr_jax.loops.spectra import match_spectra, query_spectra
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.loops.config import CandidateConfig
+from sglpr_jax.loops.keyframes import Seen
+from sglpr_jax.registration.bev_search import coarse_correlations, search
+from sglpr_jax.registration.bev_spectra import match_spectra, query_spectra
+from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.se3 import transform
 
 from .scenes import place, seen_from
 

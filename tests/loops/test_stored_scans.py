@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.loops import stored_scans
-from sglpr_jax.loops.spectra import match_spectra
-from sglpr_jax.loops.stored_scans import StoredScans
+from sglpr_jax.loops import keyframes
+from sglpr_jax.loops.keyframes import StoredScans
+from sglpr_jax.registration.bev_spectra import match_spectra
 from sglpr_jax.retrieval.index import Index
 
 from .scenes import place, seen_from
@@ -37,7 +37,7 @@ def test_an_image_of_another_size_is_one_clear_error():
 
 
 def test_spectra_are_those_of_the_images_and_only_the_last_used_are_kept(monkeypatch):
-    monkeypatch.setattr(stored_scans, "SPECTRA", 3)
+    monkeypatch.setattr(keyframes, "SPECTRA", 3)
     stored, given = StoredScans(Index.empty(4)), images(5)
     for k, image in enumerate(given):
         stored.add(10 * k, np.full(4, k, np.float32), image)

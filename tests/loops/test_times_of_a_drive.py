@@ -7,10 +7,10 @@ import pytest
 from bags import typestore, write_bag
 
 import sglpr_jax
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops.transforms import transform
+from sglpr_jax.se3 import transform
 
 FRAMES = 40
 SECONDS = np.arange(FRAMES) / 5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sglpr_jax.loops.transforms import (
+from sglpr_jax.se3 import (
     from_quaternions,
     inverse,
     quaternions,

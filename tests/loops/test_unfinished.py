@@ -14,11 +14,11 @@ from recordings import with_points
 import sglpr_jax
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.warning import DataWarning
-from sglpr_jax.loops import find, joint, unfinished
+from sglpr_jax.loops import acceptance, checkpoint, search
 from sglpr_jax.loops.config import CandidateConfig, DetectorConfig
-from sglpr_jax.loops.folder import write_found
 from sglpr_jax.loops.probability import AdditiveModel, Curve, LoopModel
-from sglpr_jax.loops.registration import Registration
+from sglpr_jax.pose_graph.folder import write_found
+from sglpr_jax.registration.gicp import Registration
 from sglpr_jax.retrieval.index import Index
 
 from .kept import WANTED, fake_frames, keep, recalled
@@ -26,7 +26,7 @@ from .kept import WANTED, fake_frames, keep, recalled
 ROWS = (*range(0, 24, 2), *range(1, 24, 2))
 """A drive that is driven twice."""
 ALWAYS = LoopModel(AdditiveModel({"deviation": Curve((0.0,), (0.0,))}, 10.0), "everything")
-find_loops = functools.partial(find.find_loops, model=ALWAYS)
+find_loops = functools.partial(search.find_loops, model=ALWAYS)
 """Every candidate is probable, so that the loops depend on nothing but what is kept."""
 CONFIG = DetectorConfig(candidates=CandidateConfig(recent_m=20.0))
 EMPTY = Index.empty(4, weights_hash="w")
@@ -50,7 +50,7 @@ def twice(drive):
 
 @pytest.fixture(autouse=True)
 def _small_files(monkeypatch):
-    monkeypatch.setattr(unfinished, "FRAMES", 5)
+    monkeypatch.setattr(checkpoint, "FRAMES", 5)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_as_if_it_had_not_been(twice,
     assert reached == [3, 7, 16, 24]
     assert contents(found, tmp_path / "found") == files
     (tmp_path / "kept" / f".000024.safetensors.{32 * 'a'}.tmp").write_bytes(b"half")
-    unfinished.remove(tmp_path / "kept")
+    checkpoint.remove(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
 
 
@@ -181,28 +181,28 @@ def test_a_folder_of_somebody_else_is_refused_and_left_as_it_is(tmp_path, name):
         path.write_text("{}")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(FileExistsError, match=rf"kept: expected a new folder.* found {Path(name).parts[0]}$"):
-        unfinished.Unfinished.opened(folder, {"format": unfinished.FORMAT})
+        checkpoint.Unfinished.opened(folder, {"format": checkpoint.FORMAT})
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_of_a_run_with_other_settings_its_own_files_are_removed_and_no_others(tmp_path):
-    wanted = {"format": unfinished.FORMAT, "weights": "a"}
-    unfinished.Unfinished.opened(tmp_path, wanted)
+    wanted = {"format": checkpoint.FORMAT, "weights": "a"}
+    checkpoint.Unfinished.opened(tmp_path, wanted)
     own = ("000050.safetensors", "1000000.safetensors", f".settings.json.{32 * '0'}.tmp")
     others = ("2024.safetensors", "000050.safetensors.bak", ".mine.tmp")
     for name in (*own, *others):
         (tmp_path / name).write_text("")
     with pytest.warns(DataWarning, match="found another weights"):
-        unfinished.Unfinished.opened(tmp_path, {**wanted, "weights": "b"})
+        checkpoint.Unfinished.opened(tmp_path, {**wanted, "weights": "b"})
     assert {path.name for path in tmp_path.iterdir()} == {*others, "settings.json"}
-    unfinished.remove(tmp_path)
+    checkpoint.remove(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(others)
 
 
 def test_what_a_kill_leaves_without_settings_is_thrown_away(tmp_path):
     (tmp_path / "000050.safetensors").write_text("")
     with pytest.warns(DataWarning, match="found another format"):
-        unfinished.Unfinished.opened(tmp_path, {"format": unfinished.FORMAT})
+        checkpoint.Unfinished.opened(tmp_path, {"format": checkpoint.FORMAT})
     assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
 
 
@@ -215,8 +215,8 @@ def test_registration_stops_between_loops_and_goes_on(twice, params, tmp_path, m
         done.append(None)
         return Registration(initial, np.eye(6), 0.9)
 
-    monkeypatch.setattr(joint, "register", registered)
-    monkeypatch.setattr(find, "check_installed", lambda: None)
+    monkeypatch.setattr(acceptance, "register", registered)
+    monkeypatch.setattr(search, "check_installed", lambda: None)
     options = {"odometry": odometry, "config": CONFIG, "registered": True, "kept_in": tmp_path / "kept"}
     stopped = find_loops(recording, params, **options, should_stop=lambda: len(done) >= 2)
     overlaps = [loop.overlap for loop in stopped.loops]
@@ -301,9 +301,9 @@ def test_scans_of_another_drive_have_other_settings_though_sizes_and_times_agree
         for path in paths:
             path.write_bytes(content)
             os.utime(path, (1e9, 1e9))
-        found.append(unfinished.settings(recording, finder))
+        found.append(checkpoint.settings(recording, finder))
     assert found[0]["recording"] == found[1]["recording"] and found[0] != found[1]
-    assert unfinished.settings(dataclasses.replace(recording, name="other"), finder) != found[1]
+    assert checkpoint.settings(dataclasses.replace(recording, name="other"), finder) != found[1]
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -317,23 +317,23 @@ def test_a_bag_of_other_scans_has_other_settings_though_its_size_and_times_agree
         for file in path.iterdir() if path.is_dir() else (path,):
             os.utime(file, (1e9, 1e9))
         recording = sglpr_jax.open_recording(path, sensor_height=1.73)
-        found.append(unfinished.settings(recording, finder))
+        found.append(checkpoint.settings(recording, finder))
     assert found[0]["recording"] == found[1]["recording"] and found[0]["scans"] != found[1]["scans"]
     os.utime(recording.containers[0], (2e9, 2e9))
-    assert unfinished.settings(recording, finder)["recording"] != found[1]["recording"]
+    assert checkpoint.settings(recording, finder)["recording"] != found[1]["recording"]
 
 
 def test_settings_tell_all_that_changes_what_is_seen(twice, params):
     recording, odometry = twice
     finder = sglpr_jax.LoopDetector(params, config=CONFIG).finder
-    base = unfinished.settings(recording, finder, odometry=odometry)
+    base = checkpoint.settings(recording, finder, odometry=odometry)
     tilted = dataclasses.replace(recording, mounting=Mounting(2.0))
     others = (
-        unfinished.settings(tilted, finder, odometry=odometry),
-        unfinished.settings(recording, finder, odometry=odometry + 1e-9),
-        unfinished.settings(recording, finder, odometry=None),
-        unfinished.settings(recording, sglpr_jax.LoopDetector(params).finder, odometry=odometry),
-        unfinished.settings(dataclasses.replace(recording, times=recording.times + 1), finder, odometry=odometry),
+        checkpoint.settings(tilted, finder, odometry=odometry),
+        checkpoint.settings(recording, finder, odometry=odometry + 1e-9),
+        checkpoint.settings(recording, finder, odometry=None),
+        checkpoint.settings(recording, sglpr_jax.LoopDetector(params).finder, odometry=odometry),
+        checkpoint.settings(dataclasses.replace(recording, times=recording.times + 1), finder, odometry=odometry),
     )
-    assert base == unfinished.settings(recording, finder, odometry=odometry.copy())
+    assert base == checkpoint.settings(recording, finder, odometry=odometry.copy())
     assert all(other != base for other in others)

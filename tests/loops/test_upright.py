@@ -8,20 +8,19 @@ from recordings import reading_scans
 from scipy.spatial.transform import Rotation
 
 import sglpr_jax
+from sglpr_jax.data.levelling import Mountings, lidar_pose, upright_from_lidar, upright_odometry, upright_poses
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.closure import planar_loop
 from sglpr_jax.loops.config import CandidateConfig
 from sglpr_jax.loops.consistency import agree
 from sglpr_jax.loops.drift import deviations
-from sglpr_jax.loops.find import find_loops
-from sglpr_jax.loops.loop import planar_loop
-from sglpr_jax.loops.mountings import Mountings, upright_from_lidar
-from sglpr_jax.loops.places import PlaceMap
-from sglpr_jax.loops.registration import register
-from sglpr_jax.loops.transforms import inverse, moved_covariance, transform, transformed
-from sglpr_jax.loops.upright import lidar_pose, upright_odometry, upright_poses
-from sglpr_jax.loops.verification import Alignment
+from sglpr_jax.loops.search import find_loops
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.registration.gicp import register
+from sglpr_jax.se3 import inverse, moved_covariance, transform, transformed
 
 TILTS = {"forward": (0.0, 25.0, 0.0), "sideways": (20.0, 10.0, 0.0), "upside down": (170.0, 5.0, 0.0)}
 

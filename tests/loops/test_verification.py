@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage, signal
 
-from sglpr_jax.loops.config import VerificationConfig
-from sglpr_jax.loops.loop import is_degenerate, position_deviation
-from sglpr_jax.loops.seen import square_image
-from sglpr_jax.loops.transforms import inverse, yaw_of
-from sglpr_jax.loops.upright import upright_poses
-from sglpr_jax.loops.verification import DEFAULT, _parabola, align, align_all
+from sglpr_jax.data.levelling import upright_poses
+from sglpr_jax.loops.closure import is_degenerate, position_deviation
+from sglpr_jax.loops.keyframes import square_image
+from sglpr_jax.registration.bev_alignment import DEFAULT, _parabola, align, align_all
+from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.se3 import inverse, yaw_of
 
 from .scenes import difference, place, relative, seen_from
 

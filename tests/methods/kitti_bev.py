@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 KITTI_BEV_RADIUS = 62.0

@@ -9,7 +9,7 @@ import pytest
 
 from sglpr_jax.bev import rotate_image
 from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.methods.learned.bevplace import (
     BEVPLACE,
     REIN,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.methods.learned.disco import DISCO, DiSCO, doubled, loss, occupancy, prepare, spectrum, turned
 from sglpr_jax.methods.learned.method import Tuples
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.handcrafted import HANDCRAFTED
 from sglpr_jax.methods.handcrafted.m2dp import m2dp

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.method import Tuples
 from sglpr_jax.methods.learned.pointnetvlad import POINTNETVLAD, TNet, loss, scaled_points, turned

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.methods.learned.distance import learned_distance
 from sglpr_jax.methods.learned.method import Tuples
 from sglpr_jax.methods.learned.rinet import CLASSES, RINET, loss, prepare, ring_image, same_place, strongest_phase

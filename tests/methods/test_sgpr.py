@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.labels import to_raw
 from sglpr_jax.methods.learned import LEARNED
 from sglpr_jax.methods.learned.method import Tuples

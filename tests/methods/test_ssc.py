@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import to_classes
 from sglpr_jax.methods.handcrafted.ssc import NEWEST, PAPER, ssc, ssc_distance
 from sglpr_jax.methods.outline_alignment import align, best_move, best_shift

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.config import ModelConfig, SwinConfig
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures"
 TOLERANCE = 1e-4

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.heads.place import PlaceHead
+from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, model_preset
 from sglpr_jax.models.input_image import field_of_view, prepare
 from sglpr_jax.models.params import Params
+from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.polar import to_polar
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, forward, init, segment
 from sglpr_jax.models.weights_file import load, save
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.backbones.attention import (
+from sglpr_jax.models.swin import (
     BLOCKED,
     WindowAttention,
     join_windows,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.average import average
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.weights import by_name, for_places
 from sglpr_jax.models.whitening import whitened

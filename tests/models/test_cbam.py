@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.heads.cbam import CBAM, ChannelGate, largest
+from sglpr_jax.models.place_head import CBAM, ChannelGate, largest
 
 SPATIAL = "SpatialGate.spatial"
 

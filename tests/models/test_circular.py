@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models import sglpr
-from sglpr_jax.models.backbones.circular import CircularDecoder, CircularNet, block_means
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.heads.spectrum import Spectrum, amplitudes
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.circular import CircularDecoder, CircularNet, block_means
+from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, model_preset
+from sglpr_jax.models.place_head import Spectrum, amplitudes
 
 RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
 HEAD = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)

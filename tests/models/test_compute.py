@@ -10,10 +10,8 @@ import pytest
 
 from sglpr_jax.grid import Grid
 from sglpr_jax.models import sglpr
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 
 HEAD = HeadConfig(tap="tokens", channels=(16,), kernels=(3,), strides=(1,), cbam_reduction=4, clusters=4)
 SWIN = SwinConfig(embed_dim=8, depths=(1,), heads=(2,), window=4, drop_path=0.0)

@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 
-from sglpr_jax.models.config import ModelConfig
-from sglpr_jax.models.config_dict import config_from_dict
-from sglpr_jax.models.presets import MODELS, model_preset
+from sglpr_jax.models.config import MODELS, ModelConfig, config_from_dict, model_preset
 
 
 def values_of(config: ModelConfig) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import pytest
 from jax.scipy.special import erf
 from scipy.ndimage import correlate
 
-from sglpr_jax.models.heads.detail import Detail
+from sglpr_jax.models.segmentation_head import Detail
 
 
 @pytest.fixture(scope="module")

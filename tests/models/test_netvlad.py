@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.heads.netvlad import NetVLAD
 from sglpr_jax.models.layers import l2_normalize
+from sglpr_jax.models.place_head import NetVLAD
 
 LAYERS = {
     "assignment": ("cluster_weights", "cluster_biases", "bn1"),

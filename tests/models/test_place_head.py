@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.heads.place import PlaceHead
+from sglpr_jax.models.place_head import PlaceHead
 
 
 def head(kernels, strides):

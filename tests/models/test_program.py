@@ -11,9 +11,9 @@ import onnxruntime
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models import program
-from sglpr_jax.models.presets import model_preset
-from sglpr_jax.models.program import input_description, save_program
+from sglpr_jax.models import export as program
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.export import input_description, save_program
 
 RNG = np.random.default_rng(0)
 TINY = model_preset("tiny")

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.config import HeadConfig, SwinConfig, model_preset
 from sglpr_jax.models.input_image import field_of_view, prepare
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe, forward, init, segment
 
 # One stage instead of two, so that a program compiles in a second.

@@ -10,13 +10,10 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 from sglpr_jax.models import sglpr
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.sglpr import CircularSwin
-from sglpr_jax.models.backbones.sglpr_config import SglprConfig
-from sglpr_jax.models.config import HeadConfig, ModelConfig
-from sglpr_jax.models.heads.place import PlaceHead
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, SglprConfig, model_preset
+from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.sglpr import forward
+from sglpr_jax.models.swin_on_circular import CircularSwin
 from sglpr_jax.models.weights import weight_shapes
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.retrieval.heat_maps import heat_maps

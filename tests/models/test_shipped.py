@@ -12,11 +12,9 @@ import pytest
 import safetensors.numpy
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models import shipped
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models import weights_file
+from sglpr_jax.models.config import HeadConfig, SwinConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import describe
 from sglpr_jax.models.shipped import shipped_weights, weights_folder
 from sglpr_jax.models.weights import for_places
@@ -64,17 +62,17 @@ def params(random_params) -> Params:
 @pytest.fixture
 def placeholder(params, tmp_path, monkeypatch) -> Path:
     """A set of weights `placeholder`, which is all that ships."""
-    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
-    folder = save(for_places(params), shipped.FOLDER / "placeholder", half=True)
+    monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "package")
+    folder = save(for_places(params), weights_file.FOLDER / "placeholder", half=True)
     (folder / CARD_FILE).write_text("# A card\n" + "".join(f"\n## {title}\n\n{text}\n" for title, text in CARD.items()))
     return folder
 
 
 @pytest.mark.slow
 def test_every_set_that_ships_is_fit_to():
-    assert shipped_weights(), f"{shipped.FOLDER}: expected at least one set of weights"
+    assert shipped_weights(), f"{weights_file.FOLDER}: expected at least one set of weights"
     for name in shipped_weights():
-        assert_fit_to_ship(shipped.FOLDER / name)
+        assert_fit_to_ship(weights_file.FOLDER / name)
 
 
 def test_the_placeholder_is_fit_to_ship(placeholder):
@@ -128,7 +126,7 @@ def test_what_is_neither_a_name_nor_a_folder_lists_the_names(placeholder, tmp_pa
     for unknown in ("simulatd", str(tmp_path / "none"), placeholder / WEIGHTS_FILE):
         with pytest.raises(FileNotFoundError, match=rf"{unknown}: .* \(placeholder\), found neither"):
             load(unknown)
-    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "empty")
+    monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "empty")
     assert shipped_weights() == ()
     with pytest.raises(FileNotFoundError, match=r"circular: .*\(there are none\), found neither"):
         load("circular")

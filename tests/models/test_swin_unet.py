@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
-from sglpr_jax.models.backbones.attention import WindowAttention
-from sglpr_jax.models.backbones.swin_layers import DropPath, PatchEmbed, SwinBlock
-from sglpr_jax.models.backbones.swin_unet import SwinUnet, drop_path_rates
 from sglpr_jax.models.layers import LayerNorm
+from sglpr_jax.models.swin import DropPath, PatchEmbed, SwinBlock, WindowAttention
+from sglpr_jax.models.swin_unet import SwinUnet, drop_path_rates
 
 MODEL = SwinUnet(embed_dim=8, depths=(2, 2), heads=(1, 2), window=4, drop_path=0.5)
 

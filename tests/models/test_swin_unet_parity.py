@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax import losses
-from sglpr_jax.models.backbones.swin_layers import FinalPatchExpand
-from sglpr_jax.models.backbones.swin_unet import SwinUnet
 from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.swin import FinalPatchExpand
+from sglpr_jax.models.swin_unet import SwinUnet
 from sglpr_jax.models.torch_import import from_torch_names, torch_name
 
 FILES = (

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from sglpr_jax.models.config import HeadConfig, ModelConfig
+from sglpr_jax.models.config import HeadConfig, ModelConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import init
 from sglpr_jax.models.torch_import import from_swin_t, from_torch_names, import_swin_t, import_swin_unet, torch_name
 from sglpr_jax.models.weights import as_tree, weight_shapes

@@ -12,10 +12,8 @@ import safetensors.numpy
 
 import sglpr_jax
 from sglpr_jax.models import weights_file
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.config import CircularConfig, HeadConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.weights import (
     as_tree,
     by_name,

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sglpr_jax.models.heads.whitening import Whitening
-from sglpr_jax.models.presets import model_preset
+from sglpr_jax.models.config import model_preset
+from sglpr_jax.models.place_head import Whitening
 from sglpr_jax.models.sglpr import describe, init
 from sglpr_jax.models.weights_file import load, save
 from sglpr_jax.models.whitening import fit_whitening, unwhitened, whitened

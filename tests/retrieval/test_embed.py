@@ -11,7 +11,7 @@ from recordings import of_images, of_scans, with_points
 
 from sglpr_jax.bev import even_cells, rasterize, rasterize_labels, rotate_image, rotate_labels, rotate_points
 from sglpr_jax.data.density_image import density_bev
-from sglpr_jax.data.formats.label_images import label_image_pixels
+from sglpr_jax.data.formats.png import label_image_pixels
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.grid import Grid

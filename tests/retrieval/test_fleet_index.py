@@ -10,7 +10,7 @@ import pytest
 from sglpr_jax import FleetIndex, Index
 from sglpr_jax.retrieval.fleet_index import TABLE
 from sglpr_jax.retrieval.overlaps import overlaps
-from sglpr_jax.retrieval.place_rows import FORMAT, place_rows
+from sglpr_jax.retrieval.parquet import FORMAT, place_rows
 
 from .places import draw, file_of
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.presets import MODELS, model_preset
+from sglpr_jax.models.config import MODELS, HeadConfig, SwinConfig, model_preset
 from sglpr_jax.models.sglpr import forward, init
 from sglpr_jax.models.shipped import shipped_weights
 from sglpr_jax.models.weights_file import load

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 import sglpr_jax
 from sglpr_jax.methods.method import ImageMethod
 from sglpr_jax.methods.registry import method_named
-from sglpr_jax.retrieval.place_rows import POSE, place_rows
-from sglpr_jax.retrieval.place_store import embed_to_store, read_places, stored_places
+from sglpr_jax.retrieval.parquet import POSE, embed_to_store, place_rows, read_places, stored_places
 
 from .places import file_of
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from recordings import of_scans
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.retrieval.reuse import fingerprint
 
 

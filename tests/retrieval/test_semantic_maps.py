@@ -10,14 +10,13 @@ from recordings import of_images
 
 from sglpr_jax.bev import even_cells, rasterize, rasterize_labels
 from sglpr_jax.data.density_image import density_bev, density_label_bev
-from sglpr_jax.data.formats.label_images import label_image_pixels
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.formats.png import label_image_pixels
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.grid import Grid
 from sglpr_jax.labels import to_raw
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.input_image import field_of_view
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.models.sglpr import init, segment
 from sglpr_jax.retrieval.semantic_maps import semantic_map
 

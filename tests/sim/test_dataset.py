@@ -9,25 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.density_image import density_bev, density_image, density_label_image
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.sampling.batch import read_batch
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.labels import to_classes
-from sglpr_jax.poses import positions_from_camera
-from sglpr_jax.sim import (
-    SENSORS,
-    Sensor,
-    plan_sessions,
-    recording,
-    scan,
-    simulate_recording,
-    write_dataset,
-    write_sessions,
-)
+from sglpr_jax.se3 import positions_from_camera
+from sglpr_jax.sim import recording
+from sglpr_jax.sim.dataset import write_dataset, write_sessions
+from sglpr_jax.sim.recording import simulate_recording
 from sglpr_jax.sim.scenery import OUTSKIRTS
+from sglpr_jax.sim.sensor import SENSORS, Sensor, scan
+from sglpr_jax.sim.sessions import plan_sessions
 
 TINY = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
 SCANS = 4

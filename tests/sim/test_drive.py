@@ -5,11 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sglpr_jax.poses import distances
-from sglpr_jax.sim import plan_scan_path, poses_on, read_path
+from sglpr_jax.se3 import distances
 from sglpr_jax.sim.drive import (
     name_of_path,
     plan_path,
+    plan_scan_path,
+    poses_on,
+    read_path,
     speeds,
     thinned,
 )

@@ -11,15 +11,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy.spatial import KDTree
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.formats.scan_files import read_scan
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.readers import open_recording
 from sglpr_jax.labels import CATEGORIES, to_classes
-from sglpr_jax.sim import SENSORS, Sensor, plan_sessions, write_sessions
+from sglpr_jax.sim.dataset import write_sessions
 from sglpr_jax.sim.drive import plan_path
 from sglpr_jax.sim.layouts import nclt_scan
 from sglpr_jax.sim.routes import ROLES, plan_days
-from sglpr_jax.sim.sensor import NCLT_HEIGHT_M
+from sglpr_jax.sim.sensor import NCLT_HEIGHT_M, SENSORS, Sensor
+from sglpr_jax.sim.sessions import plan_sessions
 
 DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
 TINY = Sensor(elevations_deg=(10.0, 2.0, -1.0, -3.0, -6.0, -10.0, -14.0, -18.0), azimuth_steps=120, height_m=1.0)

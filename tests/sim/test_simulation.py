@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 from sglpr_jax.data.submap import submaps
-from sglpr_jax.sim import CARRIERS, SENSORS, simulate, simulate_repeating
-from sglpr_jax.sim.simulation import default_dataset, default_sessions
+from sglpr_jax.sim.carriers import CARRIERS
+from sglpr_jax.sim.repeating import simulate_repeating
+from sglpr_jax.sim.sensor import SENSORS
+from sglpr_jax.sim.simulation import default_dataset, default_sessions, simulate
 
 THIN = {"scans": 3, "azimuth_steps": 40, "sensor": "vlp16"}
 

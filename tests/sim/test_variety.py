@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sglpr_jax.data import open_recording
 from sglpr_jax.data.density_image import density_image, density_label_image
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.sim import simulate, simulate_recording
-from sglpr_jax.sim.simulation import _lidar
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.sim.recording import simulate_recording
+from sglpr_jax.sim.simulation import _lidar, simulate
 from sglpr_jax.sim.variety import vary
 
 SCANS = 300

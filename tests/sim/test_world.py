@@ -6,7 +6,7 @@ import pytest
 from town import LOOP, THERE_AND_BACK, drive
 
 from sglpr_jax.labels import CATEGORIES, to_classes
-from sglpr_jax.sim import World, build_world, vehicles
+from sglpr_jax.sim import vehicles
 from sglpr_jax.sim.ground import is_raised, label_at, surface_height
 from sglpr_jax.sim.raw_ids import (
     BUILDING,
@@ -24,6 +24,7 @@ from sglpr_jax.sim.raw_ids import (
 from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.shapes import Shapes
 from sglpr_jax.sim.styles import STYLES
+from sglpr_jax.sim.world import World, build_world
 
 SEEDS = range(4)
 _worlds: dict[tuple, World] = {}

@@ -9,11 +9,8 @@ import pytest
 from sglpr_jax.data.sampling.batch import Batch
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.backbones.circular_config import CircularConfig
-from sglpr_jax.models.backbones.swin_config import SwinConfig
-from sglpr_jax.models.config import HeadConfig
+from sglpr_jax.models.config import CircularConfig, HeadConfig, SwinConfig, model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.training.batch_queue import BatchSource
 from sglpr_jax.training.config import OptimizerConfig, TrainConfig
 

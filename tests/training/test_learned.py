@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.losses import descriptor_distance
 from sglpr_jax.methods.learned.distance import learned_distance

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recordings import of_images
 
-from sglpr_jax.data import Recording
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.models.config import ModelConfig

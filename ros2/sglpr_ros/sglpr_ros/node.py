@@ -20,8 +20,8 @@ from sglpr_jax.live.ros_wire import Wire
 from sglpr_jax.live.sinks import SinkOptions
 from sglpr_jax.live.sources import SourceOptions
 from sglpr_jax.live.warm_up import warm_up
+from sglpr_jax.loops.checkpoint import alone
 from sglpr_jax.loops.detector import LoopDetector
-from sglpr_jax.loops.unfinished import alone
 from sglpr_jax.models.weights_file import load
 from sglpr_ros.parameters import command_of, defaults
 from sglpr_ros.wire import RclpyWire

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from sglpr_jax.data.formats.scan_size import MOST_POINTS, check_bytes
+from sglpr_jax.data.formats.cloud_text import MOST_POINTS, check_bytes
 from sglpr_jax.files import in_short
 from sglpr_jax.numpy_files import read_array
 

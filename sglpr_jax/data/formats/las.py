@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.scan_size import BLOCK_POINTS, check_points
+from sglpr_jax.data.formats.cloud_text import BLOCK_POINTS, check_points
 from sglpr_jax.data.point_times import TimeField, time_field_of
 from sglpr_jax.files import in_short, naming
 

@@ -1,4 +1,4 @@
-"""Reads points and their times from .pcd files, the format of the Point Cloud Library."""
+"""LZF decompression, for binary_compressed .pcd files. LZF data consists of literal runs and back references."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -10,10 +10,63 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.lzf import decompress_lzf
-from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
-from sglpr_jax.data.formats.scan_size import blocks_of, check_points, mapped_content, read_content
+from sglpr_jax.data.formats.cloud_text import (
+    blocks_of,
+    check_points,
+    mapped_content,
+    number_rows,
+    read_content,
+    text_lines,
+    whole_number,
+)
 from sglpr_jax.data.point_times import TimeField, time_field_of
+
+
+def decompress_lzf(data: bytes, *, size: int) -> bytes:
+    """Return the decompressed data.
+
+    Arguments:
+      data: Compressed data.
+      size: Expected number of decompressed bytes.
+
+    Raises:
+      ValueError: If `data` is truncated, malformed or of another size.
+    """
+    out = bytearray()
+    at, end = 0, len(data)
+    try:
+        while at < end:
+            control = data[at]
+            at += 1
+            if control < 32:  # a literal run of control + 1 bytes
+                out += data[at : at + control + 1]
+                at += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length += data[at]
+                at += 1
+            start = len(out) - ((control & 31) << 8) - data[at] - 1
+            at += 1
+            if start < 0:
+                raise ValueError("expected LZF, found a reference to before the start")
+            _copy(out, start, length + 2)
+            if len(out) > size:
+                break
+    except IndexError as error:
+        raise ValueError("expected LZF, found truncated data") from error
+    if len(out) != size or at != end:
+        raise ValueError(f"expected {size} decompressed bytes, found {len(out)}")
+    return bytes(out)
+
+
+def _copy(out: bytearray, start: int, length: int) -> None:
+    """Append `length` bytes from `start`. The range may overlap the appended bytes."""
+    whole = out[start : start + length]
+    while len(whole) < length:
+        whole += whole[: length - len(whole)]
+    out += whole
+
 
 _NUMBERS = {
     **{("F", 4): "<f4", ("F", 8): "<f8"},

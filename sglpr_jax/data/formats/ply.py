@@ -10,8 +10,15 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.number_text import number_rows, text_lines, whole_number
-from sglpr_jax.data.formats.scan_size import blocks_of, check_points, mapped_content, read_content
+from sglpr_jax.data.formats.cloud_text import (
+    blocks_of,
+    check_points,
+    mapped_content,
+    number_rows,
+    read_content,
+    text_lines,
+    whole_number,
+)
 from sglpr_jax.data.point_times import TimeField, time_field_of
 
 _TYPES = {

@@ -1,16 +1,19 @@
 """Reads text files with one row of numbers per frame: poses and timestamps."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.choices import TimeUnit
-from sglpr_jax.data.formats.timed_poses import poses_of
+from sglpr_jax.data.choices import PoseFormat, TimeUnit
+from sglpr_jax.data.poses import poses_at_scans, poses_of, unturned
 from sglpr_jax.data.times import ADVICE, times_of
 from sglpr_jax.data.warning import warn
-from sglpr_jax.poses import ROTATION_TOLERANCE, are_rotations
+from sglpr_jax.fields import check_value
+from sglpr_jax.se3 import ROTATION_TOLERANCE, are_rotations
 
 CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
@@ -170,3 +173,241 @@ def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.nd
     if not finite.all():
         raise ValueError(f"{where}: expected finite numbers, found {words[int(finite.argmin())]!r:.40}")
     return values
+
+
+MOST_HEIGHT_M = 100.0
+"""Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
+JUMP_M = 10.0
+JUMP_STEPS = 8.0
+"""A step between two scans is a jump if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Positions and times of the frames of a sequence."""
+
+    positions: np.ndarray
+    """Positions (n, 3) as float64, in metres, z up."""
+    times: np.ndarray | None
+    """Times (n,) as float64, in seconds, or None."""
+    source: str
+    """Description of the pose source."""
+    by_row: bool = False
+    """Whether row i belongs to frame i regardless of the times, because the times are those of the frames."""
+    rotations: np.ndarray | None = None
+    """Rotations (n, 3, 3) of the frames, or None for csv."""
+
+
+TIME_COLUMNS = ("t", "time", "timestamp")
+"""Names of the csv column with the times in seconds."""
+TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
+"""Names with a unit, used if none of `TIME_COLUMNS` exists."""
+KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
+
+
+def read_trajectory(
+    path: Path,
+    *,
+    format: PoseFormat = "auto",
+    times: Path | None = None,
+    time_unit: TimeUnit = "auto",
+    twelve_numbers: Literal["kitti", "lidar"] | None = None,
+) -> Trajectory:
+    """Read a pose file with one row per frame. Warns if the heights look wrong.
+
+    Arguments:
+      path: Pose file.
+      format: Format of the pose file. "auto" recognises csv by its ending and tum by its 8 numbers a line.
+      times: File of timestamps, one number a line. They replace the times of the pose file.
+      time_unit: Unit of the times in both files (`times_of`).
+      twelve_numbers: Format of files with 12 numbers a line, for "auto". It cannot be detected, and horizontal
+        distances depend on it.
+
+    Raises:
+      FileNotFoundError: If a file does not exist.
+      ValueError: If a file is malformed or empty, the numbers of poses and times differ, or "auto" cannot determine the
+        format.
+    """
+    check_value(format, PoseFormat, f"{path}, format")
+    check_value(time_unit, TimeUnit, f"{path}, time_unit")
+    unit = "s" if times is not None and time_unit == "auto" else time_unit  # times that are replaced are not judged
+    trajectory = _read(path, _format_of(path, twelve_numbers) if format == "auto" else format, unit)
+    if len(trajectory.positions) == 0:
+        raise ValueError(f"{path}: expected at least one pose, found none")
+    check_height(trajectory.positions, path=path)
+    if times is None:
+        return trajectory
+    clock = read_times(times, unit=time_unit)
+    if clock is not None and len(clock) != len(trajectory.positions):
+        raise ValueError(f"{times}: expected {len(trajectory.positions)} times, one per pose, found {len(clock)}")
+    return replace(trajectory, times=clock, by_row=True)
+
+
+def check_height(positions: Float[np.ndarray, "n 3"], *, path: Path) -> None:
+    """Warn if the heights range over more than `MOST_HEIGHT_M` and a horizontal range: the frame is probably wrong."""
+    forward, left, up = np.ptp(positions, axis=0)
+    if up > MOST_HEIGHT_M and up > min(forward, left):
+        warn(
+            f"{path}: expected z up, found heights over {up:.0f} m and {forward:.0f} x {left:.0f} m on the ground;"
+            " are the poses in another frame (kitti: camera axes, lidar: z up)?"
+        )
+
+
+def check_order(positions: Float[np.ndarray, "n 3"], ids: Sequence[str], *, path: Path) -> None:
+    """Warn if consecutive scans are much farther apart than most: the scans may have another order than the poses."""
+    if len(positions) < 3:
+        return
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    usual = float(np.median(steps))
+    far = np.flatnonzero(steps > max(JUMP_M, JUMP_STEPS * usual))
+    near = _nearest(positions)
+    if not len(far) and usual <= max(JUMP_M, JUMP_STEPS * near):
+        return
+    worst = int(np.argmax(steps))
+    warn(
+        f"{path}: expected consecutive scans near each other, found {ids[worst]} and {ids[worst + 1]}"
+        f" {steps[worst]:.0f} m apart ({len(far)} jumps; half of the steps are below {usual:.1f} m, the median distance"
+        f" to the nearest other pose is {near:.1f} m); are the poses in the order of the scans?"
+    )
+
+
+def _nearest(positions: Float[np.ndarray, "n 3"]) -> float:
+    """Median distance to the nearest other pose, in metres."""
+    from scipy.spatial import KDTree  # imported here because the import is slow
+
+    return float(np.median(KDTree(positions).query(positions, k=2)[0][:, 1]))
+
+
+def _format_of(path: Path, twelve_numbers: str | None) -> str:
+    """Return the format by the ending or the first line."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a pose file, found none")
+    if path.suffix == ".csv":
+        return "csv"
+    columns = columns_of(path)
+    if columns == 12 and twelve_numbers is not None:
+        return twelve_numbers
+    if columns == 12:
+        raise ValueError(
+            f"{path}: expected --pose-format kitti (camera frame: KITTI, SemanticKITTI) or lidar (z up) for poses of"
+            " 12 numbers a line, found neither"
+        )
+    if columns != 8:
+        raise ValueError(f"{path}: expected 12 numbers a line (kitti, lidar), 8 (tum) or a .csv, found {columns}")
+    return "tum"
+
+
+def _read(path: Path, format: str, unit: TimeUnit) -> Trajectory:
+    if format == "csv":
+        return _read_csv(path, unit)
+    if format == "tum":
+        poses, times = read_tum(path, time_unit=unit)
+        return Trajectory(poses[:, :3, 3], times, _said(path, "TUM"), rotations=poses[:, :3, :3])
+    camera = format == "kitti"
+    poses = read_kitti(path, camera=camera)
+    said = _said(path, "camera" if camera else "z up")
+    return Trajectory(poses[:, :3, 3], None, said, rotations=poses[:, :3, :3])
+
+
+def _read_csv(path: Path, unit: TimeUnit) -> Trajectory:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a pose file, found none")
+    names, clock = _header(path)
+    columns = dict(zip(names, read_rows(path, columns=len(names), header_lines=1, separator=",").T, strict=True))
+    times = None if clock is None else times_of(columns[clock], source=path, unit=unit)
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    check_positions(path, positions)
+    return Trajectory(positions, times, _said(path, "csv"))
+
+
+def _header(path: Path) -> tuple[list[str], str | None]:
+    """Return the column names of a csv file, and the name of the time column or None."""
+    header = path.read_text(errors="replace").partition("\n")[0]
+    names = [name.strip().lower() for name in header.removeprefix("#").split(",")]  # numpy.savetxt begins it with #
+    clocks = [name for name in names if name in TIME_COLUMNS] or [name for name in names if name in TIME_COLUMNS_S]
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"{path}: expected a header with x, y and z, found {header[:80]!r}")
+    if len(set(names)) < len(names) or len(clocks) > 1:
+        raise ValueError(
+            f"{path}: expected every column once, and one of {', '.join(KNOWN_CLOCKS)}, found {header[:80]!r}"
+        )
+    unused = [name for name in names if ("time" in name or "stamp" in name) and name not in clocks]
+    if unused:
+        warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
+    return names, clocks[0] if clocks else None
+
+
+def _said(path: Path, format: str) -> str:
+    """Short description of the file for tables: the last two parts of its path, and the format."""
+    return f"{Path(*path.parts[-2:])} ({format})"
+
+
+POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
+TIMES_FILE = "times.txt"
+
+
+def folder_trajectory(
+    root: Path,
+    *,
+    scans: int,
+    poses: Path | None = None,
+    pose_format: PoseFormat = "auto",
+    times: Path | None = None,
+    time_unit: TimeUnit = "auto",
+) -> tuple[Float[np.ndarray, "n 3"] | None, Float[np.ndarray, " n"] | None, str | None]:
+    """Read the positions and times of the scans in a plain folder.
+
+    If the poses have other times than the scans, or another number of rows, they are interpolated (`poses_at_scans`).
+
+    Arguments:
+      root: Folder of the scans.
+      scans: Number of scans.
+      poses: Pose file. By default, the file of `POSE_FILES` beside the scans. In a file beside the scans, 12 numbers a
+        line are poses of the LiDAR, z up.
+      pose_format: Format of the pose file.
+      times: File of timestamps. By default, `TIMES_FILE` beside the scans, or else the times of the poses.
+      time_unit: Unit of the times in both files. With "auto", row numbers are not times (`times_of`).
+
+    Returns:
+      Positions in metres, times in seconds, and a description of the pose source. Each is `None` if unknown.
+
+    Raises:
+      FileNotFoundError: If `se3` or `times` does not exist.
+      ValueError: If the folder has several pose files, a file is malformed, `times` has another number of rows, or a
+        scan has no pose.
+    """
+    beside = [root / name for name in POSE_FILES if (root / name).is_file()]
+    if poses is None and len(beside) > 1:
+        raise ValueError(f"{root}: expected one pose file, found {', '.join(path.name for path in beside)}")
+    path = poses or next(iter(beside), None)
+    clock = times or (root / TIMES_FILE if (root / TIMES_FILE).is_file() else None)
+    seconds = None
+    if clock is not None:
+        seconds = read_times(clock, unit=time_unit)
+        _check_rows(clock, scans if seconds is None else len(seconds), scans)
+    if path is None:
+        return None, seconds, None
+    twelve = "lidar" if poses is None else None
+    found = read_trajectory(path, format=pose_format, time_unit=time_unit, twelve_numbers=twelve)
+    positions, said = _at_scans(path, found, seconds, scans, of=f"scan of {root.resolve().name}")
+    source = found.source if poses is not None else path.name
+    return positions, found.times if seconds is None else seconds, f"{source}{said}"
+
+
+def _at_scans(
+    path: Path, trajectory: Trajectory, times: Float[np.ndarray, " n"] | None, scans: int, *, of: str
+) -> tuple[Float[np.ndarray, "n 3"], str]:
+    """Positions of all scans, and how they were matched if not row by row. Raises ValueError if a scan has no pose."""
+    found = poses_at_scans(str(path), unturned(trajectory.positions), trajectory.times, times, scans=scans, of=of)
+    if times is not None and not found.kept.all():
+        late = times[~found.kept]
+        raise ValueError(
+            f"{path}: expected poses at the times of all {scans} scans, found none for {len(late)}, the first at "
+            f"{late[0]:.1f} s; remove these scans, or pass the poses only to bin/evaluate, which skips them"
+        )
+    return found.poses[:, :3, 3], f", {found.said}" if found.said else ""
+
+
+def _check_rows(path: Path, rows: int, scans: int) -> None:
+    if rows != scans:
+        raise ValueError(f"{path}: expected {scans} rows, one per scan, found {rows}")

@@ -8,11 +8,10 @@ from jaxtyping import Float32, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.arrays import read_npy, read_npz
-from sglpr_jax.data.formats.bin_records import Records, is_record, read_records
+from sglpr_jax.data.formats.bin_records import Records, is_record, read_records, record_of_scan
 from sglpr_jax.data.formats.las import las_records
 from sglpr_jax.data.formats.pcd import pcd_records
 from sglpr_jax.data.formats.ply import ply_records
-from sglpr_jax.data.formats.record_size import record_of_scan
 from sglpr_jax.fields import check_value
 
 READERS: dict[ScanFormat, Callable[[Path], Records]] = {

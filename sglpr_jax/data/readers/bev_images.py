@@ -13,12 +13,11 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
-from sglpr_jax.data.formats.grey_png import read_grey_png
+from sglpr_jax.data.formats.png import read_grey_png
 from sglpr_jax.data.formats.pose_files import read_poses, rows_of
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import image_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Recording, image_record
 
 
 def recording_names(root: Path) -> tuple[str, ...]:

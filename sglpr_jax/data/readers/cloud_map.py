@@ -14,16 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
+from sglpr_jax.data.cloud_map import TiledCloud, tiled_cloud, visible_points
 from sglpr_jax.data.formats.cloud_files import cloud_blocks, is_cloud_file
-from sglpr_jax.data.formats.timed_poses import poses_of
-from sglpr_jax.data.formats.trajectory import read_trajectory
+from sglpr_jax.data.formats.pose_files import read_trajectory
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
-from sglpr_jax.data.readable import only
+from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.data.tiled_cloud import TiledCloud, tiled_cloud
-from sglpr_jax.data.visible_points import visible_points
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scan_stream import only
 from sglpr_jax.data.warning import warn
 
 REACH_M = 36.0
@@ -59,7 +57,7 @@ def open_recording(
       time_unit: Unit of the times (`times_of`).
 
     Raises:
-      FileNotFoundError: If `poses` or `times` does not exist.
+      FileNotFoundError: If `se3` or `times` does not exist.
       ValueError: If there are no poses, a file is malformed, no pose has points around it, or the map is too large.
       ImportError: If the map is a .las or .laz file and the extra `las` is not installed.
     """

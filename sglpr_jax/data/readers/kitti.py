@@ -4,7 +4,7 @@
 - `sequences/08/labels/000000.label`: SemanticKITTI's labels, optional for each frame.
 - `sequences/08/times.txt`: timestamps in seconds, one line per frame (optional).
 - `sequences/08/poses.txt`: SemanticKITTI's poses. Their loops are also closed in height.
-- `poses/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
+- `se3/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
 
 Both pose files contain poses of the left camera. Positions are computed without `calib.txt`.
 """
@@ -17,16 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseChoice, ScanFormat, TimeUnit
-from sglpr_jax.data.formats.bin_records import described
+from sglpr_jax.data.formats.bin_records import described, unusual_record
 from sglpr_jax.data.formats.pose_files import read_poses, read_times, rows_of
-from sglpr_jax.data.formats.record_size import unusual_record
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import scan_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.files import naming, read_json
-from sglpr_jax.poses import positions_from_camera
+from sglpr_jax.se3 import positions_from_camera
 
 SIMULATION = "simulation.json"
 """File with the settings of a simulated dataset, written by `bin/simulate`."""

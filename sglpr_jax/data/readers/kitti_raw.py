@@ -18,8 +18,7 @@ from jaxtyping import Float
 from sglpr_jax.data.formats.pose_files import numbers_of
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import scan_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Recording, scan_record
 from sglpr_jax.files import in_short
 
 EARTH_M = 6378137.0

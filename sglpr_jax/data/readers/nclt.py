@@ -18,12 +18,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Z_UP_FROM_Z_DOWN
-from sglpr_jax.data.formats.timed_poses import match_times
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.poses import match_times
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import scan_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Recording, scan_record
 
 MAX_GAP_S = 0.5
 """Maximum time between a scan and its pose, in seconds. A Segway moves half a metre in this time."""

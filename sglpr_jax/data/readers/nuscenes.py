@@ -20,10 +20,8 @@ from sglpr_jax.data.formats.json_tables import column_of, numbers_of, table_rows
 from sglpr_jax.data.formats.pose_files import rotations_of
 from sglpr_jax.data.formats.scan_files import scan_id
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import scan_record
-from sglpr_jax.data.recording import Recording
-from sglpr_jax.files import naming
-from sglpr_jax.names import path_inside
+from sglpr_jax.data.recording import Recording, scan_record
+from sglpr_jax.files import naming, path_inside
 
 CHANNEL = "LIDAR_TOP"
 

@@ -21,8 +21,7 @@ from sglpr_jax.data.formats.arrays import read_npy
 from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import Record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.times import check_order
 from sglpr_jax.files import read_json
 

@@ -1,7 +1,7 @@
 """Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_poses.py`).
 
 - `my_scans/full0.bin`, `full1.bin`, ..., `full10.bin`: scans in the order of their numbers. Hidden files are ignored.
-- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `poses.tum` and `poses.csv` work, too.
+- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `se3.tum` and `se3.csv` work, too.
 - `my_scans/times.txt`: timestamps, one number a line, in seconds unless `time_unit` names another unit.
 """
 
@@ -10,15 +10,12 @@ from functools import partial
 from pathlib import Path
 
 from sglpr_jax.data.choices import PoseFormat, RecordFormat, ScanFormat, TimeUnit
-from sglpr_jax.data.formats.bin_records import described, is_record
-from sglpr_jax.data.formats.folder_poses import POSE_FILES, TIMES_FILE, folder_trajectory
-from sglpr_jax.data.formats.record_size import check_record, find_record
+from sglpr_jax.data.formats.bin_records import check_record, described, find_record, is_record
+from sglpr_jax.data.formats.pose_files import POSE_FILES, TIMES_FILE, check_order, folder_trajectory
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, guess_format, says_its_format, scan_id
-from sglpr_jax.data.formats.trajectory import check_order
 from sglpr_jax.data.listing import files_in, left_aside
 from sglpr_jax.data.reader import Reader
-from sglpr_jax.data.record import scan_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.recording import Recording, scan_record
 
 
 def recording_names(root: Path) -> tuple[str, ...]:
@@ -47,7 +44,7 @@ def open_recording(
       time_unit: Unit of the times (`times_of`).
 
     Raises:
-      FileNotFoundError: If the folder has no scans, or `poses` or `times` does not exist.
+      FileNotFoundError: If the folder has no scans, or `se3` or `times` does not exist.
       ValueError: If two files differ only by their ending, the record cannot be detected, or the poses or timestamps
         are malformed.
     """

@@ -8,10 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.timed_poses import match_times
 from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.record import Record, found_record
-from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.poses import match_times
+from sglpr_jax.data.recording import Record, Recording, found_record
 
 MAX_GAP_S = 0.1
 """Maximum time between a scan and its pose, in seconds: the duration of one sweep."""

@@ -9,7 +9,7 @@ Frames are numbered from 0, in the order of the poses.
 
 from pathlib import Path
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs.matrix import read_matrix
 from sglpr_jax.evaluation.inputs.own_file import read_own_file
 from sglpr_jax.evaluation.inputs.pair_list import read_pair_list

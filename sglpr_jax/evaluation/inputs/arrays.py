@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Float32, Num
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Num
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs.arrays import as_descriptors
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.files import in_short, naming

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from sglpr_jax.data.formats.scan_poses import poses_at_scans, unturned
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
+from sglpr_jax.data.poses import poses_at_scans, unturned
 from sglpr_jax.files import naming
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 
 
 def needed(path: Path, trajectory: Trajectory | None, *, rows: int | None = None) -> Trajectory:

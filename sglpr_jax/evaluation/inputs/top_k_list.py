@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
 from sglpr_jax.evaluation.inputs.positions import needed
 from sglpr_jax.evaluation.inputs.text_list import as_frame, as_score, check_rows, padded, read_lines
 from sglpr_jax.evaluation.protocols import TopK

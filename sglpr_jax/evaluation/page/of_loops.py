@@ -5,18 +5,15 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.levelling import mountings_of, upright_odometry, upright_poses
 from sglpr_jax.evaluation import figures, loop_figures
+from sglpr_jax.evaluation.overlay import overlaid
 from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing, paragraph
-from sglpr_jax.loops.explanation import why_none
-from sglpr_jax.loops.find import FoundLoops
-from sglpr_jax.loops.loop import Loop, Rejected
-from sglpr_jax.loops.mountings import mountings_of
-from sglpr_jax.loops.optimization import OptimizedTrajectory, trajectory_error
-from sglpr_jax.loops.overlay import overlaid
-from sglpr_jax.loops.reasons import MEANING, counted
-from sglpr_jax.loops.reliability import reliability_of
-from sglpr_jax.loops.seen import square_image
-from sglpr_jax.loops.upright import upright_odometry, upright_poses
+from sglpr_jax.loops.calibration import reliability_of
+from sglpr_jax.loops.closure import MEANING, Loop, Rejected, counted
+from sglpr_jax.loops.keyframes import square_image
+from sglpr_jax.loops.search import FoundLoops, why_none
+from sglpr_jax.pose_graph.optimize import OptimizedTrajectory, trajectory_error
 from sglpr_jax.same_place import NEGATIVE_M
 
 PAGE = "index.html"

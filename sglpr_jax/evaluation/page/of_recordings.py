@@ -3,17 +3,17 @@
 import numpy as np
 from jaxtyping import Float
 
+from sglpr_jax.data.levelling import upright_from_lidar
 from sglpr_jax.evaluation import figures, loop_figures
+from sglpr_jax.evaluation.overlay import overlaid
 from sglpr_jax.evaluation.page.document import Section, document, figure_html, html_table, missing, paragraph
 from sglpr_jax.evaluation.page.of_loops import SHOWN_PAIRS, about, rejected_table, sections_of
-from sglpr_jax.loops.find_between import AlignedParts, FoundBetween, FoundRecordings, Part
-from sglpr_jax.loops.joint_optimization import OptimizedRecordings, placements
-from sglpr_jax.loops.loop import Loop
-from sglpr_jax.loops.mountings import upright_from_lidar
-from sglpr_jax.loops.overlay import overlaid
-from sglpr_jax.loops.seen import square_image
-from sglpr_jax.loops.several_folder import unique_names
-from sglpr_jax.loops.transforms import inverse, yaw_of
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.keyframes import square_image
+from sglpr_jax.loops.search_between import AlignedParts, FoundBetween, FoundRecordings, Part
+from sglpr_jax.pose_graph.folder import unique_names
+from sglpr_jax.pose_graph.optimize import OptimizedRecordings, placements
+from sglpr_jax.se3 import inverse, yaw_of
 
 
 def recordings_page(found: FoundRecordings, *, optimized: OptimizedRecordings | None = None) -> str:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from sglpr_jax.evaluation import figures
 from sglpr_jax.evaluation.scoring import Evaluation
-from sglpr_jax.names import file_name
+from sglpr_jax.files import file_name
 
 if TYPE_CHECKING:
     import matplotlib.figure

@@ -4,15 +4,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sglpr_jax.data import Recording
-from sglpr_jax.data.formats.trajectory import Trajectory
+from sglpr_jax.data.formats.pose_files import Trajectory
+from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.views import view
 from sglpr_jax.evaluation.false_positives import FalsePositive
 from sglpr_jax.evaluation.inputs import Input
 from sglpr_jax.evaluation.page import HeatPicture, Pictures, SemanticPicture
 from sglpr_jax.grid import Grid
+from sglpr_jax.models.config import model_preset
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.presets import model_preset
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.heat_maps import heat_maps
 from sglpr_jax.retrieval.semantic_maps import semantic_map

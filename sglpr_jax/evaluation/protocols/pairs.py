@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from sglpr_jax import metrics
 from sglpr_jax.evaluation.protocols.bootstrap import f1_max_interval
 from sglpr_jax.evaluation.protocols.result import Result
-from sglpr_jax.poses import distances
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
 from sglpr_jax.retrieval.distances import distance_function
+from sglpr_jax.se3 import distances
 
 BLOCK = 32
 """Number of frames compared with all others at a time."""

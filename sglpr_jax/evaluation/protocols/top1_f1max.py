@@ -4,7 +4,8 @@ from sglpr_jax.evaluation.protocols.answers import score_top1_by_distance
 from sglpr_jax.evaluation.protocols.protocol import SCORED_RETRIEVAL, Protocol
 from sglpr_jax.evaluation.protocols.result import Result
 from sglpr_jax.evaluation.protocols.source import Source
-from sglpr_jax.revisits import EXCLUDED_FRAMES, EXCLUDED_S, Near, database_end
+from sglpr_jax.revisits import Near, database_end
+from sglpr_jax.same_place import EXCLUDED_FRAMES, EXCLUDED_S
 
 POSITIVE_M, NEGATIVE_M = 3.0, 20.0
 METRES = f"{POSITIVE_M:g} m / {NEGATIVE_M:g} m"

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sglpr_jax.data.choices import RecordFormat
-from sglpr_jax.data.formats.record_size import record_of_scan
+from sglpr_jax.data.formats.bin_records import record_of_scan
 from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, says_its_format
 from sglpr_jax.data.listing import files_in
-from sglpr_jax.data.record import scan_record
+from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH
 from sglpr_jax.live.frame import LiveFrame
 from sglpr_jax.live.report import Report

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of, rotations_of
-from sglpr_jax.data.formats.timed_poses import BEYOND_S, interpolate, interpolate_turns, poses_of
+from sglpr_jax.data.poses import BEYOND_S, interpolate, interpolate_turns, poses_of
 from sglpr_jax.data.times import PER_SECOND
 from sglpr_jax.growing import GrowingArray
 

@@ -19,9 +19,8 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Num, UInt8
 
 from sglpr_jax.bev import rotate_image
-from sglpr_jax.data.degenerate import check_cloud
 from sglpr_jax.data.density_grid import MAX_COUNT, SIZE
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import check_ready_made, picture
 from sglpr_jax.losses import descriptor_distance, lazy_triplet

@@ -18,8 +18,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Shaped, UInt8
 
-from sglpr_jax.data.degenerate import check_cloud
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.methods.learned.image_layers import Convolution, batch_norm, max_pool
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables

@@ -21,8 +21,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Int
 
 from sglpr_jax.bev import rotate_points
-from sglpr_jax.data.degenerate import check_cloud
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.methods.learned.maximum import maximum
 from sglpr_jax.methods.learned.method import LearnedMethod, Recipe, Tuples, Variables

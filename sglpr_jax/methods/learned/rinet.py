@@ -15,7 +15,7 @@ import optax
 from flax import linen as nn
 from jaxtyping import Array, Float, Float32, Int32
 
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.data.sampling.config import TupleConfig
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.losses import descriptor_distance

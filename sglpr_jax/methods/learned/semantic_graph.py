@@ -8,8 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from sglpr_jax.data.degenerate import check_cloud
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record, check_cloud
 from sglpr_jax.data.views import classes_of
 from sglpr_jax.methods.voxel_means import voxels
 

@@ -9,7 +9,7 @@ import numpy as np
 import safetensors
 
 from sglpr_jax.data.formats.tensors import tensors_as_bytes
-from sglpr_jax.data.record import Record
+from sglpr_jax.data.recording import Record
 from sglpr_jax.files import check_holds_only, in_short, json_text, read_json, replacing
 from sglpr_jax.methods.learned.method import LearnedMethod, Variables
 from sglpr_jax.models.weights import as_tree, by_name, hash_of

@@ -1,1 +1,0 @@
-"""Packs recordings into a few large files, which are faster to read."""

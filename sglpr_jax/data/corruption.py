@@ -1,0 +1,322 @@
+"""Assigns the points of a scan to rings, one ring per laser of the sensor."""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32
+
+from sglpr_jax.data.recording import Record, Recording
+
+GAP_DEG = 0.1
+"""Elevation separates the rings if no ring is wider than this angle, in degrees, and all gaps between rings are
+wider."""
+IN_ORDER = 0.9
+"""Minimum correlation of revolution and elevation for points that are stored ring after ring."""
+
+
+def ring_numbers(
+    points: Float[np.ndarray, "n 3"], *, lasers: Int[np.ndarray, " n"] | None = None
+) -> Int32[np.ndarray, " n"]:
+    """Return the ring of every finite point, counted from 0 at the lowest elevation. Rings without points have no
+    number.
+
+    The first of these sources that separates the rings is used:
+
+    - `lasers`: the laser numbers in files of nuScenes and NCLT, in any order. If all numbers are equal, as in simulated
+      NCLT files, they are ignored.
+    - Elevation, if it separates all rings, as in simulated scans and for sensors with few lasers.
+    - The order of the points, if they are stored ring after ring, each counter-clockwise from straight ahead, as in
+      KITTI's files. There the elevation varies within a ring by more than the distance between two rings.
+
+    Arguments:
+      points: Finite points in the LiDAR frame.
+      lasers: Laser number of each point, or None.
+
+    Raises:
+      ValueError: If no source separates the rings.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int32)
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    told = lasers is not None and lasers.min() < lasers.max()
+    groups = lasers if told else _by_elevation(elevation)
+    groups = groups if groups is not None else _by_order(points, elevation)
+    if groups is None:
+        raise ValueError(
+            "expected a scan with rings (laser numbers in its file, separate elevations, or points ring after ring "
+            f"from straight ahead), found {len(points)} points without rings"
+        )
+    return _from_the_lowest(groups, elevation)
+
+
+def keep_rings(rings: Int[np.ndarray, " n"], beams: int) -> Bool[np.ndarray, " n"]:
+    """Return whether each point remains if the sensor has only `beams` lasers: every 2nd of 64 for 32, every 4th for
+    16.
+
+    The sensor is assumed to have the number of found rings, rounded up to a power of two, because some lasers may have
+    no returns. A sensor with at most `beams` lasers keeps all points.
+
+    Arguments:
+      rings: Ring of each point, from `ring_numbers`.
+      beams: Number of lasers.
+    """
+    found = int(rings.max(initial=0)) + 1
+    sensor = 2 ** math.ceil(math.log2(found))
+    return rings % max(sensor // beams, 1) == 0
+
+
+def _by_elevation(elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
+    order = np.argsort(elevation)
+    rising = elevation[order]
+    starts = np.flatnonzero(np.diff(rising, prepend=-np.inf) > GAP_DEG)
+    ends = np.append(starts[1:], len(rising)) - 1
+    if (rising[ends] - rising[starts]).max() > GAP_DEG:
+        return None
+    groups = np.empty(len(order), np.int64)
+    groups[order] = np.repeat(np.arange(len(starts)), ends - starts + 1)
+    return groups
+
+
+def _by_order(points: Float[np.ndarray, "n 3"], elevation: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | None:
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+    turn = np.cumsum(np.diff(azimuth, prepend=0) < -np.pi)
+    if turn[-1] == 0 or abs(np.corrcoef(turn, elevation)[0, 1]) < IN_ORDER:
+        return None
+    return turn
+
+
+def _from_the_lowest(groups: Int[np.ndarray, " n"], elevation: Float[np.ndarray, " n"]) -> Int32[np.ndarray, " n"]:
+    _, group, count = np.unique(groups, return_inverse=True, return_counts=True)
+    mean = np.bincount(group, weights=elevation) / count
+    return np.argsort(np.argsort(mean)).astype(np.int32)[group]
+
+
+Cloud = Float32[np.ndarray, "n 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scan:
+    """Input of a corruption: the finite points of one scan, the laser of each point if known, and a random
+    generator."""
+
+    points: Cloud
+    lasers: Int[np.ndarray, " n"] | None
+    rng: np.random.Generator
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """Kind of corruption."""
+
+    corrupt: Callable[[Scan, float], Cloud | Bool[np.ndarray, " n"]]
+    """Function of the scan and the strength. It returns a mask of the remaining points, or all points at new
+    positions."""
+    strengths: tuple[float, ...]
+    """Strengths that `bin/stress` uses, from weak to strong."""
+    unit: str = ""
+    """Unit of the strength."""
+    limits: tuple[float, float] = (0.0, np.inf)
+    """Minimum and maximum strength."""
+    needs_lasers: bool = False
+    """Whether `corrupt` needs the laser of each point."""
+
+
+def occlude(scan: Scan, degrees: float) -> Bool[np.ndarray, " n"]:
+    """Remove the points in a sector of the given width, in degrees, about a random heading."""
+    return outside_sector(scan.points, heading=scan.rng.uniform(-np.pi, np.pi), width=np.radians(degrees))
+
+
+def fewer_beams(scan: Scan, beams: float) -> Bool[np.ndarray, " n"]:
+    """Keep the given number of lasers (`laser_rings.keep_rings`). Raises ValueError if the rings are unknown."""
+    return keep_rings(ring_numbers(scan.points, lasers=scan.lasers), int(beams))
+
+
+def add_noise(scan: Scan, metres: float) -> Cloud:
+    """Add Gaussian noise along each ray, with the given standard deviation in metres."""
+    return add_to_range(scan.points, metres * scan.rng.standard_normal(len(scan.points)))
+
+
+def drop_out(scan: Scan, share: float) -> Bool[np.ndarray, " n"]:
+    """Remove each point with the given probability."""
+    return scan.rng.random(len(scan.points)) >= share
+
+
+def offset(scan: Scan, metres: float) -> Cloud:
+    """Move the sensor by the given distance, in metres, to the left or to the right at random."""
+    return moved_left(scan.points, scan.rng.choice((-1, 1)) * metres)
+
+
+def leave(scan: Scan, strength: float) -> Cloud:
+    """Return the points unchanged."""
+    return scan.points
+
+
+def rotate_elsewhere(scan: Scan, strength: float) -> Cloud:
+    """Raise ValueError. Embedding rotates the scans, because it can rotate images, too."""
+    raise ValueError("expected a corruption other than rotation; for rotation use the rotation_seed of embed")
+
+
+KINDS: dict[str, Kind] = {
+    "clean": Kind(leave, strengths=()),
+    "rotation": Kind(rotate_elsewhere, strengths=(0.0,)),
+    "occlusion": Kind(occlude, strengths=(45.0, 90.0, 180.0), unit="°", limits=(0.0, 360.0)),
+    "beams": Kind(fewer_beams, strengths=(32.0, 16.0), limits=(1.0, np.inf), needs_lasers=True),
+    "noise": Kind(add_noise, strengths=(0.05, 0.1, 0.2), unit=" m"),
+    "dropout": Kind(drop_out, strengths=(0.5, 0.9), limits=(0.0, 1.0)),
+    "offset": Kind(offset, strengths=(0.5, 1.0, 2.0), unit=" m"),
+}
+"""All kinds by name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Corruption:
+    """Corruption of every scan of a recording: a kind of `KINDS` and a strength in its unit.
+
+    Raises ValueError if the kind is unknown or the strength is outside its limits.
+    """
+
+    kind: str
+    strength: float = 0.0
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise ValueError(f"expected a kind of corruption among {', '.join(KINDS)}, found {self.kind!r}")
+        low, high = KINDS[self.kind].limits
+        if not low <= self.strength <= high:
+            raise ValueError(f"expected {self.kind} with a strength from {low:g} to {high:g}, found {self.strength:g}")
+
+    @property
+    def name(self) -> str:
+        """Name on the command line: "occlusion-90"."""
+        return f"{self.kind}-{self.strength:g}" if self.strength else self.kind
+
+    @property
+    def label(self) -> str:
+        """Strength with its unit, or the name of the kind if it has no strength."""
+        return f"{self.strength:g}{KINDS[self.kind].unit}" if self.strength else self.kind
+
+    @property
+    def needs_lasers(self) -> bool:
+        """Whether `corrupt` needs the laser of each point."""
+        return KINDS[self.kind].needs_lasers
+
+
+CLEAN = Corruption("clean")
+ROTATION = Corruption("rotation")
+CORRUPTIONS = tuple(Corruption(name, strength) for name, kind in KINDS.items() for strength in kind.strengths)
+"""All corruptions of `bin/stress`."""
+
+
+def chosen_corruptions(names: Sequence[str]) -> tuple[Corruption, ...]:
+    """Return the corruptions with the given names. A kind selects all its strengths. Without names, all corruptions are
+    returned.
+
+    Raises:
+      ValueError: If a name is unknown. The message contains the nearest name.
+    """
+    known = {corruption.name: corruption for corruption in CORRUPTIONS}
+    kinds = {corruption.kind for corruption in CORRUPTIONS}
+    for name in names:
+        if name not in known and name not in kinds:
+            nearest = difflib.get_close_matches(name, [*known, *kinds], n=1, cutoff=0)[0]
+            raise ValueError(
+                f"expected a corruption, found {name!r}; did you mean {nearest!r}? Available: {', '.join(known)}"
+            )
+    return tuple(each for each in CORRUPTIONS if not names or each.name in names or each.kind in names)
+
+
+def corrupt(
+    points: Cloud,
+    corruption: Corruption,
+    *,
+    rng: np.random.Generator,
+    lasers: Int[np.ndarray, " n"] | None = None,
+) -> tuple[Float32[np.ndarray, "m 3"], Bool[np.ndarray, " n"]]:
+    """Corrupt the finite points of a scan.
+
+    Arguments:
+      points: Finite points in the LiDAR frame, in metres.
+      corruption: Kind and strength.
+      rng: Random generator.
+      lasers: Laser of each point, if known.
+
+    Returns:
+      The remaining points, and a mask of them among the given points.
+
+    Raises:
+      ValueError: If the corruption is a rotation (see `rotation_seed` of `embed`), or if the beams cannot be separated.
+    """
+    found = KINDS[corruption.kind].corrupt(Scan(points, lasers, rng), corruption.strength)
+    if found.dtype == bool:
+        return points[found], found
+    return found, np.ones(len(points), bool)
+
+
+def outside_sector(points: Float[np.ndarray, "n 3"], *, heading: float, width: float) -> Bool[np.ndarray, " n"]:
+    """Return whether each point is outside a sector of `width` radians about `heading` (0: ahead,
+    counter-clockwise)."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
+    return np.abs((azimuth - heading + np.pi) % (2 * np.pi) - np.pi) >= width / 2
+
+
+def add_to_range(points: Cloud, metres: Float[np.ndarray, " n"]) -> Cloud:
+    """Move every point along its ray, away from the sensor. A point at the sensor has no ray and stays."""
+    distance = np.linalg.norm(points.astype(np.float64), axis=1)
+    share = np.divide(metres, distance, out=np.zeros_like(distance), where=distance > 0)
+    return (points * (1 + share[:, None])).astype(np.float32)
+
+
+def moved_left(points: Cloud, offset_m: float) -> Cloud:
+    """Return the scan relative to a place `offset_m` metres to the left of the sensor, or to the right if negative.
+
+    Only the points move. A sensor at the new place would see other occlusions, which one scan does not show.
+    """
+    return points - np.array([0, offset_m, 0], np.float32)
+
+
+def corrupted(recording: Recording, corruption: Corruption, *, seed: int) -> Recording:
+    """Return the recording with every scan corrupted on reading. Ids, positions and times do not change.
+
+    The corruption of a scan is a function of `seed` and its row. Labels stay with their points. Points that are not
+    finite are removed.
+
+    Raises:
+      ValueError: If the recording contains only images.
+    """
+    if recording.has_images:
+        raise ValueError(
+            f"{corruption.name} needs points, found only images in sequence {recording.name}, which can only be "
+            "rotated (rotation)"
+        )
+    row_of = {path: row for row, path in enumerate(recording.paths)}
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        row = row_of[path]
+        record = recording.read(path, labels, lasers or corruption.needs_lasers)
+        try:
+            return corrupt_record(record, corruption, rng=np.random.default_rng((seed, row)))
+        except ValueError as error:
+            scan = f"scan {recording.ids[row]} of sequence {recording.name}"
+            raise ValueError(f"{scan}: {corruption.name}: {error}") from error
+
+    return dataclasses.replace(recording, read=read, on_disk=False)
+
+
+def corrupt_record(record: Record, corruption: Corruption, *, rng: np.random.Generator) -> Record:
+    """Corrupt the finite points of a scan, and keep the labels and lasers of the remaining points, but no times."""
+    assert record.points is not None
+    rows = np.flatnonzero(np.isfinite(record.points).all(axis=1))
+    lasers = None if record.lasers is None else record.lasers[rows]
+    points, kept = corrupt(record.points[rows], corruption, rng=rng, lasers=lasers)
+    left = rows[kept]
+    return dataclasses.replace(
+        record,
+        points=points,
+        labels=None if record.labels is None else record.labels[left],
+        lasers=None if record.lasers is None else record.lasers[left],
+        time_field=None,
+    )

@@ -1,1 +1,0 @@
-"""Artificially degraded scans for the stress test."""

@@ -1,0 +1,384 @@
+"""Reads serialised ROS messages field by field. rosbags is slower, because it creates an object for each part.
+
+ROS 1 packs the fields without padding, in little-endian order. ROS 2 (CDR) begins with four bytes that contain the byte
+order. After them, each number is aligned to its size.
+"""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int64, UInt8
+from numpy.typing import ArrayLike
+
+from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.cloud_text import check_points
+from sglpr_jax.data.point_times import FIELDS, TimeField, time_field_of
+from sglpr_jax.data.poses import interpolate, poses_of
+from sglpr_jax.data.times import doubt
+from sglpr_jax.data.warning import warn
+
+
+class Header(NamedTuple):
+    """std_msgs/Header."""
+
+    time: float
+    """Timestamp in seconds."""
+    frame: str
+
+
+class RosMessage:
+    """A message and a read position. Reading beyond the end raises ValueError."""
+
+    def __init__(self, raw: bytes, *, cdr: bool):
+        self._raw = raw
+        self._cdr = cdr
+        self._order = ">" if cdr and not raw[1] & 1 else "<"
+        self._at = 4 if cdr else 0
+
+    def numbers(self, kind: str, count: int = 1) -> np.ndarray:
+        """Read the next `count` numbers of a type such as "f8"."""
+        return self._next(np.dtype(f"{self._order}{kind}"), count)
+
+    def text(self) -> str:
+        """Read the next string."""
+        length = int(self.numbers("u4")[0])
+        return self.numbers("u1", length).tobytes().rstrip(b"\0").decode(errors="replace")
+
+    def header(self) -> Header:
+        """Read the header at the start of a sensor message."""
+        if not self._cdr:
+            self.numbers("u4")  # sequence number of ROS 1
+        seconds, nanoseconds = int(self.numbers("i4")[0]), int(self.numbers("u4")[0])
+        return Header(seconds + nanoseconds / 1e9, self.text())
+
+    def records(self, fields: dict[str, str]) -> np.ndarray:
+        """Read the next sequence of records. Fields of 4 bytes must precede fields of 1 byte."""
+        count = int(self.numbers("u4")[0])
+        packed = np.dtype([(name, f"{self._order}{kind}") for name, kind in fields.items()])
+        padding = -packed.itemsize % 4 if self._cdr else 0
+        names, offsets = list(fields), [packed.fields[name][1] for name in fields]  # pyright: ignore
+        formats, size = [packed[name] for name in names], packed.itemsize + padding
+        padded = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+        found = self._next(padded, max(count - 1, 0))  # the last record has no padding
+        return np.concatenate([found, self._next(packed, min(count, 1)).astype(found.dtype)])
+
+    def _next(self, kind: np.dtype, count: int) -> np.ndarray:
+        size = 1 if kind.names else kind.itemsize
+        self._at += -(self._at - 4) % size if self._cdr else 0
+        end = self._at + count * kind.itemsize
+        if end > len(self._raw):
+            raise ValueError(f"expected {count} times {kind.itemsize} bytes, found {len(self._raw) - self._at}")
+        found = np.frombuffer(self._raw, kind, count, self._at) if count else np.zeros(0, kind)
+        self._at = end
+        return found
+
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LEAST_M, _MOST_M = 1e-3, 1e4
+"""Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
+_LASERS = ("ring", "channel", "line", "laser_id", "laser")
+"""Field names that drivers use for the laser number of a point."""
+
+
+def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
+    """Return the points (n, 3) in the axes of the message, and their lasers and times if the message has such fields.
+
+    Some drivers set `is_bigendian` for little-endian data. If only the little-endian numbers are metres, they are
+    returned, with a warning.
+
+    Arguments:
+      message: Object with the attributes of sensor_msgs/PointCloud2.
+      name: Name of the message for the warning.
+
+    Raises:
+      ValueError: If x, y or z is missing or not numeric, or the data is shorter than its width, height and steps
+        require.
+    """
+    data = _point_bytes(message)
+    records = data.view(_record(message, ">" if message.is_bigendian else "<"))
+    if message.is_bigendian and not _in_metres(records):
+        others = data.view(_record(message, "<"))
+        if _in_metres(others):
+            warn(f"{name}: expected big-endian points, as is_bigendian states, found little-endian points")
+            records = others
+    names = records.dtype.names or ()
+    laser, time = next((field for field in _LASERS if field in names), None), time_field_of(names)
+    times = None if time is None else TimeField(time, records[time].copy())
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        return Records(points, None if laser is None else records[laser].astype(np.int32), times)
+
+
+def described_fields(message: Any) -> str:
+    """Return a description of the fields of a cloud: "x y z intensity ring (22 bytes a point)"."""
+    return f"{' '.join(field.name for field in message.fields)} ({message.point_step} bytes a point)"
+
+
+def _point_bytes(message: Any) -> UInt8[np.ndarray, " n"]:
+    """Bytes of all points, without the padding of rows."""
+    width, height, step, row = message.width, message.height, message.point_step, message.row_step
+    check_points(width * height, bytes_each=step)
+    row = max(row, width * step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if not step or len(data) < row * (height - 1) + width * step:
+        raise ValueError(f"expected {height} rows of {width} points of {step} bytes, found {len(data)} bytes")
+    return np.concatenate([data[start : start + width * step] for start in range(0, row * height, row)])
+
+
+def _in_metres(records: np.ndarray) -> bool:
+    """Whether most coordinates are those of a scan. Zeros and NaN are ignored."""
+    size = np.abs(np.stack([records[axis].astype(np.float64) for axis in "xyz"]))
+    size = size[size > 0]
+    return not size.size or bool(np.mean((size >= _LEAST_M) & (size <= _MOST_M)) > 0.5)
+
+
+def _record(message: Any, order: str) -> np.dtype:
+    fields = {field.name: field for field in message.fields}
+    if not {"x", "y", "z"} <= set(fields):
+        raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
+    wanted = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
+    wanted += [name for name in FIELDS if name in fields and fields[name].datatype in _TYPES]
+    types = [_TYPES.get(fields[name].datatype) for name in wanted]
+    if None in types:
+        raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")
+    try:
+        return np.dtype(
+            {
+                "names": wanted,
+                "formats": [f"{order}{kind}" for kind in types],
+                "offsets": [fields[name].offset for name in wanted],
+                "itemsize": message.point_step,
+            }
+        )
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error
+
+
+CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+POINT = {
+    "offset_time": "u4",
+    "x": "f4",
+    "y": "f4",
+    "z": "f4",
+    "reflectivity": "u1",
+    "tag": "u1",
+    "line": "u1",
+}
+"""Fields of a point, and their numpy types."""
+
+
+def read_custom_msg(message: RosMessage) -> Records:
+    """Return the points (n, 3) in the axes of the message, their line numbers and their times.
+
+    Raises:
+      ValueError: If the message is truncated or has no points.
+    """
+    message.header()
+    message.numbers("u8")
+    message.numbers("u4")
+    message.numbers("u1", 4)
+    points = message.records(POINT)
+    if not len(points):
+        raise ValueError("expected at least one point, found none")
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    return Records(xyz, points["line"].astype(np.int32), TimeField("offset_time", points["offset_time"].copy()))
+
+
+class StampedPose(NamedTuple):
+    """Pose of a child frame in a frame, with its time."""
+
+    time: float
+    """Time in the header of the message, in seconds."""
+    child: str
+    """Child frame, such as "base_link". Empty if the message does not name it."""
+    frame: str
+    """Reference frame, such as "odom"."""
+    numbers: Float[np.ndarray, " 7"]
+    """Position x, y, z in metres, and quaternion x, y, z, w."""
+
+
+def _odometry(message: RosMessage) -> StampedPose:
+    header, child = message.header(), message.text()
+    return StampedPose(header.time, child, header.frame, message.numbers("f8", 7))
+
+
+def _pose_stamped(message: RosMessage) -> StampedPose:
+    header = message.header()
+    return StampedPose(header.time, "", header.frame, message.numbers("f8", 7))
+
+
+def read_transforms(message: RosMessage) -> Iterator[StampedPose]:
+    """Read the transforms of a tf message. Each is the pose of its child frame in the frame of its header."""
+    for _ in range(int(message.numbers("u4")[0])):
+        yield _odometry(message)  # header, child, and the same seven numbers
+
+
+POSES: dict[str, Callable[[RosMessage], StampedPose]] = {
+    "nav_msgs/msg/Odometry": _odometry,
+    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+}
+"""Message types with poses of the vehicle, and their readers."""
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""Message types of tf."""
+
+
+LEAST_SHARE = 0.5
+"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
+UNIT = 0.01
+"""Maximum deviation of the length of a quaternion from 1."""
+
+
+class Stamps(NamedTuple):
+    """Timestamps of the messages of a topic."""
+
+    recorded: Int64[np.ndarray, " n"]
+    """Times of the recorder, in nanoseconds."""
+    own: Float[np.ndarray, " n"]
+    """Times in the headers of the messages, in seconds."""
+
+    def of(self, rows: Int[np.ndarray, " m"]) -> "Stamps":
+        """Stamps of some messages."""
+        return Stamps(self.recorded[rows], self.own[rows])
+
+    @property
+    def orderly(self) -> bool:
+        """Whether the header times are positive, never decrease, and can be seconds (`times.doubt`)."""
+        ordered = len(self.own) and (self.own > 0).all() and (np.diff(self.own) >= 0).all()
+        return bool(ordered and not doubt(self.own, numbers=False))
+
+    @property
+    def seconds(self) -> Float[np.ndarray, " n"]:
+        """Header times in seconds if they are orderly, or else the recorder's times."""
+        return self.own if self.orderly else self.recorded / 1e9
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Track:
+    """Poses of a topic."""
+
+    stamps: Stamps
+    positions: Float[np.ndarray, "n 3"]
+    """Positions in metres."""
+    quaternions: Float[np.ndarray, "n 4"]
+    """Quaternions x, y, z, w. The quaternions are not normalised and may be invalid (see `turned`)."""
+    child: str
+    """Child frame, such as "base_link". Empty if the messages do not name it."""
+    frame: str
+    """Reference frame, such as "odom"."""
+    dropped: int = 0
+    """Number of messages without a valid pose, which are not part of the track."""
+
+    @classmethod
+    def of(cls, found: Iterable[tuple[int, StampedPose]]) -> "Track":
+        """Create a track from recorder times (ns) and poses. Poses with non-finite positions are dropped.
+
+        If most poses have a rotation, those without one are dropped, too.
+        """
+        given = list(found)
+        placed = [(time, pose) for time, pose in given if np.isfinite(pose.numbers[:3]).all()]
+        valid = are_unit([pose.numbers[3:] for _, pose in placed])
+        turned = [one for one, fits in zip(placed, valid, strict=True) if fits]
+        kept = turned if 2 * len(turned) > len(placed) else placed
+        numbers = np.array([pose.numbers for _, pose in kept], np.float64).reshape(-1, 7)
+        stamps = Stamps(np.array([t for t, _ in kept], np.int64), np.array([pose.time for _, pose in kept], float))
+        child, frame = (kept[0][1].child, kept[0][1].frame) if kept else ("", "")
+        return cls(stamps, numbers[:, :3], numbers[:, 3:], child, frame, len(given) - len(kept))
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the quaternions are valid rotations that change. A GPS receiver writes zeros or a constant."""
+        return bool(len(self) and are_unit(self.quaternions).all() and np.ptp(self.quaternions, axis=0).any())
+
+    @property
+    def moves(self) -> bool:
+        """Whether any pose differs from the first."""
+        numbers = np.concatenate([self.positions, self.quaternions], axis=1)
+        return bool(len(self) and (numbers != numbers[0]).any())
+
+    def __str__(self) -> str:
+        return f"{len(self)} poses of {self.child or 'a body'} in {self.frame or 'a frame'}"
+
+
+def are_unit(quaternions: ArrayLike) -> Bool[np.ndarray, " n"]:
+    """Whether each quaternion has length 1."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        lengths = np.linalg.norm(np.reshape(np.asarray(quaternions, np.float64), (-1, 4)), axis=1)
+        return np.abs(lengths - 1) <= UNIT
+
+
+def tracks_of(transforms: Iterable[tuple[int, StampedPose]]) -> list[Track]:
+    """Group tf transforms into one track for each pair of child and parent frame."""
+    found: dict[tuple[str, str], list[tuple[int, StampedPose]]] = defaultdict(list)
+    for time, pose in transforms:
+        named = pose._replace(child=pose.child.strip("/"), frame=pose.frame.strip("/"))
+        found[named.child, named.frame].append((time, named))
+    return [Track.of(poses) for _, poses in sorted(found.items())]
+
+
+def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " q"]]:
+    """Times of messages and of scans in seconds: header times, or recorder times if the headers do not overlap."""
+    if scans.orderly and stamps.orderly:
+        own = interpolate(stamps.own, np.zeros((len(stamps.own), 3)), scans.own)
+        if own.kept.mean() >= LEAST_SHARE:
+            return stamps.own, scans.own
+    return stamps.recorded / 1e9, scans.recorded / 1e9
+
+
+def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
+    """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+
+    steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
+    for track in tracks:
+        if len(track) and not track.moves and abs(np.linalg.norm(track.quaternions[0]) - 1) <= UNIT:
+            turned = Rotation.from_quat(track.quaternions[:1]).as_matrix()
+            frame_from_child = poses_of(track.positions[:1], turned)[0]
+            steps[track.frame].append((track.child, frame_from_child))
+            steps[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
+    reached, queue = {frame: np.eye(4)}, [frame]
+    for here in queue:
+        for there, here_from_there in steps[here]:
+            if there not in reached:
+                reached[there] = reached[here] @ here_from_there
+                queue.append(there)
+    return reached.get(other)
+
+
+IMU = "sensor_msgs/msg/Imu"
+"""Message type of an IMU."""
+
+
+class ImuMessages(NamedTuple):
+    """Messages of an IMU."""
+
+    stamps: Stamps
+    frame: str
+    """Frame of the IMU."""
+    rates: Float[np.ndarray, "n 3"]
+    """Angular velocities, in radians per second."""
+    accelerations: Float[np.ndarray, "n 3"]
+    """Accelerations, in m/s^2 or in multiples of gravity."""
+    quaternions: Float[np.ndarray, "n 4"] | None
+    """Orientations x, y, z, w, or None if the messages have none."""
+
+    @classmethod
+    def of(cls, messages: Iterable[tuple[int, RosMessage]]) -> "ImuMessages":
+        """Decode messages with the times (ns) of their recorder."""
+        recorded, own, numbers, frame = [], [], [], ""
+        for time, message in messages:
+            header = message.header()
+            recorded.append(time)
+            own.append(header.time)
+            frame = frame or header.frame
+            numbers.append(message.numbers("f8", 37))
+        found = np.array(numbers, np.float64).reshape(-1, 37)
+        turned, covariance, rates, accelerations = found[:, :4], found[:, 4], found[:, 13:16], found[:, 25:28]
+        valid = len(found) and covariance[0] != -1 and are_unit(turned).all() and np.ptp(turned, axis=0).any()
+        stamps = Stamps(np.array(recorded, np.int64), np.array(own, float))
+        return cls(stamps, frame, rates, accelerations, turned if valid else None)

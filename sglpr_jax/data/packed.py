@@ -1,0 +1,257 @@
+"""Stores arrays with rows of one shape one after another in a file, and maps the file into memory."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import math
+import mmap
+import os
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from sglpr_jax.data.formats.png import read_label_image
+from sglpr_jax.data.recording import ReadRecord, Record, Recording
+from sglpr_jax.files import file_name, in_short, read_json, replacing, writing
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stacked:
+    """Arrays in a file that is mapped into memory: array i is rows `offsets[i]` to `offsets[i + 1]`.
+
+    Indexing returns a read-only view. It raises ValueError if the checksum of the array is wrong.
+    """
+
+    path: Path
+    file: mmap.mmap
+    rows: np.ndarray
+    offsets: tuple[int, ...]
+    checksums: tuple[int, ...] | None
+    """Checksum of each array. None for older files, which have no checksums."""
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        start, stop = self.offsets[i : i + 2]
+        if stop > start:
+            self._announce(*(row * self.rows.strides[0] for row in (start, stop)))
+        array = self.rows[start:stop]
+        if self.checksums is not None and self.checksums[i] != (found := _checksum(array)):
+            raise ValueError(
+                f"{self.path}: expected array {i} with the checksum {self.checksums[i]} of pack.json, found {found};"
+                " delete its folder to pack the recording again"
+            )
+        return array
+
+    def _announce(self, start: int, stop: int) -> None:
+        """Request these bytes from the disk at once. By default, the system reads 128 KiB at each first access."""
+        page = start - start % mmap.PAGESIZE
+        self.file.madvise(mmap.MADV_WILLNEED, page, stop - page)
+
+
+class StackWriter:
+    """Writes arrays one after another into a new file. All arrays must have rows like those of `first`."""
+
+    def __init__(self, path: Path, first: np.ndarray):
+        self._path, self._dtype, self._row = path, first.dtype, first.shape[1:]
+        self._offsets: list[int] = [0]
+        self._checksums: list[int] = []
+        with writing(path):
+            self._stream = path.open("xb")
+
+    def append(self, array: np.ndarray, *, of: str) -> None:
+        """Append an array. Raises ValueError, whose message names `of`, if the rows do not fit, and OSError if the disk
+        is full.
+        """
+        if (array.dtype, array.shape[1:]) != (self._dtype, self._row):
+            raise ValueError(
+                f"{of}: expected {self._dtype} with rows of shape {self._row}, like the first array of the pack, "
+                f"found {array.dtype} {array.shape[1:]}"
+            )
+        array = np.ascontiguousarray(array)
+        with writing(self._path):
+            self._stream.write(array.data)
+        self._checksums.append(_checksum(array))
+        self._offsets.append(self._offsets[-1] + len(array))
+
+    def finish(self) -> dict[str, Any]:
+        """Flush the file to disk and return its layout, the keyword arguments of `map_stacked`."""
+        with writing(self._path):
+            sync(self._stream)
+        lies = {"dtype": self._dtype.str, "row": self._row, "offsets": self._offsets}
+        return {**lies, "checksums": self._checksums}
+
+    def close(self) -> None:
+        """Close the file, whether finished or not."""
+        with contextlib.suppress(OSError):  # An earlier write error is already being raised.
+            self._stream.close()
+
+
+def map_stacked(
+    path: Path, *, dtype: str, row: Sequence[int], offsets: Sequence[int], checksums: Sequence[int] | None = None
+) -> Stacked:
+    """Map a file written by `StackWriter` into memory. The keyword arguments are those that `finish` returned.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If the file has the wrong size, or if the arguments contradict each other. Access to the missing part
+        of a file that is too short would kill the process.
+    """
+    if any(type(number) is not int for number in (*offsets, *row)) or sorted(offsets) != [*offsets] or offsets[0] != 0:
+        raise ValueError(f"{path.name}: expected offsets in ascending order from 0, found {offsets!s:.60}")
+    if checksums is not None and [type(number) for number in checksums] != [int] * (len(offsets) - 1):
+        raise ValueError(f"{path.name}: expected {len(offsets) - 1} checksums, found {checksums!s:.60}")
+    shape = (offsets[-1], *row)
+    expected, found = np.dtype(dtype).itemsize * math.prod(shape), path.stat().st_size
+    if expected != found:
+        raise ValueError(f"{path.name}: expected {expected} bytes, found {found}")
+    with path.open("rb") as stream:
+        file = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    rows = np.frombuffer(file, dtype).reshape(shape)
+    return Stacked(path, file, rows, tuple(offsets), None if checksums is None else tuple(checksums))
+
+
+def _checksum(array: np.ndarray) -> int:
+    """CRC-32 of type, shape and content of an array: 0.2 ms for a scan of 120,000 points."""
+    return zlib.crc32(array.data, zlib.crc32(f"{array.dtype.str} {array.shape}".encode()))
+
+
+def sync(stream: IO) -> None:
+    """Flush a file to disk. If the file were renamed before, a power failure could leave it incomplete."""
+    stream.flush()
+    os.fsync(stream.fileno())
+
+
+FORMAT = "sglpr-jax packed recording 1"
+ABOUT_FILE = "pack.json"
+LAYOUT = {"points": ("<f4", [3]), "labels": ("<u2", []), "images": ("<f4", None)}
+"""Type and shape of the rows of each array. Images of different packs have different widths."""
+
+
+def packed(recording: Recording, folder: Path, *, on_progress: Callable[[int], None] = lambda done: None) -> Recording:
+    """Return the same recording, read from its pack in `folder`. If there is no pack, it is created first.
+
+    Points, labels and images are bitwise equal to those of the files. Points and images are read-only. Lasers, and the
+    labels of images, still come from the files.
+
+    Arguments:
+      recording: Recording as opened by a reader.
+      folder: Folder of the packs.
+      on_progress: Called with the number of packed scans.
+
+    Raises:
+      ValueError: If the pack is damaged, `recording` is not read from its own files, or its images differ in width.
+        Other errors are those of reading.
+      OSError: If the pack cannot be written.
+    """
+    if not recording.on_disk:
+        raise ValueError(
+            f"sequence {recording.name}: expected a recording that is read from its files, found a packed, "
+            "corrupted or simulated one"
+        )
+    source = _source(recording)
+    identity = hashlib.sha256(json.dumps(source).encode()).hexdigest()[:16]
+    target = folder / f"{file_name(recording.name)}-{identity}"
+    if not target.is_dir():
+        _make(target, recording, source, on_progress)
+    return dataclasses.replace(
+        recording, read=_reader(recording, open_pack(target, scans=len(recording))), on_disk=False
+    )
+
+
+def _reader(recording: Recording, arrays: dict[str, Stacked]) -> ReadRecord:
+    """Return a function that reads from the arrays of a pack, and everything else from the recording's files."""
+    row_of = {path: row for row, path in enumerate(recording.paths)}
+    points, raw = arrays.get("points"), arrays.get("labels")
+
+    def read(path: Path, labels: Path | None, lasers: bool) -> Record:
+        row = row_of[path]
+        if points is None:
+            image = arrays["images"][row]
+            return Record(image=image, labels=None if labels is None else read_label_image(labels, shape=image.shape))
+        return Record(
+            points=points[row],
+            labels=None if labels is None or raw is None else raw[row].astype(np.int32),
+            lasers=recording.read(path, None, True).lasers if lasers else None,
+        )
+
+    return read
+
+
+def _source(recording: Recording) -> dict[str, Any]:
+    """Identify the pack of a recording: its files and their read options.
+
+    Only options that are strings count. A reader whose points depend on other files adds a hash of these files as an
+    option.
+    """
+    paths = recording.paths if recording.has_images else (*recording.paths, *recording.label_paths)
+    files = [(str(path.absolute()), path.stat()) for path in paths if path is not None]
+    return {
+        "format": FORMAT,
+        "options": recording.read_options,
+        "files": [(path, stat.st_size, stat.st_mtime_ns) for path, stat in files],
+    }
+
+
+def _make(target: Path, recording: Recording, source: dict[str, Any], on_progress: Callable[[int], None]) -> None:
+    """Write a pack atomically."""
+    with replacing(target, keep=True) as temporary:  # If another process is faster, its copy stays.
+        temporary.mkdir()
+        arrays = _write_arrays(temporary, recording, on_progress)
+        with (temporary / ABOUT_FILE).open("w") as stream:
+            json.dump({**source, "arrays": arrays}, stream)
+            sync(stream)
+
+
+def _write_arrays(folder: Path, recording: Recording, on_progress: Callable[[int], None]) -> dict[str, Any]:
+    """Write the arrays of all scans or images, and return their layout."""
+    with contextlib.ExitStack() as opened:
+        files: dict[str, StackWriter] = {}
+        for i in range(len(recording)):
+            for name, array in _arrays(recording, i).items():
+                if name not in files:
+                    files[name] = opened.enter_context(contextlib.closing(StackWriter(folder / f"{name}.bin", array)))
+                files[name].append(array, of=f"scan {recording.ids[i]} of sequence {recording.name}")
+            on_progress(i + 1)
+        return {name: file.finish() for name, file in files.items()}
+
+
+def _arrays(recording: Recording, i: int) -> dict[str, np.ndarray]:
+    if recording.has_images:
+        return {"images": recording.image(i)}
+    record = recording.record(i)
+    assert record.points is not None
+    if not recording.has_labels:
+        return {"points": record.points}
+    labels = np.zeros(0, np.uint16) if record.labels is None else record.labels.astype(np.uint16)
+    return {"points": record.points, "labels": labels}
+
+
+def open_pack(folder: Path, *, scans: int | None = None) -> dict[str, Stacked]:
+    """Return the arrays of a pack by name.
+
+    Raises ValueError, with the folder, if the pack is damaged, has other arrays than a pack, or not as many `scans`.
+    """
+    try:
+        lie = read_json(folder / ABOUT_FILE)["arrays"]
+        for name, about in lie.items():
+            _check_layout(name, about, scans)
+        if "images" not in lie and "points" not in lie:
+            raise ValueError(f"expected arrays of points or images, found {', '.join(lie) or 'none'}")
+        return {name: map_stacked(folder / f"{name}.bin", **about) for name, about in lie.items()}
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError) as error:
+        raise ValueError(
+            f"{folder}: expected a packed recording, found a damaged one ({ABOUT_FILE}: {in_short(error)}); delete the "
+            "folder to pack the recording again"
+        ) from error
+
+
+def _check_layout(name: str, about: dict[str, Any], scans: int | None) -> None:
+    """Raise ValueError if a pack has no array of this name, type and shape of its rows."""
+    dtype, row = LAYOUT.get(name, (None, None))
+    if about["dtype"] != dtype or (row is not None and about["row"] != row) or len(about["row"]) > 1:
+        raise ValueError(f"expected arrays {', '.join(LAYOUT)}, found {name!r:.20} {about['dtype']!r:.20}")
+    if scans is not None and len(about["offsets"]) != scans + 1:
+        raise ValueError(f"expected {scans} scans, found {len(about['offsets']) - 1}")

@@ -1,0 +1,316 @@
+"""A loop closure: two scans of one place, and the pose of one relative to the other."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.levelling import AnyMounting, lidar_pose, upright_from_lidar, upright_poses, uprights
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scaled, scaled_poses
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.se3 import inverse, moved_covariance, transform, yaw_of
+
+Reason = Literal[
+    "little similarity",
+    "repeats",
+    "too few neighbours",
+    "contradicts the motion",
+    "contradicts the odometry",
+    "contradicts other loops",
+    "little overlap",
+    "degenerate",
+]
+"""Why a pair that looked like a loop closure was rejected."""
+UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M = 0.03, 0.018
+UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M = 1.2, 0.07
+"""Standard deviations of height, and of pitch and roll, which images do not show. Each has a value for two scans at one
+position, and an increase per metre between them. They hold for vehicles, in simulated towns and outskirts and on
+KITTI."""
+GROUND_HEIGHT_PER_M, GROUND_TILT_DEG_PER_M = 0.008, 0.03
+"""Increase of these standard deviations per metre between two scans whose mountings were estimated from the scans."""
+UNKNOWN_HEIGHT_M = 10.0
+"""Standard deviation of the height of a loop if nothing measures height: the scans may be on two storeys."""
+DEGENERATE_M = 1.0
+"""Maximum standard deviation of the position of a pose that is not degenerate, in metres."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Loop:
+    """Two frames of one place, with the pose between them."""
+
+    query: int
+    match: int
+    """Frame numbers, counted from 0. The match is the earlier frame."""
+    match_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the query's LiDAR in the frame of the match's LiDAR, in metres. The points of the scans are in these
+    frames, which are tilted if the sensor is tilted."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Covariance of a small motion of the query in its own frame: x, y, z in metres, then rotations about x, y, z in
+    radians."""
+    probability: float
+    """Probability that both frames show one place."""
+    overlap: float | None = None
+    """Overlap of the scans, from 0 to 1, if they were registered in 6 degrees of freedom."""
+
+    @property
+    def yaw(self) -> float:
+        """Rotation of the query in the match's frame, in radians counter-clockwise."""
+        return float(yaw_of(self.match_from_query))
+
+    @property
+    def information(self) -> Float[np.ndarray, "6 6"]:
+        """The inverse of the covariance."""
+        return np.linalg.inv(self.covariance)
+
+    @property
+    def is_degenerate(self) -> bool:
+        """Whether the position has a standard deviation of more than `DEGENERATE_M` in some horizontal direction."""
+        return is_degenerate(self.covariance)
+
+
+def unseen_covariance(
+    match_from_query: Float[np.ndarray, "4 4"], query: Mounting | None = None, match: Mounting | None = None
+) -> Float[np.ndarray, "6 6"]:
+    """Covariance of height, roll and pitch of a query in its own frame, between two gravity-aligned scans.
+
+    Suspension and bumps tilt vehicles. With a tilt or a slope, the height error grows with the distance. If a mounting
+    was estimated from its scan, its deviations count. A wrong tilt of the match lifts the query by its distance.
+
+    Arguments:
+      match_from_query: Pose of the gravity-aligned query in the plane.
+      query: Mounting of the query's sensor.
+      match: Mounting of the match's sensor.
+    """
+    apart_m = float(np.hypot(*match_from_query[:2, 3]))
+    if not (_is_estimated(query) or _is_estimated(match)):
+        height = np.hypot(UNSEEN_HEIGHT_M, UNSEEN_HEIGHT_PER_M * apart_m)
+        tilt = np.radians(np.hypot(UNSEEN_TILT_DEG, UNSEEN_TILT_DEG_PER_M * apart_m))
+        return np.diag([0.0, 0.0, height, tilt, tilt, 0.0]) ** 2
+    ground = _diagonal(GROUND_HEIGHT_PER_M * apart_m, GROUND_TILT_DEG_PER_M * apart_m)
+    own, other = (_diagonal(*_deviations(mounting)) for mounting in (query, match))
+    return own + moved_covariance(other, inverse(match_from_query)) + ground
+
+
+def _is_estimated(mounting: Mounting | None) -> bool:
+    """Whether the mounting was estimated from its own scan."""
+    return mounting is not None and mounting.tilt_deviation_deg is not None
+
+
+def _deviations(mounting: Mounting | None) -> tuple[float, float]:
+    """Standard deviations of height (metres) and tilt (degrees) of one scan."""
+    if mounting is None or mounting.height_deviation_m is None or mounting.tilt_deviation_deg is None:
+        return UNSEEN_HEIGHT_M / 2**0.5, UNSEEN_TILT_DEG / 2**0.5
+    return mounting.height_deviation_m, mounting.tilt_deviation_deg
+
+
+def _diagonal(height_m: float, tilt_deg: float) -> Float[np.ndarray, "6 6"]:
+    """Covariance of independent height, roll and pitch."""
+    tilt = np.radians(tilt_deg)
+    return np.diag([0.0, 0.0, height_m, tilt, tilt, 0.0]) ** 2
+
+
+def position_deviation(covariance: Float[np.ndarray | Array, "n n"]) -> float:
+    """Largest standard deviation of the position in the plane, over all directions, in metres.
+
+    Arguments:
+      covariance: Covariance of (x, y, yaw), as in `Alignment`, or of all 6 degrees of freedom, as in `Loop`.
+    """
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.asarray(covariance, np.float64)[:2, :2])[-1], 0)))
+
+
+def is_degenerate(covariance: Float[np.ndarray | Array, "n n"], *, threshold_m: float = DEGENERATE_M) -> bool:
+    """Whether a position is uncertain in some horizontal direction, for example parallel to a long featureless wall.
+
+    Arguments:
+      covariance: See `position_deviation`.
+      threshold_m: Maximum standard deviation of a pose that is not degenerate, in metres.
+    """
+    return position_deviation(covariance) > threshold_m
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rejected:
+    """A pair that looked like a loop closure, and the reason why it was rejected."""
+
+    loop: Loop
+    reason: Reason
+
+
+def planar_loop(
+    query: int,
+    match: int,
+    alignment: Alignment,
+    *,
+    probability: float,
+    knows_height: bool = True,
+    query_mounting: Mounting | None = None,
+    match_mounting: Mounting | None = None,
+) -> Loop:
+    """Returns the loop of two aligned images, in the plane of the ground.
+
+    Arguments:
+      query: Frame of the query.
+      match: Frame of the match.
+      alignment: Pose of the query's image in the match's image, and its covariance.
+      probability: Probability that both frames show one place.
+      knows_height: Whether the odometry measures height. If not, the storey is unknown.
+      query_mounting: Mounting of the query's sensor. Its points were gravity-aligned for the image.
+      match_mounting: Mounting of the match's sensor.
+    """
+    upright = transform(float(alignment.x), float(alignment.y), float(alignment.yaw))
+    covariance = unseen_covariance(upright, query_mounting, match_mounting)
+    covariance[2, 2] += 0.0 if knows_height else UNKNOWN_HEIGHT_M**2
+    seen = np.array([0, 1, 5])
+    to_query = np.eye(3)
+    to_query[:2, :2] = upright[:2, :2].T  # the alignment's covariance is in the match's frame
+    covariance[np.ix_(seen, seen)] = to_query @ np.asarray(alignment.covariance, np.float64) @ to_query.T
+    pose = lidar_pose(upright, query=query_mounting, match=match_mounting)
+    covariance = moved_covariance(covariance, inverse(upright_from_lidar(query_mounting)))
+    return Loop(query, match, pose, covariance, float(probability))
+
+
+Planar = Float[np.ndarray, "... 3"]
+"""Poses in the plane: x, y, yaw."""
+
+SEEN = np.array([0, 1, 5])
+"""Rows of x, y and yaw in a covariance of 6 degrees of freedom."""
+
+
+def planar(poses: Float[np.ndarray, "n 4 4"]) -> Planar:
+    """Project poses to the x-y plane of their own frame."""
+    return np.concatenate([poses[:, :2, 3], yaw_of(poses)[:, None]], axis=1)
+
+
+def planar_loops(loops: Sequence[Loop], mounting: AnyMounting) -> tuple[Planar, Float[np.ndarray, "n 3 3"]]:
+    """Poses of the queries in the frames of their matches, and their covariances in the frames of the queries.
+
+    Standard deviations are limited to `DEGENERATE_M` along every direction. Otherwise a pose that may lie anywhere
+    along a wall would agree with every other pose along the wall.
+    """
+    poses = np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
+    covariances = np.array([loop.covariance for loop in loops], np.float64).reshape(-1, 6, 6)
+    query, match = frames_of(loops)
+    covariances = moved_covariance(covariances, uprights(mounting, query))
+    upright = upright_poses(poses, mounting, query=query, match=match)
+    return planar(upright), _bounded(covariances[:, SEEN[:, None], SEEN])
+
+
+def _bounded(covariances: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Covariances with eigenvalues of at most `DEGENERATE_M` squared."""
+    variances, axes = np.linalg.eigh(covariances)
+    return (axes * np.minimum(variances, DEGENERATE_M**2)[:, None]) @ np.swapaxes(axes, 1, 2)
+
+
+def frames_of(loops: Sequence[Loop]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Frames of the queries and of the matches."""
+    return np.array([loop.query for loop in loops], np.int64), np.array([loop.match for loop in loops], np.int64)
+
+
+def compose(a: Planar, b: Planar) -> Planar:
+    """Return a_from_c of a_from_b and b_from_c."""
+    a, b = np.broadcast_arrays(a, b)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + cos * b[..., 0] - sin * b[..., 1]
+    y = a[..., 1] + sin * b[..., 0] + cos * b[..., 1]
+    return np.stack([x, y, wrapped(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def inverted(a: Planar) -> Planar:
+    """Return b_from_a of a_from_b."""
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack([-cos * a[..., 0] - sin * a[..., 1], sin * a[..., 0] - cos * a[..., 1], -a[..., 2]], axis=-1)
+
+
+def relative(a: Planar, b: Planar) -> Planar:
+    """Return the pose of b in the frame of a (`a_from_b`), from the poses of both in one common frame."""
+    return compose(inverted(a), b)
+
+
+def wrapped(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Wrap angles to the range from -pi to pi."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+class Search(NamedTuple):
+    """Input of a search: a recording, the pose of the LiDAR at each of its scans, and the settings."""
+
+    recording: Recording
+    odometry: Float[np.ndarray, "n 4 4"] | None
+    config: DetectorConfig
+
+    def scaled(self, scale: Scale) -> "Search":
+        """The same input with all lengths multiplied by `scale`."""
+        odometry = None if self.odometry is None else scaled_poses(self.odometry, float(scale))
+        return Search(scaled(self.recording, scale), odometry, scaled_config(self.config, scale))
+
+
+def scaled_config(config: DetectorConfig, scale: Scale) -> DetectorConfig:
+    """Settings for scaled scans. Settings that do not belong to the images are in real metres, and are scaled."""
+    return dataclasses.replace(
+        config,
+        keyframe_m=config.keyframe_m * scale,
+        drift=scaled_drift(config.drift, float(scale)),
+    )
+
+
+def scaled_drift(drift: DriftModel, factor: float) -> DriftModel:
+    """Drift of odometry whose translations were multiplied by `factor`. Shares of the distance do not change."""
+    return dataclasses.replace(drift, degrees_per_metre=drift.degrees_per_metre / factor)
+
+
+def divided_loop(loop: Loop, scale: Scale) -> Loop:
+    """Loop of scans before they were multiplied by `scale`."""
+    return dataclasses.replace(
+        loop,
+        match_from_query=scaled_poses(loop.match_from_query, 1 / scale),
+        covariance=divided_covariance(loop.covariance, scale),
+    )
+
+
+def divided_rejected(rejected: Rejected, scale: Scale) -> Rejected:
+    """Rejected pair of scans before they were multiplied by `scale`."""
+    return dataclasses.replace(rejected, loop=divided_loop(rejected.loop, scale))
+
+
+def divided_covariance(covariance: Float[np.ndarray, "6 6"], scale: Scale) -> Float[np.ndarray, "6 6"]:
+    """Covariance of a pose (x, y, z, rotations) before its lengths were multiplied by `scale`."""
+    units = np.repeat([1 / scale, 1.0], 3)
+    return covariance * np.outer(units, units)
+
+
+MEANING: dict[Reason, str] = {
+    "little similarity": "The images fit too little, or the motion makes the pose improbable.",
+    "repeats": "Another place, or another pose, fits about as well.",
+    "too few neighbours": "Too few of the frames before and after the query show the same place.",
+    "contradicts the motion": "The motion between the two frames, estimated from their images, leads elsewhere.",
+    "contradicts the odometry": "The loop needs more drift of the odometry than was stated.",
+    "contradicts other loops": "The loop is not consistent with the largest set of loops that agree.",
+    "little overlap": "The two scans, registered in 6 degrees of freedom, overlap too little.",
+    "degenerate": f"The position is uncertain by more than {DEGENERATE_M:g} m along one direction, as between walls.",
+}
+"""Meaning of each reason, one sentence each."""
+
+
+def counted(rejected: Sequence[Rejected]) -> dict[Reason, int]:
+    """Number of rejected pairs by reason, the most frequent reason first."""
+    reasons: list[Reason] = [one.reason for one in rejected]
+    return dict(Counter(reasons).most_common())
+
+
+def listed(counts: dict[Reason, int]) -> str:
+    """Format counts in one line: "repeats: 10, little overlap: 2"."""
+    return ", ".join(f"{reason}: {count}" for reason, count in counts.items())
+
+
+def why_rejected(rejected: Sequence[Rejected]) -> list[str]:
+    """Lines for the user: one for each reason, with its count and meaning."""
+    return [f"rejected, {reason} ({count}): {MEANING[reason]}" for reason, count in counted(rejected).items()]

@@ -1,0 +1,189 @@
+"""Description of a scan for the loop search: its descriptor and its density image."""
+
+import copy
+import zlib
+from collections import OrderedDict
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Complex64, Float32, Int, Num, UInt8
+
+from sglpr_jax.bev import centre_crop, even_cells
+from sglpr_jax.data.density_grid import MAX_COUNT
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.recording import Record
+from sglpr_jax.data.views import check_ready_made, image_view, picture, view
+from sglpr_jax.growing import GrowingArray
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import describe
+from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.registration.bev_spectra import match_spectra
+from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.retrieval.index import Index
+
+
+class Seen(NamedTuple):
+    """Descriptor and image of a scan or ready-made image."""
+
+    descriptor: Float32[np.ndarray, " d"]
+    image: UInt8[np.ndarray, "n n"]
+    """Density image."""
+    mounting: Mounting | None
+    """Mounting of the sensor. Descriptor and image are gravity-aligned."""
+
+
+def described(params: Params, record: Record) -> Seen:
+    """Descriptor and 8-bit density image of a scan or image."""
+    model = params.config
+    check_ready_made(record, model.image)
+    whole, _ = picture(record, None)
+    if record.points is None or model.image == "density":
+        bev = image_view(whole, None, model.grid).image
+    else:
+        bev = view(record, model.grid, image=model.image).image
+    return Seen(np.asarray(describe(params, bev)), _kept(whole), record.mounting)
+
+
+def _kept(image: Num[np.ndarray, "h w"]) -> UInt8[np.ndarray, "n n"]:
+    """Central square of an image, with an even number of cells, as 8 bits."""
+    even = even_cells(jnp.asarray(image, jnp.float32))
+    size = min(even.shape)
+    grey = np.asarray(centre_crop(even, height=size, width=size)) * (255 / MAX_COUNT)
+    return np.round(grey).clip(0, 255).astype(np.uint8)
+
+
+def square_image(record: Record) -> UInt8[np.ndarray, "n n"]:
+    """Image for the verification of loops: the density image or the ready-made image, as 8 bits."""
+    return _kept(picture(record, None)[0])
+
+
+LEVEL = 1
+"""Level of zlib, the fastest one. Most cells of an image are empty, so higher levels save little."""
+KEYFRAME_DEG = 20.0
+"""Rotation from the last stored scan from which a scan is stored, whatever the distance, in degrees."""
+SPECTRA = 512
+"""Number of spectra that are kept for the next queries. Consecutive queries are compared with the same scans."""
+PARTS = 16
+"""The stored scans are forgotten in this many parts, because each removal moves all rows that follow."""
+
+
+class StoredScans:
+    """Scans in the order they were added: row i of the index is scan i. Images are compressed without loss."""
+
+    def __init__(
+        self,
+        index: Index,
+        *,
+        verification: VerificationConfig = VerificationConfig(),
+        keyframe_m: float = 0.0,
+        max_places: int | None = None,
+    ):
+        """Start with an index without places. The limits are those of `DetectorConfig`."""
+        self.index, self.verification, self.keyframe_m, self.max_places = index, verification, keyframe_m, max_places
+        self._first = 0
+        self._frames = GrowingArray(np.empty(0, np.int64))
+        self._repeated = GrowingArray(np.empty(0, bool))
+        """Whether each scan has a loop to a newer stored scan."""
+        self._packed: list[bytes] = []
+        self._shape = 0, 0
+        self._spectra: OrderedDict[int, Complex64[np.ndarray, "s f"]] = OrderedDict()
+        """Spectra by frame, the last used one at the end."""
+
+    def __len__(self) -> int:
+        return len(self._packed)
+
+    @property
+    def frames(self) -> Int[np.ndarray, " n"]:
+        """Frame number of each scan, in increasing order."""
+        return self._frames.rows + self._first
+
+    def shifted(self, first: int) -> "StoredScans":
+        """The same scans with frame numbers that begin at `first`. The scans are shared."""
+        found = copy.copy(self)
+        found._first = first
+        return found
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        """Up to k (0 or more) scans with the nearest descriptors among those with a flag, nearest first."""
+        if not k:
+            return np.zeros(0, np.int64)
+        rows = self.index.query(descriptor, k, exclude=~among).rows
+        return rows[rows >= 0]
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes of descriptors and compressed images, without the kept spectra (`SPECTRA`)."""
+        return self.index.nbytes + self._frames.nbytes + self._repeated.nbytes + sum(map(len, self._packed))
+
+    def is_new_place(self, frame: int, motion: Motion) -> bool:
+        """Whether a frame is far enough from the last stored scan, or its motion from there is unknown."""
+        if not self.keyframe_m or not len(self):
+            return True
+        last = self.frames[-1:]
+        moved, rotation = motion.moved(int(last[0]), motion.poses[frame])
+        near = moved < self.keyframe_m and rotation < np.radians(KEYFRAME_DEG)
+        return not (near and motion.same(frame, last).all())
+
+    def check(self, frame: int, image: UInt8[np.ndarray, "m m"]) -> None:
+        """Raises ValueError if an image has another shape than the stored ones."""
+        if len(self) and image.shape != self._shape:
+            raise ValueError(f"frame {frame}: expected an image of {self._shape} cells, found {image.shape}")
+
+    def add(self, frame: int, descriptor: Float32[np.ndarray, " d"], image: UInt8[np.ndarray, "m m"]) -> None:
+        """Add the scan of a frame, after forgetting others if there are `max_places`. Raises the error of `check`."""
+        self.check(frame, image)
+        if self.max_places is not None and len(self) >= self.max_places:
+            self.forget(max(self.max_places // PARTS, 1))
+        self.index.add(descriptor, ids=f"{frame:06d}")
+        self._frames.append(frame)
+        self._repeated.append(False)
+        self._packed.append(zlib.compress(image.tobytes(), LEVEL))
+        self._shape = image.shape
+
+    def close_loop(self, query: int, match: int) -> None:
+        """Note a loop between two frames. If both are stored, the query represents the place from now on."""
+        if query in self and match in self:
+            self._repeated.rows[np.searchsorted(self.frames, match)] = True
+
+    def forget(self, count: int) -> None:
+        """Remove some scans: first those that have a loop to a newer stored scan, then the oldest."""
+        kept = np.ones(len(self), bool)
+        kept[np.argsort(~self._repeated.rows, kind="stable")[:count]] = False
+        self.index.keep(kept)
+        self._frames.keep(kept)
+        self._repeated.keep(kept)
+        self._packed = [packed for packed, one in zip(self._packed, kept, strict=True) if one]
+
+    def __contains__(self, frame: int) -> bool:
+        row = np.searchsorted(self.frames, frame)
+        return bool(row < len(self) and self.frames[row] == frame)
+
+    def image(self, row: int) -> UInt8[np.ndarray, "m m"]:
+        """Image of a scan."""
+        return np.frombuffer(zlib.decompress(self._packed[row]), np.uint8).reshape(self._shape)
+
+    def image_of(self, frame: int) -> UInt8[np.ndarray, "m m"]:
+        """Image of the scan of a frame."""
+        return self.image(int(np.searchsorted(self.frames, frame)))
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        """Spectrum of each scan's image (`match_spectra`)."""
+        found = [self._spectrum(row) for row in rows.tolist()]
+        while len(self._spectra) > SPECTRA:
+            self._spectra.popitem(last=False)
+        return found
+
+    def _spectrum(self, row: int) -> Complex64[np.ndarray, "s f"]:
+        frame = int(self._frames.rows[row])
+        if frame not in self._spectra:
+            self._spectra[frame] = image_spectrum(self.image(row), self.verification)
+        self._spectra.move_to_end(frame)
+        return self._spectra[frame]
+
+
+def image_spectrum(image: UInt8[np.ndarray, "m m"], config: VerificationConfig) -> Complex64[np.ndarray, "s f"]:
+    """Spectrum of one image (`match_spectra`)."""
+    return np.asarray(match_spectra(image[None], config=config))[0]

@@ -1,0 +1,130 @@
+"""Alignment of a new map with an existing map whose world frame differs, or a check that the frames are the same."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.levelling import upright_from_lidar
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.config import ConsistencyConfig
+from sglpr_jax.loops.consistency import Joined, accepted_between
+from sglpr_jax.loops.frame_alignment import FrameAlignment, aligned_frames
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import inverse, moved_covariance, travelled
+
+SAMPLE = 300
+"""Maximum number of places of the new map that are located in the existing map. They are evenly spaced."""
+MIN_PROBABILITY = 0.5
+"""Minimum probability of a located place. The located places must also be consistent with each other."""
+MAX_APART_M = 5.0
+"""Maximum median distance between the two positions of common places in one world frame, in metres."""
+
+
+class MapAlignment(NamedTuple):
+    """Transform from the world frame of a new map to that of an existing map."""
+
+    frames: FrameAlignment
+    """`match_from_query` is the pose of the new world frame in the existing one."""
+    places: int
+    """Number of common places from which the transform was estimated."""
+    apart_m: float
+    """Median distance between the positions of these places in both maps, as if the frames were the same."""
+
+    def __str__(self) -> str:
+        x, y, z = self.frames.match_from_query[:3, 3]
+        rotation = self.frames.match_from_query[:3, :3]
+        yaw = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+        along, across, *_, turn = np.sqrt(np.diag(self.frames.covariance))
+        return (
+            f"transform x {x:.2f} m, y {y:.2f} m, z {z:.2f} m, yaw {yaw:.2f} degrees from {self.places} common places "
+            f"(standard deviations {along:.2f} m, {across:.2f} m, {np.degrees(turn):.2f} degrees)"
+        )
+
+
+def align_maps(before: PlaceMap, new: PlaceMap) -> MapAlignment | None:
+    """Locate places of a new map in an existing map, and estimate the transform between their world frames.
+
+    Arguments:
+      before: Existing map.
+      new: Map of one drive, made with the same weights, with its places in order.
+
+    Returns:
+      The transform, or None if the maps have no common place.
+
+    Raises:
+      ValueError: If the maps were made with other weights, or if their images have other sizes.
+    """
+    loops = _located(before, new)
+    if not loops:
+        return None
+    upright = [_upright_loop(loop, before, new) for loop in loops]
+    joined = Joined(
+        np.concatenate([_upright_poses(before), _upright_poses(new)]),
+        np.concatenate([travelled(before.world_from_place), travelled(new.world_from_place)]),
+        np.repeat([0, 1], [len(before), len(new)]),
+    )
+    sets, _ = accepted_between(upright, joined, drift=DriftModel(), config=ConsistencyConfig())
+    if not sets:
+        return None
+    accepted = {loop.query - len(before) for loop in sets[0]}
+    common = [loop for loop in loops if loop.query in accepted]
+    frames = aligned_frames(
+        common,
+        before.world_from_place,
+        new.world_from_place,
+        match_way=travelled(before.world_from_place),
+        query_way=travelled(new.world_from_place),
+        drift=DriftModel(),
+    )
+    there = np.array([before.world_from_place[loop.match] @ loop.match_from_query for loop in common])
+    here = new.world_from_place[[loop.query for loop in common]]
+    apart = np.linalg.norm(there[:, :3, 3] - here[:, :3, 3], axis=1)
+    return MapAlignment(frames, len(common), float(np.median(apart)))
+
+
+def check_one_frame(before: PlaceMap, new: PlaceMap) -> None:
+    """Check that two maps are in one world frame, as far as they have common places.
+
+    Raises:
+      ValueError: If the common places have other positions in the two maps.
+    """
+    found = align_maps(before, new)
+    if found is not None and found.apart_m > MAX_APART_M:
+        raise ValueError(
+            f"expected poses in the world frame of the existing map, found {found.places} places that are "
+            f"{found.apart_m:.1f} m away from where the existing map has them (median); with --frame align the poses "
+            "are moved to the existing map, with --frame same they are taken as they are"
+        )
+
+
+def without_known_places(before: PlaceMap, new: PlaceMap) -> PlaceMap:
+    """The new map without the places whose descriptors the existing map has, so that no scan is added twice."""
+    known = {descriptor.tobytes() for descriptor in before.index.descriptors}
+    return new.some([row for row, found in enumerate(new.index.descriptors) if found.tobytes() not in known])
+
+
+def _located(before: PlaceMap, new: PlaceMap) -> list[Loop]:
+    """Loops from places of the new map (query) to the existing map (match)."""
+    loops = []
+    for row in np.unique(np.linspace(0, len(new) - 1, min(len(new), SAMPLE)).astype(int)).tolist():
+        answers = before.relocate_seen(new.seen(row), weights_hash=new.index.weights_hash)
+        if answers and answers[0].probability >= MIN_PROBABILITY:
+            loops.append(dataclasses.replace(answers[0].loop, query=row))
+    return loops
+
+
+def _upright_poses(places: PlaceMap) -> Float[np.ndarray, "n 4 4"]:
+    """Pose of the gravity-aligned frame of the sensor at each place."""
+    uprights = [upright_from_lidar(places.mounting(row)) for row in range(len(places))]
+    return places.world_from_place @ inverse(np.array(uprights).reshape(-1, 4, 4))
+
+
+def _upright_loop(loop: Loop, before: PlaceMap, new: PlaceMap) -> Loop:
+    """The loop in gravity-aligned frames. The rows of the new map follow those of the existing map."""
+    ours = upright_from_lidar(new.mounting(loop.query))
+    pose = upright_from_lidar(before.mounting(loop.match)) @ loop.match_from_query @ inverse(ours)
+    covariance = moved_covariance(loop.covariance, ours)
+    return dataclasses.replace(loop, query=len(before) + loop.query, match_from_query=pose, covariance=covariance)

@@ -1,0 +1,349 @@
+"""Poses of a scan in a map of places, the answers of `PlaceMap.relocate`."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex64, Float, Float32, Int, UInt8
+from numpy.typing import ArrayLike
+
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.gravity import GroundFilter
+from sglpr_jax.data.levelling import upright_from_lidar
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scaled import scaled_poses, scaled_record
+from sglpr_jax.fields import check_value
+from sglpr_jax.loops.arguments import check_is, given_record
+from sglpr_jax.loops.candidates import CandidateFinder
+from sglpr_jax.loops.closure import Loop, divided_loop, planar_loop
+from sglpr_jax.loops.comparison import Candidate, Comparer, Query
+from sglpr_jax.loops.config import CANDIDATES, SPACING_M, CandidateConfig, PlaceCount
+from sglpr_jax.loops.keyframes import Seen, image_spectrum
+from sglpr_jax.loops.probability import LoopModel, default_model
+from sglpr_jax.maps.mapped_scans import map_scans
+from sglpr_jax.maps.place_file import REQUIRED, Content, free_names, read_places, write_places
+from sglpr_jax.models.params import Params
+from sglpr_jax.odometry.bev_odometry import Motion
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.registration.bev_spectra import query_spectra, within_reach
+from sglpr_jax.registration.config import VerificationConfig
+from sglpr_jax.retrieval.index import Index
+from sglpr_jax.retrieval.index_rows import check_scale, check_weights
+from sglpr_jax.same_place import NEGATIVE_M
+from sglpr_jax.se3 import inverse
+
+
+class Relocated(NamedTuple):
+    """Pose of a scan, estimated from one place of the map."""
+
+    place: str
+    """Id of the place."""
+    world_from_query: Float[np.ndarray, "4 4"]
+    """Pose of the scan's LiDAR (tilted if the sensor is) in the frame of the map, in metres."""
+    loop: Loop
+    """Loop between scan and place. `match` is the row of the place, `query` is the number of places."""
+
+    @property
+    def probability(self) -> float:
+        """Probability that the scan shows the place."""
+        return self.loop.probability
+
+    def divided(self, scale: Scale) -> "Relocated":
+        """The same pose in metres, of scans that were multiplied by `scale`."""
+        pose = scaled_poses(self.world_from_query, 1 / scale)
+        return self._replace(world_from_query=pose, loop=divided_loop(self.loop, scale))
+
+
+def with_shared_probability(answers: Sequence[Relocated]) -> list[Relocated]:
+    """Sort answers by probability, scaled so that those of answers more than `NEGATIVE_M` apart add up to at most 1."""
+    groups: list[list[Relocated]] = []
+    for one in _most_probable_first(answers):
+        position = one.world_from_query[:3, 3]
+        near = (group for group in groups if np.linalg.norm(group[0].world_from_query[:3, 3] - position) <= NEGATIVE_M)
+        group = next(near, None)
+        if group is None:
+            groups.append([one])
+        else:
+            group.append(one)
+    total = max(1.0, sum(group[0].probability for group in groups))
+    return _most_probable_first(
+        [one._replace(loop=dataclasses.replace(one.loop, probability=one.probability / total)) for one in answers]
+    )
+
+
+def _most_probable_first(answers: Sequence[Relocated]) -> list[Relocated]:
+    return sorted(answers, key=lambda one: -one.probability)
+
+
+NO_DRIFT = DriftModel(metres_per_metre=1e-3, degrees_per_metre=1e-4, height_per_metre=1e-3)
+"""Drift of the poses of a map. It is small, but large over the unknown motion of a query (`motion.UNKNOWN_M`)."""
+NO_LOOPS = np.zeros((0, 2), np.int64)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PlaceMap:
+    """Places in one world frame, from one or more drives.
+
+    Example:
+      places = PlaceMap.of(recording, params, poses)
+      places.save("town.safetensors")
+      best = PlaceMap.load("town.safetensors").relocate(params, record)[0]
+    """
+
+    index: Index
+    images: UInt8[np.ndarray, "n h h"]
+    """Density images, 8 bits."""
+    world_from_place: Float[np.ndarray, "n 4 4"]
+    """Pose of the LiDAR at each place."""
+    mountings: Float[np.ndarray, "n 4"]
+    """Mounting of the sensor: height above the ground, in metres, and the up direction in its frame."""
+    mounting_deviations: Float[np.ndarray, "n 2"] | None = None
+    """Standard deviations of height (metres) and tilt (degrees), NaN for a sensor fixed to a vehicle. None stands for
+    NaN everywhere."""
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        params: Params,
+        poses: ArrayLike,
+        *,
+        spacing_m: float = SPACING_M,
+        scale: Scale = 1,
+        on_progress: Callable[[int], None] = lambda done: None,
+    ) -> "PlaceMap":
+        """Create the map of a recording with known poses.
+
+        `map_recording` does the same and can also skip unreadable scans and resume. Raises the errors of
+        `map_recording`.
+
+        Arguments:
+          recording: The scans.
+          params: Weights of the model that describes them.
+          poses: Pose of the LiDAR in the world at each scan.
+          spacing_m: Minimum distance of consecutive places, in metres.
+          scale: Factor for all lengths before scans are described, 1, 2 or 4.
+          on_progress: Called with the number of scans done.
+        """
+        check_is(recording, Recording, by="open_recording")
+        scans = map_scans(recording, params, poses, spacing_m=spacing_m, scale=scale, on_progress=on_progress)
+        return cls(*scans.places)
+
+    def mounting(self, row: int = -1) -> Mounting:
+        """Mounting of the sensor at a place, by default the last one."""
+        height, *up = self.mountings[row].tolist()
+        deviations = self._deviations[row]
+        return Mounting(height, tuple(up), *(() if np.isnan(deviations).any() else deviations.tolist()))
+
+    def query_mounting(self, points: Float[np.ndarray, "n 3"]) -> Mounting:
+        """Mounting of the sensor of a query: that of the last place or, if the sensor of the map tilts, by the ground
+        of the query near the median of all places."""
+        if not self.tilts:
+            return self.mounting()
+        height, *up = np.median(self.mountings, axis=0)
+        mean = Mounting(float(height), tuple((np.array(up) / np.linalg.norm(up)).tolist()))
+        return GroundFilter(mean).add(points)
+
+    @property
+    def scale(self) -> Scale:
+        """Factor for all lengths of the described scans (`data.scaled`). Poses and mountings are in metres."""
+        return self.index.scale
+
+    @property
+    def tilts(self) -> bool:
+        """Whether the mounting of some place was estimated from its scan, because the sensor tilts."""
+        return bool(np.isfinite(self._deviations).all(axis=1).any())
+
+    @property
+    def _deviations(self) -> Float[np.ndarray, "n 2"]:
+        given = self.mounting_deviations
+        return np.full((len(self), 2), np.nan) if given is None else given
+
+    def merged(self, other: "PlaceMap", *, drive: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> "PlaceMap":
+        """Merge two maps in one world frame. Places that are in both are stored once.
+
+        If ids of `other` are taken by other places, its recordings are renamed with the suffix ~2, ~3 and so on.
+
+        Arguments:
+          other: Map to add.
+          drive: Poses of all scans of the recording of `other` (`poses_by_id`). They are needed if `other` is not
+            complete, so that its places get the same ids as in the complete map.
+
+        Raises:
+          ValueError: If the maps were made with other weights or another scale, or have images of another size.
+        """
+        check_scale(self.scale, other.scale)
+        if other.images.shape[1:] != self.images.shape[1:]:
+            raise ValueError(f"expected images of {self.images.shape[1:]} cells, found {other.images.shape[1:]}")
+        known = set(self._contents())
+        new = [row for row, content in enumerate(other._contents()) if content not in known]
+        coming: dict[str, Content] = {name: (None, pose.tobytes()) for name, pose in (drive or {}).items()}
+        coming |= zip(other.index.ids, other._contents(), strict=True)
+        taken = dict(zip(self.index.ids, self._contents(), strict=True))
+        new_ids = free_names([other.index.ids[row] for row in new], coming, taken=taken)
+        index = self.index.without_places()
+        for one, rows, ids in ((self, list(range(len(self))), self.index.ids), (other, new, new_ids)):
+            places = {"ids": ids, "positions": one.world_from_place[rows, :3, 3]}
+            index.add(one.index.descriptors[rows], **places, weights_hash=one.index.weights_hash)
+        both = (np.concatenate([getattr(self, name), getattr(other, name)[new]]) for name in REQUIRED)
+        deviations = np.concatenate([self._deviations, other._deviations[new]])
+        return PlaceMap(index, *both, mounting_deviations=deviations)
+
+    def relocate(
+        self,
+        params: Params,
+        record: Record | ArrayLike,
+        *,
+        model: LoopModel | None = None,
+        candidates: int = CANDIDATES,
+    ) -> list[Relocated]:
+        """Locate a scan or image in the map.
+
+        Arguments:
+          params: Weights that made the map.
+          record: A record, points (n, 3) in metres or an image (h, w). Points are taken from a sensor mounted like that
+            of the map (`query_mounting`). For another mounting pass a record.
+          model: Model of the probabilities, by default the one shipped for the weights.
+          candidates: Maximum number of poses, and number of nearest places that the query is compared with. If it fits
+            none of them well, as many others of the nearest 25 are compared, chosen by a coarse comparison.
+
+        Returns:
+          One pose for each compared place, the most probable first. Empty if the scan is almost empty.
+
+        Raises:
+          ValueError: If other weights made the map, if an array has another shape, or if `candidates` is not from 1 to
+            1000.
+          TypeError: If an argument is not parameters, a record or an array.
+        """
+        check_value(candidates, PlaceCount, "candidates")
+        finder = CandidateFinder(params)
+        given = given_record(record)
+        if len(self) and not isinstance(record, Record) and given.points is not None:
+            given = dataclasses.replace(given, mounting=self.query_mounting(given.points))
+        seen = finder.seen(scaled_record(given, self.scale))
+        return self.relocate_seen(seen, weights_hash=finder.index.weights_hash, model=model, candidates=candidates)
+
+    def relocate_seen(
+        self, seen: Seen, *, weights_hash: str | None, model: LoopModel | None = None, candidates: int = CANDIDATES
+    ) -> list[Relocated]:
+        """Locate a described scan in the map. The arguments and answers are those of `relocate`.
+
+        Arguments:
+          seen: Description of the scan, with the scale of the map.
+          weights_hash: Hash of the weights that described it.
+          model: Model of the probabilities, by default the one shipped for the weights.
+          candidates: Maximum number of poses.
+        """
+        check_weights(self.index.weights_hash, weights_hash)
+        image = seen.image
+        if len(self) and within_reach(image).shape != within_reach(self.images[0]).shape:
+            raise ValueError(f"expected an image of {self.images.shape[1:]} cells as in the map, found {image.shape}")
+        if not len(self) or np.count_nonzero(image) < CandidateConfig().min_cells:
+            return []
+        model, scaled_map = default_model() if model is None else model, self._scaled()
+        config = CandidateConfig(candidates=candidates, further=max(candidates, CandidateConfig().further))
+        query = Query(len(self), seen.descriptor, image, query_spectra(image))
+        comparer = Comparer(scaled_map._motion, NO_DRIFT, np.eye(3), config, VerificationConfig(), NO_LOOPS)
+        fits = comparer.compare(query, scaled_map)
+        order = np.argsort(-np.nan_to_num(fits.peaks.correlation), kind="stable")
+        _, first = np.unique(fits.frames[order], return_index=True)  # a place may be compared twice
+        best = order[np.sort(first)][:candidates].tolist()
+        found = [comparer.candidate(query, fits, row, self.image) for row in best]
+        answers = [scaled_map._answer(one, seen, float(model.probability(one.evidence))) for one in found]
+        return [one.divided(self.scale) for one in with_shared_probability(answers)]
+
+    @property
+    def frames(self) -> Int[np.ndarray, " n"]:
+        """Number of each place."""
+        return np.arange(len(self))
+
+    def nearest(
+        self, descriptor: Float32[np.ndarray, " d"], k: int, among: Bool[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " j"]:
+        """Up to k (0 or more) places with the nearest descriptors among those with a flag, nearest first."""
+        rows = self.index.query(descriptor, k, exclude=~among).rows if k else np.zeros(0, np.int64)
+        return rows[rows >= 0]
+
+    def image(self, row: int) -> UInt8[np.ndarray, "h h"]:
+        """Image of a place."""
+        return self.images[row]
+
+    def spectra(self, rows: Int[np.ndarray, " k"]) -> list[Complex64[np.ndarray, "s f"]]:
+        """Spectrum of each place's image (`match_spectra`)."""
+        return [image_spectrum(self.images[row], VerificationConfig()) for row in rows.tolist()]
+
+    @functools.cached_property
+    def _motion(self) -> Motion:
+        """Poses of the places, and a last frame of unknown pose for queries. The world is level."""
+        uprights = np.array([upright_from_lidar(self.mounting(row)) for row in range(len(self))]).reshape(-1, 4, 4)
+        found = Motion.of(self.world_from_place @ inverse(uprights))
+        found.add(0.0, continues=False)
+        return found
+
+    def seen(self, row: int) -> Seen:
+        """Description of the scaled scan at a place."""
+        return Seen(self.index.descriptors[row], self.images[row], self.mounting(row).scaled(self.scale))
+
+    def some(self, rows: Sequence[int]) -> "PlaceMap":
+        """Return a map of some of the places.
+
+        Arguments:
+          rows: Numbers of the places.
+        """
+        index = self.index.without_places()
+        ids, positions = [self.index.ids[row] for row in rows], self.world_from_place[rows, :3, 3]
+        index.add(self.index.descriptors[rows], ids=ids, positions=positions)
+        arrays = {name: getattr(self, name)[rows] for name in REQUIRED}
+        return PlaceMap(index, **arrays, mounting_deviations=self._deviations[rows])
+
+    def moved(self, world_from_old: Float[np.ndarray, "4 4"]) -> "PlaceMap":
+        """Return the map in another world frame.
+
+        Arguments:
+          world_from_old: Pose of the old world frame in the new one.
+        """
+        poses = world_from_old @ self.world_from_place
+        index = self.index.without_places()
+        index.add(self.index.descriptors, ids=self.index.ids, positions=poses[:, :3, 3])
+        return dataclasses.replace(self, index=index, world_from_place=poses)
+
+    def save(self, path: Path | str) -> None:
+        """Write the map atomically to one file: an index file with additional arrays (`place_file.ARRAYS`)."""
+        deviations = {"mounting_deviations": self._deviations} if self.tilts else {}
+        write_places(Path(path), self.index, {name: getattr(self, name) for name in REQUIRED} | deviations)
+
+    @classmethod
+    def load(cls, path: Path | str, *, weights_hash: str | None = None) -> "PlaceMap":
+        """Read a file of `save`. Raises the errors of `Index.load`, and ValueError if the file has no valid map."""
+        index, arrays = read_places(path, weights_hash=weights_hash)
+        return cls(index, **arrays)
+
+    def _scaled(self) -> "PlaceMap":
+        """The same map with poses and mountings of its scaled scans."""
+        if self.scale == 1:
+            return self
+        deviations = self.mounting_deviations
+        return dataclasses.replace(
+            self,
+            world_from_place=scaled_poses(self.world_from_place, float(self.scale)),
+            mountings=self.mountings * np.array([self.scale, 1, 1, 1]),
+            mounting_deviations=None if deviations is None else deviations * np.array([self.scale, 1]),
+        )
+
+    def _contents(self) -> Iterator[tuple[bytes, bytes]]:
+        """Descriptor and pose of each place, as bytes."""
+        for descriptor, pose in zip(self.index.descriptors, self.world_from_place, strict=True):
+            yield descriptor.tobytes(), pose.tobytes()
+
+    def _answer(self, one: Candidate, seen: Seen, probability: float) -> Relocated:
+        """Pose of a query by a place."""
+        mountings = {"query_mounting": seen.mounting, "match_mounting": self.mounting(one.match)}
+        loop = planar_loop(one.query, one.match, one.alignment, probability=probability, **mountings)
+        return Relocated(self.index.ids[one.match], self.world_from_place[one.match] @ loop.match_from_query, loop)

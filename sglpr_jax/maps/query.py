@@ -1,0 +1,64 @@
+"""Query scans and images from files, for relocalisation in a map."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from sglpr_jax.data.choices import ScanFormat, SensorHeight
+from sglpr_jax.data.formats.scan_files import found_format
+from sglpr_jax.data.mounting import Mounting, estimate_mounting
+from sglpr_jax.data.readers.bev_images import read_image
+from sglpr_jax.data.recording import Record, Recording, scan_record
+from sglpr_jax.maps.place_map import PlaceMap
+from sglpr_jax.pose_graph.odometry_files import BAGS
+
+
+def read_query(
+    path: Path, places: PlaceMap, *, format: ScanFormat = "auto", sensor_height: SensorHeight = "auto"
+) -> Record:
+    """Read a query for `PlaceMap.relocate`.
+
+    Arguments:
+      path: File of a scan, or of an image (.png).
+      places: Map in which the query will be located.
+      format: Format of the scan. "auto" uses the file name. For a .bin whose name does not state the format, it uses
+        the content, as for a folder of scans.
+      sensor_height: Height of the sensor above the ground, in metres. "estimate" estimates height and tilt from the
+        scan. "auto" uses `PlaceMap.query_mounting`.
+
+    Raises:
+      IsADirectoryError: If `path` is a folder.
+      ValueError: If `path` is a bag, or if height and tilt cannot be estimated, because the scan shows no ground.
+        Errors of `scan_record` and `read_image` are raised, too.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{path}: expected one scan or image, found a folder; name a file in it, or use --frame"
+        )
+    if path.suffix in BAGS:
+        raise ValueError(f"{path}: expected one scan or image, found a bag; use --frame")
+    if path.suffix == ".png":
+        return Record(image=read_image(path))
+    record = scan_record(path, format=found_format(path) if format == "auto" else format)
+    assert record.points is not None
+    if sensor_height == "auto":
+        return dataclasses.replace(record, mounting=places.query_mounting(record.points))
+    if sensor_height != "estimate":
+        return dataclasses.replace(record, mounting=Mounting(float(sensor_height)))
+    found = estimate_mounting(record.points)
+    if found is None:
+        raise ValueError(f"{path}: expected ground to estimate the sensor's height, found none; state the height")
+    return dataclasses.replace(record, mounting=found)
+
+
+def query_of(recording: Recording, frame: int) -> Record:
+    """Read the scan with this number from a recording, as a query for `PlaceMap.relocate`.
+
+    Raises ValueError if the recording has no such scan, or if it is left out because it has no pose.
+    """
+    rows = np.flatnonzero(recording.numbers == frame)
+    if not rows.size:
+        there = f"{len(recording)} scans from {recording.numbers[0]} to {recording.numbers[-1]}"
+        raise ValueError(f"{recording.name}: expected the number of a scan, found {frame}; it has {there}")
+    return recording.record(int(rows[0]), labels=False)

@@ -1,1 +1,0 @@
-"""Backbones: networks from the image to feature maps."""

@@ -1,0 +1,116 @@
+"""Backbone of circular convolutions on the polar image: a rotation of the scan only shifts its features.
+
+Along the radius, strides reduce the image, because a rotation moves nothing in this direction. Along the sectors,
+average pooling reduces it, because pooling skips no sector. A rotation by a whole number of the last map's sectors is
+therefore a shift of that map. It is exact up to the resampling of the image.
+"""
+
+import dataclasses
+import functools
+import itertools
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sglpr_jax.models.backbone import Seen
+from sglpr_jax.models.config import CircularConfig
+from sglpr_jax.models.convolution import Convolution
+from sglpr_jax.models.layers import LayerNorm, Linear
+
+
+@dataclasses.dataclass(frozen=True)
+class CircularBackbone:
+    """Circular CNN and its decoder: layers `rings` and `decoder`."""
+
+    config: CircularConfig
+
+    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
+        """Computes the features: the last map. There is no stochastic depth."""
+        maps = CircularNet(self.config, name="rings")(image)  # the name in weight files
+        return Seen(maps[-1], maps[:-1], {f"circular_block{i}": seen for i, seen in enumerate(maps[1:])})
+
+    def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
+        """Computes a pixel for each pixel of the averaged image."""
+        return CircularDecoder(self.config.widths, name="decoder")([*seen.finer, seen.features])
+
+
+class CircularBlock(nn.Module):
+    """Circular convolution, layer norm, ReLU. If input and output have the same shape, the input is added."""
+
+    features: int
+    stride: int = 1
+    """Stride along the radius."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "b r s c"]) -> Float[Array, "b _ s {self.features}"]:
+        """Computes a map with the same number of sectors."""
+        convolution = Convolution(self.features, strides=(self.stride, 1), circular=True, name="convolution")
+        y = nn.relu(LayerNorm(name="norm")(convolution(x)))
+        return x + y if x.shape == y.shape else y
+
+
+class CircularNet(nn.Module):
+    """Network from the polar image to the features of the place head and all intermediate maps.
+
+    Average pooling loses details that are smaller than its window. Therefore, a second branch of blocks keeps all
+    sectors. Each of its maps is averaged to the size of a map of the main branch, to which it is joined.
+    """
+
+    config: CircularConfig
+
+    @nn.compact
+    def __call__(self, polar: Float[Array, "b p q c"]) -> list[Float[Array, "b _ _ _"]]:
+        """Returns the averaged image and the map of each block, with the fine maps. The last map is the features."""
+        config, fine = self.config, polar
+        maps = [block_means(polar, config.average, config.average)]
+        for i, (width, stride, sectors) in enumerate(zip(config.widths, config.strides, config.means, strict=True)):
+            if i < len(config.fine):
+                fine = CircularBlock(config.fine[i], config.strides[i - 1] if i else config.average, name=f"fine_{i}")(
+                    fine
+                )
+                joining = block_means(fine, 1, fine.shape[2] // maps[-1].shape[2])
+                maps[-1] = jnp.concatenate([maps[-1], joining], axis=-1)
+            maps.append(block_means(CircularBlock(width, stride, name=f"block_{i}")(maps[-1]), 1, sectors))
+        return maps
+
+
+class CircularDecoder(nn.Module):
+    """Decoder from the features to the resolution of the image after average pooling.
+
+    At each finer resolution it joins the last map that the network computed there (skip connection).
+    """
+
+    widths: tuple[int, ...]
+    """Channels of the blocks that made the maps."""
+
+    @nn.compact
+    def __call__(self, maps: list[Array]) -> Float[Array, "b p q _"]:
+        """Returns pixels with the channels of the first block."""
+        finer = [i for i, (fine, coarse) in enumerate(itertools.pairwise(maps)) if fine.shape[:3] != coarse.shape[:3]]
+        x = maps[-1]
+        for i, of_map in enumerate(reversed(finer)):
+            seen, width = maps[of_map], self.widths[max(of_map - 1, 0)]
+            x = Linear(width, name=f"narrow_{i}")(x)
+            x = jnp.concatenate([_repeated(x, seen.shape[1] // x.shape[1], seen.shape[2] // x.shape[2]), seen], axis=-1)
+            x = CircularBlock(width, name=f"block_{i}")(x)
+        return x
+
+
+def block_means(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
+    """Average blocks of `radii` x `sectors` pixels, one direction after the other, so that no array has six axes."""
+    b, r, s, c = x.shape
+    rows = _means_of_parts(x.reshape(b, r // radii, radii * s * c), radii)
+    blocks = _means_of_parts(rows.reshape(b, r // radii * (s // sectors), sectors * c), sectors)
+    return blocks.reshape(b, r // radii, s // sectors, c)
+
+
+def _means_of_parts(x: Float[Array, "b n k"], parts: int) -> Float[Array, "b n _"]:
+    """Averages equal parts of each row. It adds them, because XLA's CPU backend reduces a few numbers slowly."""
+    if parts == 1:
+        return x
+    return functools.reduce(jnp.add, jnp.split(x, parts, axis=-1)) * (1 / parts)
+
+
+def _repeated(x: Float[Array, "b r s c"], radii: int, sectors: int) -> Float[Array, "b _ _ c"]:
+    return x.repeat(radii, axis=1).repeat(sectors, axis=2)

@@ -1,0 +1,182 @@
+"""Export of `describe` with its weights as a program for runtimes without this package: StableHLO and ONNX."""
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, get_args
+
+import jax
+import jax.export
+import numpy as np
+from jax2onnx import to_onnx  # pyright: ignore[reportMissingImports]
+
+from sglpr_jax.data.density_grid import MAX_COUNT, RESOLUTION_M
+from sglpr_jax.data.density_image import (
+    CEILING_M,
+    EDGE_STEP_M,
+    FIRST_EDGE_M,
+    FLOOR_M,
+    MAX_VOXELS,
+    REACH_M,
+)
+from sglpr_jax.data.mounting import MODEL_HEIGHT_M
+from sglpr_jax.fields import check_value
+from sglpr_jax.files import check_holds_only, replacing, write_json
+from sglpr_jax.grid import Grid
+from sglpr_jax.models.config import ModelConfig
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.sglpr import describe
+from sglpr_jax.models.weights import for_places
+from sglpr_jax.models.weights_file import CONFIG_FILE, load, save
+
+ProgramFormat = Literal["stablehlo", "onnx"]
+PLATFORMS = ("cpu", "cuda", "tpu")
+INPUT_FILE = "input.json"
+NEEDS = "pip install 'sglpr-jax[export]'"
+NEEDS_ONNX = f"{NEEDS} && pip install --no-deps jax2onnx==0.17.1"
+"""jax2onnx is installed without its dependencies. They include an Orbax that is older than this package's and that the
+conversion does not use."""
+
+
+def save_program(params: Params, folder: Path | str, *, format: ProgramFormat) -> Path:
+    """Export `describe` with its weights as a program.
+
+    The folder gets `describe.stablehlo` or `describe.onnx`, the model's `config.json`, and `input.json`. The latter
+    describes how a scan becomes the program's input, and holds the SHA-256 of the program. Both formats take any number
+    of images (b, h, w) in float32 and return descriptors (b, d).
+
+    Arguments:
+      params: Model that reads images only.
+      folder: New folder, or one with an earlier program, which is replaced. It is written completely or not at all.
+      format: `stablehlo` for `jax.export.deserialize` on CPU, CUDA and TPU (requires flatbuffers), or `onnx` (requires
+        jax2onnx).
+
+    Raises:
+      ImportError: If a required package is missing. The message has the command that installs it.
+      FileExistsError: If the folder holds other files.
+      ValueError: If the format is unknown, or if the model reads labels.
+      RuntimeError: If the conversion to ONNX fails.
+    """
+    check_value(format, ProgramFormat, "format")
+    folder = Path(folder)
+    if params.config.head.reads_labels:
+        raise ValueError(f"expected a model that reads images only, found one that reads {params.config.head.input}")
+    check_holds_only(folder, (*(f"describe.{one}" for one in get_args(ProgramFormat)), CONFIG_FILE, INPUT_FILE))
+    params = for_places(params)
+    program = stablehlo(params) if format == "stablehlo" else onnx(params)
+    with replacing(folder) as new:
+        new.mkdir()
+        (new / f"describe.{format}").write_bytes(program)
+        write_json(new / CONFIG_FILE, dataclasses.asdict(params.config))
+        checksum = {"sha256": hashlib.sha256(program).hexdigest()}  # for users: runtimes do not check it
+        write_json(new / INPUT_FILE, input_description(params.config) | checksum)
+    return folder
+
+
+def stablehlo(params: Params) -> bytes:
+    """Return `describe` with these weights as serialised by `jax.export`, for any number of images."""
+    try:
+        import flatbuffers  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"StableHLO requires the package flatbuffers: {NEEDS}") from error
+    grid = params.config.grid
+    shape = jax.export.symbolic_shape(f"b, {grid.height}, {grid.width}")
+    program = jax.jit(lambda bev: describe(params, bev))
+    with _no_source_locations():
+        exported = jax.export.export(program, platforms=PLATFORMS)(jax.ShapeDtypeStruct(shape, np.float32))
+        return bytes(exported.serialize())
+
+
+@contextlib.contextmanager
+def _no_source_locations() -> Iterator[None]:
+    """Omit source file locations from programs, so that the same weights give the same bytes on every machine."""
+    limit = "jax_traceback_in_locations_limit"
+    before = getattr(jax.config, limit)
+    jax.config.update(limit, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(limit, before)
+
+
+def onnx(params: Params) -> bytes:
+    """Return `describe` with these weights as an ONNX model.
+
+    The conversion runs in a separate process, because the model cannot be called any more after it.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        weights, program = Path(temporary, "weights"), Path(temporary, "describe.onnx")
+        save(params, weights)
+        command = [sys.executable, "-m", "sglpr_jax.models.export", str(weights), str(program)]
+        on_the_cpu = os.environ | {"JAX_PLATFORMS": "cpu"}
+        ended = subprocess.run(command, capture_output=True, text=True, env=on_the_cpu)
+        if ended.returncode:
+            last = (ended.stderr.strip().splitlines() or ["no message"])[-1]
+            error = ImportError if "ModuleNotFoundError" in last else RuntimeError
+            raise error(f"the conversion to ONNX failed ({last}); it requires: {NEEDS_ONNX}")
+        return program.read_bytes()
+
+
+def input_description(config: ModelConfig) -> dict[str, str]:
+    """Describe in words and formulas how a scan becomes the program's input, for users of other languages."""
+    grid = config.grid
+    return {
+        "input": f"bev: float32 [b, {grid.height}, {grid.width}]",
+        "output": f"descriptor: float32 [b, {config.head.descriptor_size}] of length 1; compared by Euclidean distance",
+        "points": "finite ones, metres in the LiDAR frame: x forward, y left, z up, of an upright sensor "
+        f"{MODEL_HEIGHT_M} m above the ground; of one that is h m above it, with the direction n of up in its frame "
+        f"(length 1): R p + (0, 0, h - {MODEL_HEIGHT_M}), R being the smallest rotation that turns n to (0, 0, 1)",
+        **(_counts_of_points(grid) if config.image == "points" else _counts_of_voxels(grid)),
+    }
+
+
+def _counts_of_points(grid: Grid) -> dict[str, str]:
+    r, u, v = grid.resolution_m, grid.width // 2, grid.height // 2 - 1
+    return {
+        "cells": f"{r} m wide; a point lies in bev[i, v, u] with u = floor(x / {r}) + {u}, v = {v} - floor(y / {r})",
+        "values": "the number of points in each cell; points outside are left out",
+    }
+
+
+def _counts_of_voxels(grid: Grid) -> dict[str, str]:
+    """Steps of `density_bev`, `even_cells` and `centre_crop`."""
+    u, v = grid.width // 2, grid.height // 2
+    return {
+        "voxels": f"points with |x| < {REACH_M}, |y| < {REACH_M}, {FLOOR_M} < z < {CEILING_M} are sorted into voxels, "
+        f"floor(point / edge); the edge is the smallest of {FIRST_EDGE_M}, {FIRST_EDGE_M + EDGE_STEP_M}, ... m that "
+        f"leaves at most {MAX_VOXELS} voxels with points; each of these gives one centroid, the mean of its points",
+        "counts": f"n = min(number of centroids, {MAX_COUNT}) for each pair i = trunc(x / {RESOLUTION_M}), "
+        f"j = trunc(y / {RESOLUTION_M}); value = round(255 n / N) {MAX_COUNT} / 255, N being the largest n",
+        "cells": f"the value of (i, j) stands in bev[b, v, u] with u = {u} + i for i > 0, {u - 1} + i for i < 0, and "
+        f"v = {v - 1} - j for j > 0, {v} - j for j < 0; for i = 0 half of it stands in u = {u - 1}, half in u = {u}, "
+        f"for j = 0 half in v = {v - 1} and half in v = {v}; all other cells are 0, and what lies outside is left out",
+    }
+
+
+OPSET = 21
+
+
+def convert(weights: Path, file: Path) -> None:
+    """Write `describe` as an ONNX model, with the description of its input in the metadata."""
+    params = load(weights)
+    grid = params.config.grid
+    model = to_onnx(
+        lambda bev: describe(params, bev),
+        [("b", grid.height, grid.width)],
+        opset=OPSET,
+        input_names=["bev"],
+        output_names=["descriptor"],
+    )
+    for key, value in input_description(params.config).items():
+        model.metadata_props.add(key=key, value=value)
+    file.write_bytes(model.SerializeToString())
+
+
+if __name__ == "__main__":
+    convert(Path(sys.argv[1]), Path(sys.argv[2]))

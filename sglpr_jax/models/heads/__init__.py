@@ -1,1 +1,0 @@
-"""Heads: networks from feature maps to a descriptor or to classes."""

@@ -1,0 +1,299 @@
+"""Motion of the sensor from frame to frame, from odometry or by registration of each image with a keyframe.
+
+The decision about a loop needs to know which scans show other places. The motion is accurate enough for this purpose
+over some hundred metres. It does not replace odometry. Where the surroundings show the position across a direction
+only, as in a tunnel, the sensor is assumed to move on as before, and the drift grows fast. Where they show nothing,
+the motion is unknown and a new segment begins. Only ratios of times count, so a drive at another speed has the same
+motion.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sglpr_jax.growing import GrowingArray
+from sglpr_jax.odometry.config import MotionConfig
+from sglpr_jax.odometry.path import DrivenPath
+from sglpr_jax.registration.bev_alignment import Alignment
+from sglpr_jax.se3 import inverse, transform, travelled, yaw_of
+
+MOST_STEPS = 3.0
+"""Maximum time step, as a multiple of the previous one, for which a pose is extrapolated. A longer one is a gap."""
+EQUAL = 0.99
+"""Correlation of equal images. Between plain walls, too, they show that the sensor stands."""
+STANDING_M = 0.05
+"""Maximum length of a step of a sensor that stands, in metres."""
+TURN_DEG = 90.0
+"""Maximum rotation from the expected pose, in degrees. Beyond it, as after a gap, a pose drifts like a guess, because
+rows of cars look alike from both ends."""
+GAP_M = 1000.0
+"""Travelled distance that counts for an unknown motion, as after a restart, in metres."""
+UNKNOWN_M = 1e6
+"""Length of measured path with the same drift as an unknown motion, in metres: the sensor may be anywhere."""
+NUMBERS = [("time", "f8"), ("segment", "i8"), ("travelled", "f8"), ("guessed_m", "f8")]
+"""Numbers of a frame beside its pose."""
+
+
+class Link(NamedTuple):
+    """Pose of a frame in the frame of an earlier one, from their images."""
+
+    x: Float[np.ndarray, ""]
+    y: Float[np.ndarray, ""]
+    """Position, in metres."""
+    yaw: Float[np.ndarray, ""]
+    """Rotation in radians, counter-clockwise."""
+    correlation: Float[np.ndarray, ""]
+    second: Float[np.ndarray, ""]
+    """Second-peak ratio."""
+    along_m: Float[np.ndarray, ""]
+    """Standard deviation of the position along its least certain direction, in metres."""
+
+    @classmethod
+    def of(cls, one: Alignment) -> "Link":
+        """Pose of an alignment."""
+        return cls(*map(np.asarray, (one.x, one.y, one.yaw, one.correlation, one.second, one.along_m)))
+
+    def angle_to(self, yaw: float) -> float:
+        """Angle between the rotation and another one, in radians, from 0 to pi. NaN if the other one is unknown."""
+        return float(abs((float(self.yaw) - float(yaw) + np.pi) % (2 * np.pi) - np.pi))
+
+
+class Motion:
+    """Planar poses of all added frames, in order."""
+
+    def __init__(self, config: MotionConfig = MotionConfig()):
+        self.config = config
+        self.keyframe = 0
+        self.path = DrivenPath()
+        """Planar poses of all added frames or, with odometry, its gravity-aligned poses."""
+        self._numbers = GrowingArray(np.empty(0, NUMBERS))
+        self._coasted = 0
+        self._m_per_s: float | None = None
+        """Last known forward speed, in metres per second. None while it was never known."""
+
+    def __len__(self) -> int:
+        return len(self.path)
+
+    @classmethod
+    def of(cls, poses: Float[np.ndarray, "n 4 4"]) -> "Motion":
+        """Motion along known poses, such as those of the places of a map."""
+        found, numbers = cls(), np.zeros(len(poses), NUMBERS)
+        numbers["travelled"] = travelled(poses) if len(poses) else 0.0
+        found._numbers.extend(numbers)
+        found.path.extend(poses, np.zeros(len(poses)))
+        return found
+
+    @classmethod
+    def joined(cls, motions: "Sequence[Motion]", levels: Sequence[Float[np.ndarray, "3 3"]]) -> "Motion":
+        """Motion of several recordings, one after the other, in worlds whose z axes point up.
+
+        Poses between two recordings are unknown.
+
+        Arguments:
+          motions: Motions of the recordings.
+          levels: Rotations that make the z axes of their worlds point up (`DrivenPath.level`).
+        """
+        found = cls()
+        for one, level in zip(motions, levels, strict=True):
+            numbers, last = one._numbers.rows.copy(), found._numbers.rows[-1:]
+            numbers["guessed_m"] += UNKNOWN_M * len(last)
+            numbers["travelled"] += GAP_M * len(last)
+            for name in ("segment", "travelled", "guessed_m") if len(last) else ():
+                numbers[name] += last[name] + (name == "segment")
+            found._numbers.extend(numbers)
+            found.path.extend(one.path.leveled(np.arange(len(one)), level), numbers["guessed_m"])
+        return found
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Pose of each frame in the frame of the first one. Across segments it is a guess."""
+        return self.path.poses
+
+    @property
+    def segments(self) -> Int[np.ndarray, " n"]:
+        """Segment of each frame. Relative poses are known within a segment."""
+        return self._numbers.rows["segment"]
+
+    @property
+    def travelled(self) -> Float[np.ndarray, " n"]:
+        """Travelled distance at each frame, from keyframe to keyframe and with the guessed motion, in metres."""
+        return self._numbers.rows["travelled"]
+
+    @property
+    def guessed_m(self) -> Float[np.ndarray, " n"]:
+        """Length of measured path with the same drift as all guesses up to each frame, in metres."""
+        return self._numbers.rows["guessed_m"]
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes that the arrays hold."""
+        return self.path.nbytes + self._numbers.nbytes
+
+    def add(
+        self,
+        time: float,
+        *,
+        pose: Float[np.ndarray, "4 4"] | None = None,
+        link: Link | None = None,
+        continues: bool = True,
+    ) -> None:
+        """Add a frame at `time`, by its `pose` from odometry or its `link` with the keyframe.
+
+        An ambiguous link drifts like a guess. With `continues=False`, the motion since the last frame is unknown, as
+        after a restart.
+        """
+        if len(self) and not continues:
+            return self._begin(time, self.poses[-1] if pose is None else pose)
+        key, coasts, ambiguous, along_m = self.keyframe, False, False, math.inf
+        if pose is None and link is not None:
+            prior = self.prior(time, key)
+            surprises = link.angle_to(prior[2]) > np.radians(TURN_DEG) or self._steps(time) > MOST_STEPS
+            ambiguous = surprises or not self.is_trusted(link, prior)
+            along_m = float(link.along_m) if self.is_ridge(link) else along_m
+            pose = self.poses[key] @ transform(float(link.x), float(link.y), float(link.yaw))
+        elif pose is None and self._coasted < self.config.max_coasting:
+            pose, coasts = self._expected(time), True
+        self._coasted = self._coasted + 1 if coasts else 0
+        if not len(self):
+            self._append(time, np.eye(4) if pose is None else pose, segment=0, travelled=0.0, guessed_m=0.0)
+        elif pose is None:
+            self._guess(time)
+        else:
+            moved, rotation = self.moved(key, pose)
+            travelled = self.travelled[key] + moved
+            guessed_m = self.guessed_m[key]
+            if coasts or ambiguous:
+                drifted_m = self._drifted_m(time, share=1.0 if coasts else self.config.ambiguous_share)
+                guessed_m = min(drifted_m, self.guessed_m[-1] + self.config.m_per_uncertain_m * along_m)
+            self._append(time, pose, segment=int(self.segments[key]), travelled=travelled, guessed_m=guessed_m)
+            if not (self._is_far(moved, rotation) or coasts or ambiguous):
+                return
+        self.keyframe = len(self) - 1
+
+    def _is_far(self, metres: float, radians: float) -> bool:
+        return bool(metres > self.config.keyframe_m or radians > np.radians(self.config.keyframe_deg))
+
+    def prior(self, time: float, frame: int) -> Float[np.ndarray, " 3"]:
+        """Expected x, y and yaw in the frame of an earlier frame, at constant velocity. NaN if unknown."""
+        expected = self._expected(time)
+        if expected is None:
+            return np.full(3, np.nan)
+        moved = inverse(self.poses[frame]) @ expected
+        return np.array([moved[0, 3], moved[1, 3], yaw_of(moved)])
+
+    def _expected(self, time: float) -> Float[np.ndarray, "4 4"] | None:
+        moving = self._last_moving
+        if moving is None:
+            return None
+        before, after = moving
+        steps = self._steps(time)
+        if not 0 < steps <= MOST_STEPS:
+            return None
+        last = inverse(self.poses[before]) @ self.poses[after]
+        return self.poses[-1] @ transform(steps * last[0, 3], steps * last[1, 3], steps * float(yaw_of(last)))
+
+    def _steps(self, time: float) -> float:
+        """Time since the last frame, as a multiple of the last time step with a known motion. 1 without such a step."""
+        moving = self._last_moving
+        if moving is None:
+            return 1.0
+        before, after = moving
+        return float((time - self._times[-1]) / (self._times[after] - self._times[before]))
+
+    @property
+    def _last_moving(self) -> tuple[int, int] | None:
+        """Rows, from the end, of the last step with a known motion. A scan that was added twice makes no step."""
+        for after in (-1, -2):
+            before = after - 1
+            if len(self) < -before or self.segments[after] != self.segments[before]:
+                return None
+            moved = float(np.linalg.norm((self.poses[after] - self.poses[before])[:3, 3]))
+            known = self._times[after] > self._times[before]
+            if known and (moved > STANDING_M or after == -2):
+                return before, after
+        return None
+
+    def _guess(self, time: float) -> None:
+        """Add a frame whose motion is unknown."""
+        seconds = time - self._times[-1]
+        if len(self) > 1 and self.segments[-1] == self.segments[-2] and self._times[-1] > self._times[-2]:
+            step = inverse(self.poses[-2]) @ self.poses[-1]
+            self._m_per_s = float(step[0, 3]) / (self._times[-1] - self._times[-2])
+        self._append(
+            time,
+            self.poses[-1] @ transform((self._m_per_s or 0.0) * seconds, 0.0, 0.0),
+            segment=int(self.segments[-1]) + 1,
+            travelled=self.travelled[-1] + self._guessed_step_m(time),
+            guessed_m=self._drifted_m(time),
+        )
+
+    def _begin(self, time: float, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Add the first frame after an unknown motion."""
+        segment, guessed_m = int(self.segments[-1]) + 1, self.guessed_m[-1] + UNKNOWN_M
+        self._append(time, pose, segment=segment, travelled=self.travelled[-1] + GAP_M, guessed_m=guessed_m)
+        self._coasted, self._m_per_s, self.keyframe = 0, None, len(self) - 1
+
+    def _drifted_m(self, time: float, *, share: float = 1.0) -> float:
+        """Next value of `guessed_m`, if the motion since the last frame is a guess, or if this share of it is."""
+        step_m = max(self._guessed_step_m(time), self.config.least_step_m)
+        return self.guessed_m[-1] + share * self.config.guess_factor * step_m
+
+    def _guessed_step_m(self, time: float) -> float:
+        """Length of the next step, if it is a guess."""
+        if len(self) > 1 and self.segments[-1] == self.segments[-2]:
+            return self._last_step_m * max(self._steps(time), 1.0)
+        if self._m_per_s is not None:
+            return abs(self._m_per_s) * (time - self._times[-1])
+        return self.config.unknown_step_m
+
+    @property
+    def _last_step_m(self) -> float:
+        """Length of the longer one of the last two steps. The last scan may have been added twice."""
+        ends = self.poses[-3:, :3, 3]
+        return float(np.linalg.norm(np.diff(ends, axis=0), axis=1).max(initial=0.0))
+
+    def _append(
+        self,
+        time: float,
+        pose: Float[np.ndarray, "4 4"],
+        *,
+        segment: int,
+        travelled: float,
+        guessed_m: float,
+    ) -> None:
+        self.path.add(pose, guessed_m=guessed_m)
+        self._numbers.append((time, segment, travelled, guessed_m))
+
+    @property
+    def _times(self) -> Float[np.ndarray, " n"]:
+        return self._numbers.rows["time"]
+
+    def same(self, frame: int, rows: np.ndarray) -> Bool[np.ndarray, " k"]:
+        """For each of `rows`, whether its pose relative to `frame` is known: one bool a row."""
+        return self.segments[rows] == self.segments[frame]
+
+    def is_trusted(self, link: Link, prior: Float[np.ndarray, " 3"]) -> bool:
+        """Whether a link shows how the sensor moved: no other pose fits about as well.
+
+        A link far from the prior has to be less ambiguous, and one at the prior may be more ambiguous.
+        """
+        config, most = self.config, self.config.max_second
+        apart = float(np.hypot(link.x - prior[0], link.y - prior[1]))
+        if apart > config.max_jump * self._last_step_m + 1.0:
+            most = config.max_second_of_jump
+        elif apart <= config.expected_m and link.angle_to(prior[2]) <= np.radians(config.expected_deg):
+            most = config.max_second_expected
+        fits = bool(link.correlation >= config.min_correlation and link.second <= most)
+        return fits and not self.is_ridge(link)
+
+    def is_ridge(self, link: Link) -> bool:
+        """Whether the images show the position across a direction only, as between walls."""
+        return bool(link.along_m > self.config.max_along_m and link.correlation < EQUAL)
+
+    def moved(self, frame: int, pose: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
+        """Distance (metres) and rotation (radians) from a frame to a pose."""
+        moved = inverse(self.poses[frame]) @ pose
+        return float(np.linalg.norm(moved[:3, 3])), abs(float(yaw_of(moved)))

@@ -1,0 +1,122 @@
+"""Settings of odometry and of its drift, readable without JAX."""
+
+import dataclasses
+import math
+from typing import Literal
+
+from sglpr_jax.fields import NotNegative, Positive, check_fields
+
+OdometryFormat = Literal["auto", "kitti", "lidar", "tum", "g2o"]
+"""Format of odometry. "kitti" and "lidar" have 12 numbers a line, in KITTI's camera axes or with z up. "tum" has time,
+position and quaternion. "g2o" has the vertices of a graph."""
+
+
+DRIFT_PERCENT = 1.0
+"""Position drift of odometry: one standard deviation, in percent of the travelled distance."""
+
+
+DRIFT_DEG_PER_100M = 0.5
+"""Heading drift of odometry: one standard deviation, in degrees per 100 m of travelled distance."""
+
+
+DRIFT_HEIGHT_PERCENT = 0.3
+"""Height drift of odometry: one standard deviation, in percent of the travelled distance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DriftModel:
+    """Standard deviations of odometry per metre of travelled distance."""
+
+    metres_per_metre: float = DRIFT_PERCENT / 100
+    """Position drift in the direction of travel."""
+    degrees_per_metre: float = DRIFT_DEG_PER_100M / 100
+    """Heading drift. It rotates the rest of the path and so moves the position, too."""
+    sideways: float = 0.25
+    """Position drift across the direction of travel, as a fraction of the drift along it."""
+    height_per_metre: float = DRIFT_HEIGHT_PERCENT / 100
+    """Height drift. A place on another floor of a building contradicts the odometry if this is small enough."""
+    position_m: float = 0.5
+    height_m: float = 0.3
+    yaw_deg: float = 1.5
+    """Standard deviations of the comparison itself, independent of the distance, in metres and degrees."""
+    max_deviation: float = 4.0
+    """Maximum deviation of a loop from the odometry. Loops beyond it contradict the odometry."""
+
+    def __post_init__(self):
+        """Raises ValueError if a drift is negative or not finite, or if another number is not positive."""
+        for name, value in dataclasses.asdict(self).items():
+            positive = name in ("position_m", "height_m", "yaw_deg", "max_deviation")
+            if not math.isfinite(value) or value < 0 or (positive and value == 0):
+                raise ValueError(f"expected {name} {'> 0' if positive else '>= 0'}, found {value}")
+
+    def scaled(self, factor: float) -> "DriftModel":
+        """The same model with `factor` times the drift per metre."""
+        names = ("metres_per_metre", "degrees_per_metre", "height_per_metre")
+        return dataclasses.replace(self, **{name: factor * getattr(self, name) for name in names})
+
+    def __str__(self) -> str:
+        return f"{100 * self.metres_per_metre:.3g} % and {100 * self.degrees_per_metre:.3g} degrees per 100 m"
+
+
+MOTION_DRIFT = DriftModel(metres_per_metre=0.01, degrees_per_metre=0.03, yaw_deg=2.5)
+"""Drift of the motion that is used if there is no odometry (`odometry.bev_odometry`)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionConfig:
+    """Thresholds for accepting a registration with the keyframe and for choosing the next keyframe."""
+
+    min_correlation: float = 0.15
+    """Minimum correlation of the two images."""
+    max_along_m: float = 0.25
+    """Maximum standard deviation of the pose along its least certain direction, in metres. Above it, the images do not
+    show how far the sensor moved, as between walls."""
+    min_expected: float = 0.8
+    """Minimum correlation near the expected pose, divided by that at the best pose, if the best pose is less certain
+    than `max_along_m`. Above it, the sensor is assumed to move on as before."""
+    max_second: float = 0.8
+    max_second_of_jump: float = 0.6
+    max_second_expected: float = 0.95
+    """Maximum second-peak ratio, that of a pose far from the expected one, and that of the expected pose."""
+    expected_m: float = 1.0
+    expected_deg: float = 5.0
+    """Maximum distance of a pose from the expected one, in metres and degrees."""
+    max_jump: float = 2.0
+    """Distance from the expected pose, as a multiple of the last step, beyond which a pose is far from it."""
+    max_coasting: int = 3
+    """Maximum number of consecutive frames whose registration is rejected and whose pose is extrapolated."""
+    keyframe_m: float = 3.0
+    keyframe_deg: float = 20.0
+    """Distance or angle from the keyframe beyond which a frame becomes the next keyframe, in metres and degrees."""
+    guess_factor: float = 300.0
+    """Length of measured path with the same drift as one metre of guessed motion, in metres."""
+    ambiguous_share: float = 0.25
+    """Share of a step that counts as guessed if its link is ambiguous."""
+    m_per_uncertain_m: float = 100.0
+    """Length of measured path with the same drift as one metre of uncertainty along a wall, in metres."""
+    least_step_m: float = 0.5
+    unknown_step_m: float = 12.0
+    """Minimum length of a guessed step, and its length if the speed was never known, in metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OdometryConfig:
+    """Settings of odometry from the scans (kiss-icp). Lengths are divided by the scale of a recording."""
+
+    max_range_m: Positive = 100.0
+    """Maximum range of the points that are registered, in metres."""
+    min_range_m: NotNegative = 0.0
+    """Minimum range of the points, in metres. It excludes points on the vehicle."""
+    voxel_m: Positive | None = None
+    """Edge of the voxels of the local map, in metres. By default a hundredth of the maximum range."""
+
+    def __post_init__(self):
+        """Raises ValueError if a field has an invalid value or no range is left."""
+        check_fields(self)
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"expected min_range_m < max_range_m = {self.max_range_m:g}, found {self.min_range_m:g}")
+
+    @property
+    def effective(self) -> "OdometryConfig":
+        """The same settings with the edge of the voxels that is used."""
+        return dataclasses.replace(self, voxel_m=self.max_range_m / 100 if self.voxel_m is None else self.voxel_m)

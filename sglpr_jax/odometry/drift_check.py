@@ -1,0 +1,102 @@
+"""Drift of odometry, estimated from the drive: images some metres apart show how far the odometry is wrong."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.odometry.bev_odometry import Link
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import inverse, transform, yaw_of
+
+STEP_M, STEP_DEG, MOST_FRAMES = 2.5, 15.0, 20
+"""Distance and angle by odometry, and number of frames, from which a scan is compared with the last compared one."""
+MAX_STEP_M = 8.0
+"""Maximum distance of two compared scans by odometry, in metres. Images of farther ones share too little."""
+MAX_SECOND, MAX_ALONG_M = 0.6, 0.2
+"""Maximum second-peak ratio and standard deviation of the position, in metres, of a comparison that counts."""
+WINDOW_M = 30.0
+"""Distance over which odometry and images are compared, in metres."""
+MIN_WINDOWS = 3
+"""Minimum number of windows for an estimate."""
+NOISE, NOISE_DEG = 0.015, 0.025
+"""Drift of the images themselves, per metre: of lengths, and of angles in degrees."""
+UNUSABLE, UNUSABLE_DEG = 0.3, 0.5
+"""Drift per metre from which odometry is ignored: of lengths, and of angles in degrees."""
+
+
+class OdometryCheck:
+    """Compares odometry with images, and estimates its drift."""
+
+    def __init__(self):
+        self._last: Float[np.ndarray, "4 4"] | None = None
+        self._frames = 0
+        self._by_odometry, self._by_images = np.eye(4), np.eye(4)
+        self._way_m = 0.0
+        self._errors: list[tuple[float, float]] = []
+        """Errors of length and angle (degrees) per metre, one of each window."""
+
+    def is_due(self, pose: Float[np.ndarray, "4 4"]) -> bool:
+        """Whether the next scan, with this pose by odometry, is compared with the last compared one."""
+        if self._last is None or self._frames + 1 >= MOST_FRAMES:
+            return True
+        moved = inverse(self._last) @ pose
+        return bool(np.linalg.norm(moved[:3, 3]) >= STEP_M or abs(yaw_of(moved)) >= np.radians(STEP_DEG))
+
+    def restart(self) -> None:
+        """Note that the motion since the last scan is unknown."""
+        self._last = None
+
+    def skip(self) -> None:
+        """Note a scan that is not compared."""
+        self._frames += 1
+
+    def add(self, pose: Float[np.ndarray, "4 4"], link: Link | None) -> None:
+        """Add a compared scan.
+
+        Arguments:
+          pose: Gravity-aligned pose by odometry.
+          link: Pose in the frame of the last compared scan by the images. None if unknown.
+        """
+        step = np.eye(4) if self._last is None else inverse(self._last) @ pose
+        far = float(np.linalg.norm(step[:3, 3])) > MAX_STEP_M
+        if self._last is None or link is None or far or not _is_clear(link):
+            self._by_odometry, self._by_images, self._way_m = np.eye(4), np.eye(4), 0.0
+        else:
+            seen = transform(float(link.x), float(link.y), float(link.yaw))
+            self._by_odometry, self._by_images = self._by_odometry @ step, self._by_images @ seen
+            self._way_m += max(float(np.linalg.norm(one[:3, 3])) for one in (step, seen))
+        self._last, self._frames = pose, 0
+        if self._way_m >= WINDOW_M:
+            lengths = [float(np.linalg.norm(one[:2, 3])) for one in (self._by_odometry, self._by_images)]
+            turned = float(yaw_of(inverse(self._by_images) @ self._by_odometry))
+            self._errors.append(((lengths[0] - lengths[1]) / self._way_m, np.degrees(turned) / self._way_m))
+            self._by_odometry, self._by_images, self._way_m = np.eye(4), np.eye(4), 0.0
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """Root mean square of the errors of length and angle (degrees) per metre. 0 below the errors of images."""
+        if len(self._errors) < MIN_WINDOWS:
+            return 0.0, 0.0
+        length, angle = np.sqrt(np.square(self._errors).mean(axis=0)).tolist()
+        return (length if length > NOISE else 0.0), (angle if angle > NOISE_DEG else 0.0)
+
+    @property
+    def is_unusable(self) -> bool:
+        """Whether the odometry has little to do with the motion of the sensor."""
+        length, angle = self.errors
+        return length > UNUSABLE or angle > UNUSABLE_DEG
+
+    def drift(self, stated: DriftModel) -> DriftModel:
+        """Drift of the odometry: the stated one or, if it is larger, the estimate."""
+        length, angle = self.errors
+        return dataclasses.replace(
+            stated,
+            metres_per_metre=max(stated.metres_per_metre, length),
+            degrees_per_metre=max(stated.degrees_per_metre, angle),
+        )
+
+
+def _is_clear(link: Link) -> bool:
+    """Whether no other pose fits about as well."""
+    return bool(link.second <= MAX_SECOND and link.along_m <= MAX_ALONG_M)

@@ -1,0 +1,236 @@
+"""Odometry from the scans alone, by kiss-icp (extra `odometry`): one pose of the LiDAR for each scan."""
+
+import importlib
+from collections import deque
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.deskew import has_point_times, poses_at
+from sglpr_jax.data.recording import Record, Recording
+from sglpr_jax.data.scaled import scaled, scaled_poses
+from sglpr_jax.data.scan_stream import OnBadScan, check_readable, scan_stream
+from sglpr_jax.data.warning import warn
+from sglpr_jax.odometry.config import OdometryConfig
+from sglpr_jax.odometry.kept_poses import KeptPoses, settings_hash
+from sglpr_jax.se3 import inverse, transformed
+
+MIN_POINTS = 100
+"""Minimum number of points after downsampling. The pose of a scan with fewer is extrapolated."""
+PREVIOUS = 3
+"""Number of previous scans that a scan must overlap."""
+MIN_OVERLAP = 0.55
+"""Minimum share of points with a point of the previous scans within a voxel. Consecutive scans of simulated streets
+have more, scans of other places mostly less."""
+
+
+class _Input(NamedTuple):
+    """Points of a scan in the form that kiss-icp expects."""
+
+    points: Float[np.ndarray, "n 3"]
+    times: Float[np.ndarray, " m"]
+    """Time of each point relative to the scan in seconds, or an empty array."""
+
+
+class _Registered(NamedTuple):
+    """Pose of a scan, and how it was found."""
+
+    pose: Float[np.ndarray, "4 4"]
+    points: int
+    """Number of points after downsampling."""
+    overlap: float
+    """Share of points with a point of the previous scans within a voxel. 1 for the first scans."""
+
+
+def scan_odometry(
+    recording: Recording,
+    *,
+    config: OdometryConfig = OdometryConfig(),
+    scale: Scale = 1,
+    kept_in: Path | str | None = None,
+    on_bad_scan: OnBadScan | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Float[np.ndarray, "n 4 4"]:
+    """Compute odometry from the scans of a recording.
+
+    If scans and points have times, the motion within scans is removed, and each pose is that at the time of its scan.
+    Scans that are unreadable or have few points get an extrapolated pose. A warning names them, and scans that do not
+    overlap the previous ones.
+
+    Arguments:
+      recording: The scans, about 10 a second.
+      config: Settings of kiss-icp.
+      scale: Factor for all lengths, as in `find_loops`. With 4, the default range is 25 m and the voxels .25 m.
+      kept_in: File of a checkpoint (.npz). If the scans and settings are the same, an interrupted run resumes from it
+        with the same result. The file is not removed.
+      on_bad_scan: Called with id and error of an unreadable scan. Without it the error is raised.
+      should_stop: If it returns True, the poses until then are returned.
+      on_progress: Called with the number of scans.
+
+    Returns:
+      world_from_lidar, the pose of the LiDAR at each scan, in the frame of the first scan. Fewer if stopped.
+
+    Raises:
+      ValueError: If the recording has ready-made images, or if no scan is readable or has enough points.
+      ImportError: If kiss-icp is not installed.
+
+    Example:
+      odometry = scan_odometry(recording)
+      found = find_loops(recording, params, odometry=odometry)
+    """
+    if recording.has_images:
+        raise ValueError(f"sequence {recording.name}: expected scans for odometry, found ready-made images")
+    check_installed()
+    made_from = settings_hash(recording, config, scale=scale, version=version("kiss-icp"))
+    kept = KeptPoses(None if kept_in is None else Path(kept_in), made_from, scans=len(recording))
+    if len(kept) < len(recording):
+        options = {"on_bad_scan": on_bad_scan, "should_stop": should_stop, "on_progress": on_progress}
+        _register(recording, kept, _FrontEnd(config), scale, **options)
+    poses = scaled_poses(np.array(kept.poses).reshape(-1, 4, 4), 1 / scale)
+    return _at_times_of_scans(poses, recording, np.array(kept.ends))
+
+
+def _register(recording: Recording, kept: KeptPoses, front_end: "_FrontEnd", scale: Scale, **options: Any) -> None:
+    """Add the poses of all further scans to `kept`, and warn of doubtful ones."""
+    timed = has_point_times(recording)
+    known, registered = list(kept.poses), dict[int, _Registered]()
+    try:
+        for row, given in scan_stream(scaled(recording, scale), lambda _, record: _input(record, timed), **options):
+            pose = known[row] if row < len(known) else None
+            found = front_end.add(given, known=pose)
+            if given is not None:
+                registered[row] = found
+            if pose is None:
+                kept.add(found.pose, 0.0 if given is None else float(given.times.max(initial=0)))
+    finally:
+        kept.write()
+    if len(kept) == len(recording):
+        check_readable(recording, len(registered))
+        _warn_of_doubtful(recording, registered)
+
+
+class _FrontEnd:
+    """kiss-icp, one scan after the other."""
+
+    def __init__(self, config: OdometryConfig):
+        library, used = _library(), config.effective
+        data = {"max_range": used.max_range_m, "min_range": used.min_range_m, "deskew": True}
+        settings = importlib.import_module("kiss_icp.config").KISSConfig(
+            data=data, mapping={"voxel_size": used.voxel_m}
+        )
+        self._icp, self._voxel_m = library.KissICP(settings), float(used.voxel_m or 0)
+        self._before: deque[Float[np.ndarray, "n 3"]] = deque(maxlen=PREVIOUS)
+
+    def add(self, given: _Input | None, *, known: Float[np.ndarray, "4 4"] | None = None) -> _Registered:
+        """Register the next scan, or add it at its known pose. Without a scan, extrapolate the motion.
+
+        These are the steps of kiss-icp's `register_frame`, which takes no known pose.
+        """
+        icp, guess = self._icp, self._icp.last_pose @ self._icp.last_delta
+        if given is None:
+            icp.last_pose = guess
+            return _Registered(guess, 0, 1.0)
+        frame = icp.preprocessor.preprocess(given.points, given.times, icp.last_delta)
+        source, mapped = icp.voxelize(frame)
+        if len(source) < MIN_POINTS:
+            icp.last_pose = guess
+            return _Registered(guess, len(source), 1.0)
+        pose = self._aligned(source, guess) if known is None else known
+        icp.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
+        icp.local_map.update(mapped, pose)
+        icp.last_delta, icp.last_pose = np.linalg.inv(icp.last_pose) @ pose, pose
+        return _Registered(pose, len(source), self._overlap(source, mapped, pose))
+
+    def _aligned(self, source: np.ndarray, guess: np.ndarray) -> Float[np.ndarray, "4 4"]:
+        sigma = self._icp.adaptive_threshold.get_threshold()
+        return self._icp.registration.align_points_to_map(
+            points=source,
+            voxel_map=self._icp.local_map,
+            initial_guess=guess,
+            max_correspondance_distance=3 * sigma,
+            kernel=sigma,
+        )
+
+    def _overlap(self, source: np.ndarray, mapped: np.ndarray, pose: np.ndarray) -> float:
+        """Share of points with a point of the previous scans within a voxel."""
+        from scipy.spatial import KDTree  # imported here because the import is slow
+
+        before = list(self._before)
+        self._before.append(transformed(pose, mapped))
+        if len(before) < PREVIOUS:
+            return 1.0
+        tree = KDTree(np.concatenate(before), balanced_tree=False)
+        apart, _ = tree.query(transformed(pose, source), distance_upper_bound=self._voxel_m)
+        return float(np.isfinite(apart).mean())
+
+
+def _input(record: Record, timed: bool) -> _Input:
+    """Measured points of a scan, with their times if the scans have times."""
+    points = record.points
+    assert points is not None
+    valid = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    times = record.point_times if timed else None
+    return _Input(points[valid].astype(np.float64), np.zeros(0) if times is None else times[valid].astype(np.float64))
+
+
+def _at_times_of_scans(
+    poses: Float[np.ndarray, "n 4 4"], recording: Recording, ends: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses at the times of the scans. kiss-icp removes motion up to the last point, and its poses are those then."""
+    end = float(np.median(ends[ends != 0])) if ends.any() else 0.0
+    if end == 0 or recording.times is None or len(poses) < 2:
+        return poses
+    times = recording.times[: len(poses)]
+    found = poses_at(times, times + end, poses)
+    return inverse(found[0]) @ found
+
+
+def _warn_of_doubtful(recording: Recording, registered: dict[int, _Registered]) -> None:
+    """Warn of scans with few points and of scans without overlap. Raises ValueError if all scans have few points."""
+    few = [row for row, one in registered.items() if one.points < MIN_POINTS]
+    if len(few) == len(registered):
+        raise ValueError(
+            f"sequence {recording.name}: expected scans with {MIN_POINTS} points or more for odometry, found at most "
+            f"{max(one.points for one in registered.values())} after downsampling; use --scale 4 in rooms"
+        )
+    if few:
+        warn(
+            f"{recording.name}: expected {MIN_POINTS} points or more in each scan, found fewer in {len(few)}, first in "
+            f"scan {recording.ids[few[0]]}; their odometry is extrapolated"
+        )
+    apart = [row for row, one in registered.items() if one.overlap < MIN_OVERLAP]
+    if apart:
+        warn(
+            f"{recording.name}: expected scans that overlap the previous ones, found {len(apart)} that do not, first "
+            f"scan {recording.ids[apart[0]]} ({registered[apart[0]].overlap:.0%}); the odometry may be wrong from there"
+        )
+
+
+def about(recording: Recording, config: OdometryConfig, *, scale: Scale) -> str:
+    """Describe how the odometry of a recording is computed, with lengths in its metres."""
+    used = config.effective
+    assert used.voxel_m is not None
+    moved = "motion within scans removed" if has_point_times(recording) else "without times of points"
+    return (
+        f"odometry: kiss-icp {version('kiss-icp')}, points up to {used.max_range_m / scale:g} m, voxels of "
+        f"{used.voxel_m / scale:g} m, {moved}"
+    )
+
+
+def check_installed() -> None:
+    """Raises ImportError if kiss-icp is not installed."""
+    _library()
+
+
+def _library() -> ModuleType:
+    try:
+        return importlib.import_module("kiss_icp.kiss_icp")
+    except ImportError as error:
+        raise ImportError("odometry from scans needs kiss-icp: pip install 'sglpr-jax[odometry]'") from error

@@ -1,0 +1,164 @@
+"""A path with the integrals that drift needs, so that the drift between two frames takes constant time."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sglpr_jax.data.levelling import AnyMounting, is_tilted, uprights
+from sglpr_jax.data.mounting import Mounting
+from sglpr_jax.growing import GrowingArray
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import inverse
+
+UPPER = np.triu_indices(3)
+"""Rows and columns of the stored half of a symmetric matrix."""
+WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Number of the stored element at each place of the matrix."""
+SUMS = 1 + 3 + 6 + 6
+"""Number of integrals of a frame: length, position, and the upper halves of two matrices."""
+
+
+class Between(NamedTuple):
+    """Integrals over the path from one frame to another, in metres and products of metres."""
+
+    length: Float[np.ndarray, " k"]
+    first: Float[np.ndarray, "k d"]
+    """Integral of the position."""
+    directions: Float[np.ndarray, "k d d"]
+    """Integral of the outer product of the direction of travel with itself."""
+    squares: Float[np.ndarray, "k d d"]
+    """Integral of the outer product of the position with itself."""
+
+    def turned(self, rotation: Float[np.ndarray, "d 3"]) -> "Between":
+        """The integrals in rotated coordinates, or in some of them."""
+        twice = (rotation @ part @ rotation.T for part in (self.directions, self.squares))
+        return Between(self.length, self.first @ rotation.T, *twice)
+
+
+class DrivenPath:
+    """Gravity-aligned poses of the sensor in one fixed frame. Adding a pose takes constant time."""
+
+    def __init__(self):
+        self._poses = GrowingArray(np.empty((0, 4, 4)))
+        self._sums = GrowingArray(np.empty((0, SUMS)))
+        self._guessed_m = 0.0
+        self._up = np.zeros(3)
+
+    @classmethod
+    def of(
+        cls,
+        odometry: Float[np.ndarray, "n 4 4"],
+        *,
+        mounting: AnyMounting = None,
+        guessed_m: Float[np.ndarray, " n"] | None = None,
+    ) -> "DrivenPath":
+        """Path of the odometry of a LiDAR with this `mounting`. For `guessed_m` see `extend`."""
+        found = cls()
+        found.extend(odometry @ inverse(uprights(mounting, np.arange(len(odometry)))), guessed_m)
+        return found
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Pose of each frame."""
+        return self._poses.rows
+
+    @property
+    def travelled(self) -> Float[np.ndarray, " n"]:
+        """Travelled distance at each frame, in metres."""
+        return self._sums.rows[:, 0]
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes that the arrays hold."""
+        return self._poses.nbytes + self._sums.nbytes
+
+    @property
+    def up(self) -> Float[np.ndarray, " 3"]:
+        """Average direction of up in the fixed frame, a unit vector. Without poses this is the z axis."""
+        return self._up / np.linalg.norm(self._up) if len(self) else np.array([0.0, 0.0, 1.0])
+
+    def add(self, pose: Float[np.ndarray, "4 4"], *, guessed_m: float = 0.0) -> None:
+        """Add the pose of the next frame. For `guessed_m` see `extend`."""
+        self.extend(pose[None], np.array([guessed_m]))
+
+    def extend(self, poses: Float[np.ndarray, "n 4 4"], guessed_m: Float[np.ndarray, " n"] | None = None) -> None:
+        """Add the poses of the next frames.
+
+        Arguments:
+          poses: Gravity-aligned poses of the sensor.
+          guessed_m: Guessed motion up to each frame (`Motion.guessed_m`). It drifts like a path of unknown direction.
+        """
+        guessed_m = np.full(len(poses), self._guessed_m) if guessed_m is None else guessed_m
+        if len(self):
+            known, guesses = np.concatenate([self.poses[-1:], poses]), np.append(self._guessed_m, guessed_m)
+            steps = _integrals(known[:, :3, 3] - self.poses[0, :3, 3], guesses)
+            self._sums.extend(self._sums.rows[-1] + steps.cumsum(0))
+        elif len(poses):
+            steps = _integrals(poses[:, :3, 3] - poses[0, :3, 3], guessed_m)
+            self._sums.extend(np.concatenate([np.zeros((1, SUMS)), steps.cumsum(0)]))
+        self._poses.extend(poses)
+        self._up += poses[:, :3, 2].sum(axis=0)
+        self._guessed_m = float(guessed_m[-1]) if len(poses) else self._guessed_m
+
+    def level(self, mounting: AnyMounting) -> Float[np.ndarray, "3 3"]:
+        """Rotation from the fixed frame to one whose z axis points up, if the sensor has this `mounting`.
+
+        Odometry often starts with the identity, so its world is tilted like the sensor. The world of a sensor that is
+        not tilted counts as level.
+        """
+        return Mounting(0.0, tuple(self.up.tolist())).upright_from_lidar if is_tilted(mounting) else np.eye(3)
+
+    def leveled(self, frames: Int[np.ndarray, " k"], level: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "k 4 4"]:
+        """Poses of some frames in rotated coordinates, with positions counted from that of the first frame."""
+        poses = self.poses[frames]
+        if len(self):
+            poses[:, :3, 3] -= self.poses[0, :3, 3]
+        poses[:, :3] = level @ poses[:, :3]
+        return poses
+
+    def between(self, start: Int[np.ndarray, " k"], end: Int[np.ndarray, " k"]) -> Between:
+        """Integrals from frames `start` to frames `end`. Positions count from that of the first frame."""
+        length, first, directions, squares = np.split(self._sums.rows[end] - self._sums.rows[start], [1, 4, 10], axis=1)
+        return Between(length[:, 0], first, directions[:, WHOLE], squares[:, WHOLE])
+
+    def position_deviations(
+        self,
+        rows: Int[np.ndarray, " k"],
+        frame: int,
+        position: Float[np.ndarray, " 3"] | None = None,
+        *,
+        drift: DriftModel = DriftModel(),
+    ) -> Float[np.ndarray, " k"]:
+        """Standard deviation of the positions of some frames, in metres, over all directions.
+
+        Arguments:
+          rows: The frames.
+          frame: Frame to which the deviations are relative.
+          position: Position straight on from `frame` to which they are relative instead.
+          drift: Drift model.
+        """
+        here = self.poses[frame, :3, 3] if position is None else position
+        step = float(np.linalg.norm(here - self.poses[frame, :3, 3]))
+        here, sums = here - self.poses[0, :3, 3], self._sums.rows[rows] - self._sums.rows[frame]
+        weights = np.zeros(SUMS)  # integral of the squared distance from here: |p|^2 - 2 p here + |here|^2
+        weights[0], weights[1:4], weights[10 + WHOLE.diagonal()] = here @ here, -2 * here, 1
+        lever = np.abs(sums @ weights) + step**3 / 3
+        length = np.abs(sums[:, 0]) + step
+        across = np.sqrt(1 + drift.sideways**2) * drift.metres_per_metre * length
+        return np.sqrt(across**2 + np.radians(drift.degrees_per_metre) ** 2 * length * lever)
+
+
+def _integrals(positions: Float[np.ndarray, "n 3"], guessed_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m s"]:
+    """Integrals over each step of a path, one step fewer than positions. s is `SUMS`."""
+    steps, middle, more = np.diff(positions, axis=0), (positions[:-1] + positions[1:]) / 2, np.diff(guessed_m)
+    moved = np.linalg.norm(steps, axis=1)
+    length = moved + more
+    square = steps[:, :, None] * steps[:, None]
+    directions = square / np.maximum(moved, 1e-12)[:, None, None] + more[:, None, None] * np.diag([1.0, 1.0, 0.0])
+    squares = length[:, None, None] * (middle[:, :, None] * middle[:, None] + square / 12)
+    halves = (part[:, *UPPER] for part in (directions, squares))
+    return np.concatenate([length[:, None], length[:, None] * middle, *halves], axis=1)

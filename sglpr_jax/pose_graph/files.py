@@ -1,0 +1,322 @@
+"""Loops and trajectories in the file formats of pose-graph programs: g2o, TUM, KITTI, JSON lines, csv.
+
+Files are written atomically. Poses are those of the LiDAR (x forward, y left, z up) in a fixed frame.
+"""
+
+import csv
+import io
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sglpr_jax.data.formats.pose_files import CAMERA_FROM_LIDAR, numbers_of
+from sglpr_jax.files import in_short, parse_json, write_text
+from sglpr_jax.loops.closure import Loop, Rejected
+from sglpr_jax.loops.drift import step_deviations
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.se3 import are_rotations, from_quaternions, inverse, quaternions
+
+VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
+UPPER = np.triu_indices(6)
+"""Indices of the 21 numbers of an information matrix, row by row, translation before rotation."""
+Ids = Sequence[str] | Mapping[int, str]
+"""Id of each frame, by its number."""
+COLUMNS = ("query", "match", "x", "y", "z", "qx", "qy", "qz", "qw", "probability", "overlap")
+OF_RECORDINGS = ("query_recording", "match_recording")
+"""Further columns of a table of several recordings."""
+
+
+class Graph(NamedTuple):
+    """Content of a g2o file."""
+
+    poses: dict[int, Float[np.ndarray, "4 4"]]
+    edges: list[tuple[int, int, Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]]
+    """First frame, second frame, pose of the second in the first, and information matrix, translation first."""
+
+
+def write_g2o(
+    path: Path | str,
+    loops: Sequence[Loop],
+    odometry: Float[np.ndarray, "n 4 4"] | None = None,
+    *,
+    drift: DriftModel = DriftModel(),
+    numbers: Int[np.ndarray, " n"] | None = None,
+) -> None:
+    """Write a pose graph: a vertex for each pose, an edge for each step of the odometry, an edge for each loop.
+
+    Arguments:
+      path: File to write.
+      loops: Loops.
+      odometry: Pose of the LiDAR at each frame. Without it, the file has only the edges of the loops.
+      drift: Drift of the odometry, which determines the information matrices of its edges (`step_deviations`).
+      numbers: Number of the vertex of each pose, as in the loops. By default 0, 1, 2, ...
+
+    Raises:
+      WriteError: If the file cannot be written.
+    """
+    chains = []
+    if odometry is not None:
+        chains.append((np.arange(len(odometry)) if numbers is None else numbers, odometry))
+    write_joint_g2o(path, loops, chains, drift=drift)
+
+
+def write_joint_g2o(
+    path: Path | str,
+    loops: Sequence[Loop],
+    chains: Sequence[tuple[Int[np.ndarray, " _"], Float[np.ndarray, "_ 4 4"]]],
+    *,
+    drift: DriftModel = DriftModel(),
+    comments: Sequence[str] = (),
+) -> None:
+    """Write the pose graph of several recordings.
+
+    Arguments:
+      path: File to write.
+      loops: Loops between vertices.
+      chains: Vertices and poses of each recording with odometry.
+      drift: Drift of the odometry.
+      comments: Lines at the beginning of the file. Readers ignore them.
+
+    Raises:
+      WriteError: If the file cannot be written.
+    """
+    lines = [f"# {comment}" for comment in comments]
+    for vertices, odometry in chains:
+        lines += _chain(vertices.tolist(), odometry, drift)
+    for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
+        lines.append(f"{EDGE} {loop.match} {loop.query} {row} {_numbers(loop.information[UPPER])}")
+    write_text(Path(path), "".join(f"{line}\n" for line in lines))
+
+
+def _chain(vertices: list[int], odometry: Float[np.ndarray, "n 4 4"], drift: DriftModel) -> list[str]:
+    """Lines of the vertices of a recording, and of the edges of its odometry."""
+    lines = [f"{VERTEX} {i} {row}" for i, row in zip(vertices, _pose_rows(odometry), strict=True)]
+    steps = _pose_rows(inverse(odometry[:-1]) @ odometry[1:])
+    spread = np.repeat(np.stack(step_deviations(odometry, drift), axis=1), 3, axis=1) ** 2
+    information = (_numbers(np.diag(1 / row)[UPPER]) for row in spread)
+    ends = itertools.pairwise(vertices)
+    return lines + [f"{EDGE} {i} {j} {row} {next(information)}" for (i, j), row in zip(ends, steps, strict=True)]
+
+
+def read_g2o(path: Path | str) -> Graph:
+    """Read vertices and edges of a g2o file (`VERTEX_SE3:QUAT`, `EDGE_SE3:QUAT`). Other lines are ignored.
+
+    If the edges have no information matrix, they get the unit matrix.
+
+    Raises:
+      FileNotFoundError: If the file does not exist.
+      ValueError: If a line has too few numbers or repeats a vertex. The message names the line.
+    """
+    path, graph, columns = Path(path), Graph({}, []), 0
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a g2o file, found none")
+    for i, line in enumerate(path.read_text(errors="replace").splitlines()):
+        words, where = line.split(), f"{path}, line {i + 1}"
+        if words and words[0] == VERTEX:
+            values = numbers_of(words[1:], columns=8, where=where)
+            (frame,) = _frames(values[:1], where)
+            if frame in graph.poses:
+                raise ValueError(f"{where}: expected each vertex once, found vertex {frame} again")
+            graph.poses[frame] = _pose(values[1:], where)
+        elif words and words[0] == EDGE:
+            columns = columns or (9 if len(words) == 10 else 30)  # the same for all: another line is cut
+            values = numbers_of(words[1:], columns=columns, where=where)
+            information = _information(values[9:])
+            first, second = _frames(values[:2], where)
+            graph.edges.append((first, second, _pose(values[2:9], where), information))
+    return graph
+
+
+def _information(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "6 6"]:
+    """Symmetric matrix of its 21 upper numbers, or the unit matrix if an edge has none."""
+    if not len(values):
+        return np.eye(6)
+    upper = np.zeros((6, 6))
+    upper[UPPER] = values
+    return np.triu(upper, 1).T + upper
+
+
+def write_tum(path: Path | str, poses: Float[np.ndarray, "n 4 4"], times: Float[np.ndarray, " n"]) -> None:
+    """Write a TUM file: a line `time x y z qx qy qz qw` for each pose, in seconds and metres."""
+    lines = (f"{time:.9f} {row}\n" for time, row in zip(times, _pose_rows(poses), strict=True))
+    write_text(Path(path), "".join(lines))
+
+
+def write_kitti(path: Path | str, poses: Float[np.ndarray, "n 4 4"]) -> None:
+    """Write a KITTI file: 12 numbers a line, in KITTI's camera axes (x right, y down, z forward)."""
+    camera = CAMERA_FROM_LIDAR @ poses @ CAMERA_FROM_LIDAR.T
+    write_text(Path(path), "".join(f"{_all_digits(pose[:3].reshape(-1))}\n" for pose in camera))
+
+
+def write_loops_jsonl(
+    path: Path | str, loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None
+) -> None:
+    """Write loops, one JSON object a line, with the `ids` and the `recordings` of the frames if they are given."""
+    write_text(Path(path), loop_lines(loops, ids, recordings))
+
+
+def loop_lines(loops: Sequence[Loop], ids: Ids | None = None, recordings: Ids | None = None) -> str:
+    """Return the lines of a file of `write_loops_jsonl`."""
+    return "".join(f"{json.dumps(_as_json(loop, ids, recordings))}\n" for loop in loops)
+
+
+def write_rejected_jsonl(
+    path: Path | str, rejected: Sequence[Rejected], ids: Ids | None = None, recordings: Ids | None = None
+) -> None:
+    """Write rejected pairs, one JSON object a line, with the `ids` and the `recordings` of the frames if given."""
+    lines = []
+    for one in rejected:
+        pose = one.loop.match_from_query.tolist()
+        row = {**_named(one.loop, ids, recordings), "reason": one.reason, **_shares(one.loop), "match_from_query": pose}
+        lines.append(f"{json.dumps(row)}\n")
+    write_text(Path(path), "".join(lines))
+
+
+def read_loops_jsonl(path: Path | str) -> list[Loop]:
+    """Read a file of `write_loops_jsonl`. Raises the errors of `read_g2o`."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected loops, a JSON object a line, found no file")
+    lines = path.read_bytes().splitlines()
+    return [_from_json(line, f"{path}, line {i + 1}") for i, line in enumerate(lines)]
+
+
+def write_loops_csv(path: Path | str, loops: Sequence[Loop], recordings: Ids | None = None) -> None:
+    """Write a csv table with the columns `COLUMNS`. The overlap is empty if it is unknown.
+
+    If the `recordings` of the frames are given, the table also has the columns `OF_RECORDINGS`.
+    """
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS if recordings is None else (*COLUMNS, *OF_RECORDINGS))
+    for loop, row in zip(loops, _pose_rows(_poses_of(loops)), strict=True):
+        overlap = "" if loop.overlap is None else f"{loop.overlap:.4f}"
+        names = [] if recordings is None else [recordings[loop.query], recordings[loop.match]]
+        table.writerow([loop.query, loop.match, *row.split(), f"{loop.probability:.6f}", overlap, *names])
+    write_text(Path(path), text.getvalue())
+
+
+def read_loops_csv(path: Path | str) -> list[tuple[int, int, Float[np.ndarray, "4 4"], float]]:
+    """Read query, match, match_from_query and probability from a table of `write_loops_csv`.
+
+    Raises the errors of `read_g2o`.
+    """
+    path, found = Path(path), []
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a table of loops, found no file")
+    lines = path.read_text(errors="replace").splitlines()
+    if not lines or tuple(lines[0].split(",")) not in (COLUMNS, (*COLUMNS, *OF_RECORDINGS)):
+        raise ValueError(
+            f"{path}, line 1: expected {','.join(COLUMNS)}, found {lines[0][:200] if lines else 'nothing'}"
+        )
+    for i, line in enumerate(lines[1:]):
+        words, where = line.split(","), f"{path}, line {i + 2}"
+        words = words[: len(COLUMNS)] if lines[0].endswith(OF_RECORDINGS[-1]) else words
+        words = words[:-1] if len(words) == len(COLUMNS) and not words[-1] else words  # no overlap
+        values = numbers_of(words, columns=len(words) if len(words) in (10, 11) else 10, where=where)
+        query, match = _frames(values[:2], where)
+        _check_loop(query, match, values[9:].tolist(), where)
+        found.append((query, match, _pose(values[2:9], where), float(values[9])))
+    return found
+
+
+def _poses_of(loops: Sequence[Loop]) -> Float[np.ndarray, "n 4 4"]:
+    return np.array([loop.match_from_query for loop in loops], np.float64).reshape(-1, 4, 4)
+
+
+def _pose_rows(poses: Float[np.ndarray, "n 4 4"]) -> list[str]:
+    """x y z qx qy qz qw of each pose, with all digits: coordinates in a country's grid have seven before the point."""
+    if not len(poses):
+        return []
+    return [_all_digits(row) for row in np.concatenate([poses[:, :3, 3], quaternions(poses)], axis=1)]
+
+
+def _pose(values: Float[np.ndarray, " 7"], where: str) -> Float[np.ndarray, "4 4"]:
+    return from_quaternions(values[None, :3], _quaternions(values[None, 3:], where))[0]
+
+
+def _quaternions(values: Float[np.ndarray, "n 4"], where: Path | str) -> Float[np.ndarray, "n 4"]:
+    with np.errstate(over="ignore"):  # the square of a damaged number may be infinite
+        lengths = np.linalg.norm(values, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1) > 0.01)
+    if wrong.size:
+        raise ValueError(f"{where}, pose {wrong[0]}: expected a quaternion of length 1, found {values[wrong[0]]}")
+    return values
+
+
+def _frames(values: Float[np.ndarray, " n"], where: str) -> tuple[int, ...]:
+    """Frame numbers. Raises ValueError if a value is negative or not an integer."""
+    if (values < 0).any() or (values != np.round(values)).any():
+        raise ValueError(f"{where}: expected frames, counted from 0, found {' '.join(map(str, values))}")
+    return tuple(int(value) for value in values)
+
+
+def _check_loop(query: int, match: int, shares: Sequence[float], where: str) -> None:
+    """Raise ValueError if the match is not the earlier frame, or if a share is outside [0, 1]."""
+    if not match < query:
+        raise ValueError(f"{where}: expected a match before the query, found {match} and {query}")
+    if not all(0 <= share <= 1 for share in shares):
+        raise ValueError(f"{where}: expected probability and overlap from 0 to 1, found {shares}")
+
+
+def _all_digits(values: Float[np.ndarray, " n"]) -> str:
+    """Shortest text that reads back as the same float64 values."""
+    short = ((value, f"{value:.9g}") for value in values.tolist())
+    return " ".join(text if float(text) == value else repr(value) for value, text in short)
+
+
+def _numbers(values: Float[np.ndarray, " n"]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def _as_json(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
+    pose, covariance = loop.match_from_query.tolist(), loop.covariance.tolist()
+    return {**_named(loop, ids, recordings), "match_from_query": pose, "covariance": covariance, **_shares(loop)}
+
+
+def _named(loop: Loop, ids: Ids | None, recordings: Ids | None) -> dict:
+    """Frames of a loop, and their ids and recordings if they are given."""
+    named = {} if ids is None else {"query_id": ids[loop.query], "match_id": ids[loop.match]}
+    if recordings is not None:
+        named |= dict(zip(OF_RECORDINGS, (recordings[loop.query], recordings[loop.match]), strict=True))
+    return {"query": loop.query, "match": loop.match, **named}
+
+
+def _shares(loop: Loop) -> dict:
+    return {"probability": loop.probability, "overlap": loop.overlap}
+
+
+def _from_json(line: bytes, where: str) -> Loop:
+    value = parse_json(line, source=where)
+    try:
+        query, match = value["query"], value["match"]
+        shares = [share for share in (value["probability"], value["overlap"]) if share is not None]
+        if not (
+            all(type(frame) is int and frame >= 0 for frame in (query, match)) and value["probability"] is not None
+        ):
+            raise ValueError(f"frames {query}, {match} and probability {value['probability']}")
+        if not all(type(share) in (int, float) for share in shares):
+            raise ValueError(f"probability and overlap {shares}")
+        shares = [float(share) for share in shares]  # whole numbers of any size
+        pose, covariance = _matrix(value["match_from_query"], 4), _matrix(value["covariance"], 6)
+        if not are_rotations(pose[:3, :3]) or pose[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError(f"an invalid pose: {pose.tolist()}")
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ValueError(f"{where}: expected a loop as JSON, found an invalid line ({in_short(error)})") from error
+    _check_loop(query, match, shares, where)
+    return Loop(query, match, pose, covariance, shares[0], *shares[1:])
+
+
+def _matrix(rows: Any, size: int) -> Float[np.ndarray, "n n"]:
+    """Rows of JSON as a matrix of finite numbers."""
+    if not all(type(number) in (int, float) for row in rows for number in row):
+        raise ValueError(f"values that are not numbers: {rows}")
+    matrix = np.array(rows, np.float64)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise ValueError(f"a matrix {matrix.shape}: {rows}")
+    return matrix

@@ -1,0 +1,218 @@
+"""Correction of a trajectory while it is driven: an incremental pose graph, solved by gtsam's iSAM2 (extra `gtsam`).
+
+`optimization` solves a graph of all frames and loops at the end, and removes wrong loops. Here a robust cost (Cauchy)
+limits the influence of a wrong loop.
+"""
+
+import bisect
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.growing import GrowingArray
+from sglpr_jax.loops.closure import Loop
+from sglpr_jax.loops.drift import step_deviations
+from sglpr_jax.odometry.config import DriftModel
+from sglpr_jax.pose_graph.optimize import FIRST_POSE, gtsam_library, rotation_first
+from sglpr_jax.se3 import inverse
+
+CAUCHY = 3.0
+"""Residual at which a loop has half its weight, in standard deviations."""
+NODE_EVERY_M = 5.0
+"""Travelled distance between two nodes of the graph, in metres."""
+LOOP_EVERY_M = 50.0
+"""Minimum travelled distance between two loops in the graph that agree with it, in metres. It limits the growth of time
+and memory on routes that are driven again and again."""
+AGREES = 4.0
+"""Maximum residual of a loop that agrees with the graph, in standard deviations. Of right loops, 99 % have less."""
+RELINEARIZE = 0.1
+"""Change of a pose after which its factors are linearised again, in metres and radians."""
+
+
+class IncrementalTrajectory:
+    """A trajectory of odometry that loops correct frame by frame.
+
+    The loops should come from a `LoopDetector` with the same odometry, which rejects loops that contradict it. A
+    segment is a part of the trajectory whose motion is known. A new segment is part of the graph as soon as a loop
+    connects it with a segment in the graph.
+
+    The graph has a node every few metres. A loop connects the nodes before its query and its match. Loops that agree
+    with the graph are used every `LOOP_EVERY_M` only.
+
+    Example:
+      trajectory = IncrementalTrajectory()
+      for points, world_from_lidar in zip(scans, odometry):
+          trajectory.add(world_from_lidar, detector.add(points, odometry=world_from_lidar))
+          map_from_lidar = trajectory.map_from_world @ world_from_lidar
+    """
+
+    def __init__(self, *, drift: DriftModel = DriftModel()):
+        """Create a trajectory without frames.
+
+        Arguments:
+          drift: Stated drift of the odometry.
+
+        Raises:
+          ImportError: If the extra `gtsam` is not installed.
+        """
+        self._gtsam, self._drift = gtsam_library(), drift
+        settings = self._gtsam.ISAM2Params()
+        settings.setRelinearizeThreshold(RELINEARIZE)
+        settings.relinearizeSkip = 1
+        self._solver = self._gtsam.ISAM2(settings)
+        self._graph, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+        self._odometry = GrowingArray(np.empty((0, 4, 4)))
+        self._nodes: list[int] = []
+        self._segments: list[int] = []
+        """Frame and segment of each node. The keys of the graph are these frames."""
+        self._placed: set[int] = set()
+        self._waiting: list[Loop] = []
+        self._last_query = 0
+        self._travelled = GrowingArray(np.empty(0))
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._odometry)
+
+    @property
+    def map_from_world(self) -> Float[np.ndarray, "4 4"] | None:
+        """Correction of the odometry at the last frame. None if no loop connects its segment with the first one."""
+        return self._correction(self._nodes[-1]) if self._segments[-1] in self._placed else None
+
+    @property
+    def poses(self) -> Float[np.ndarray, "n 4 4"]:
+        """Corrected pose of the LiDAR at each frame. NaN in segments that no loop connects with the first one."""
+        found = np.full((len(self), 4, 4), np.nan)
+        for node, end, segment in zip(self._nodes, [*self._nodes[1:], len(self)], self._segments, strict=True):
+            if segment in self._placed:
+                found[node:end] = self._correction(node) @ self._odometry.rows[node:end]
+        return found
+
+    def add(
+        self, world_from_lidar: Float[np.ndarray, "4 4"], loops: Sequence[Loop] = (), *, continues: bool = True
+    ) -> None:
+        """Add the next frame, and new loops of this and of earlier frames.
+
+        Arguments:
+          world_from_lidar: Pose of the LiDAR by odometry.
+          loops: New loops.
+          continues: False if the motion since the last frame is unknown. The odometry may then begin in another frame.
+        """
+        frame, before = len(self), self._odometry.rows[-1:]
+        self._odometry.append(world_from_lidar)
+        step = float(np.linalg.norm(world_from_lidar[:3, 3] - before[-1, :3, 3])) if frame and continues else 0.0
+        self._travelled.append(self._travelled.rows[-1] + step if frame else 0.0)
+        if not frame:
+            self._begin(world_from_lidar)
+        elif not continues:
+            self._add_node(frame, self._segments[-1] + 1)
+        elif self._travelled.rows[-1] - self._travelled.rows[self._nodes[-1]] >= NODE_EVERY_M:
+            self._continue(frame)
+        self._waiting += loops
+        self._use_loops()
+        if self._values.size() or self._graph.size():
+            self._solver.update(self._graph, self._values)
+            self._graph, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+
+    def _begin(self, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Insert the first frame, whose pose is fixed."""
+        first = self._gtsam.noiseModel.Isotropic.Sigma(6, FIRST_POSE)
+        self._add_node(0, 0)
+        self._placed.add(0)
+        self._values.insert(0, self._gtsam.Pose3(pose))
+        self._graph.add(self._gtsam.PriorFactorPose3(0, self._gtsam.Pose3(pose), first))
+
+    def _continue(self, frame: int) -> None:
+        """Add a node to the segment of the last one."""
+        before, segment = self._nodes[-1], self._segments[-1]
+        self._add_node(frame, segment)
+        if segment in self._placed:
+            self._values.insert(frame, self._gtsam.Pose3(self._correction(before) @ self._odometry.rows[frame]))
+            self._chain(before, frame)
+
+    def _add_node(self, frame: int, segment: int) -> None:
+        self._nodes.append(frame)
+        self._segments.append(segment)
+
+    def _chain(self, before: int, frame: int) -> None:
+        """Connect two nodes by odometry."""
+        ends = self._odometry.rows[[before, frame]]
+        metres, radians = step_deviations(ends, self._drift)
+        noise = self._gtsam.noiseModel.Diagonal.Sigmas(np.repeat([radians[0], metres[0]], 3))
+        step = self._gtsam.Pose3(inverse(ends[0]) @ ends[1])
+        self._graph.add(self._gtsam.BetweenFactorPose3(before, frame, step, noise))
+
+    def _use_loops(self) -> None:
+        """Add loops with an end in the graph. Others wait until another loop connects their segments."""
+        used = True
+        while used and self._waiting:
+            connected = [
+                not {self._segment(loop.query), self._segment(loop.match)}.isdisjoint(self._placed)
+                for loop in self._waiting
+            ]
+            now, used = list(itertools.compress(self._waiting, connected)), any(connected)
+            self._waiting = list(itertools.compress(self._waiting, np.logical_not(connected)))
+            for loop in now:
+                self._use(loop)
+
+    def _use(self, loop: Loop) -> None:
+        """Connect the nodes of a loop. The covariance is that of the loop, because the nodes are near its frames."""
+        query, match = self._node(loop.query), self._node(loop.match)
+        pose = self._from_node(match, loop.match) @ loop.match_from_query @ inverse(self._from_node(query, loop.query))
+        if self._segment(query) not in self._placed:
+            self._place(query, self._pose(match) @ pose)
+        elif self._segment(match) not in self._placed:
+            self._place(match, self._pose(query) @ inverse(pose))
+        elif query == match or not self._is_useful(loop, query, match, pose):
+            return
+        self._last_query = query
+        covariance = self._gtsam.noiseModel.Gaussian.Covariance(rotation_first(loop.covariance))
+        robust = self._gtsam.noiseModel.mEstimator.Cauchy(CAUCHY)
+        noise = self._gtsam.noiseModel.Robust.Create(robust, covariance)
+        self._graph.add(self._gtsam.BetweenFactorPose3(match, query, self._gtsam.Pose3(pose), noise))
+
+    def _is_useful(self, loop: Loop, query: int, match: int, pose: Float[np.ndarray, "4 4"]) -> bool:
+        """Whether a loop between two nodes contradicts the graph, or no other loop was used for a while."""
+        way = self._travelled.rows
+        if query == self._last_query:
+            return False
+        if abs(way[query] - way[self._last_query]) >= LOOP_EVERY_M:
+            return True
+        error = self._gtsam.Pose3.Logmap(
+            self._gtsam.Pose3(inverse(pose) @ inverse(self._pose(match)) @ self._pose(query))
+        )
+        return float(error @ np.linalg.solve(rotation_first(loop.covariance), error)) > AGREES**2
+
+    def _place(self, node: int, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Insert the nodes of a segment. The pose of one node is known."""
+        segment = self._segment(node)
+        self._placed.add(segment)
+        nodes = [one for one, its in zip(self._nodes, self._segments, strict=True) if its == segment]
+        map_from_world = pose @ inverse(self._odometry.rows[node])
+        for one in nodes:
+            self._values.insert(one, self._gtsam.Pose3(map_from_world @ self._odometry.rows[one]))
+        for before, after in itertools.pairwise(nodes):
+            self._chain(before, after)
+
+    def _node(self, frame: int) -> int:
+        """Last node at or before a frame."""
+        return self._nodes[bisect.bisect_right(self._nodes, frame) - 1]
+
+    def _segment(self, frame: int) -> int:
+        return self._segments[bisect.bisect_right(self._nodes, frame) - 1]
+
+    def _from_node(self, node: int, frame: int) -> Float[np.ndarray, "4 4"]:
+        """Pose of a frame in that of a node, by odometry."""
+        return inverse(self._odometry.rows[node]) @ self._odometry.rows[frame]
+
+    def _correction(self, node: int) -> Float[np.ndarray, "4 4"]:
+        """Correction of the odometry at a node in the graph."""
+        return self._pose(node) @ inverse(self._odometry.rows[node])
+
+    def _pose(self, node: int) -> Float[np.ndarray, "4 4"]:
+        """Latest estimate of the pose of a node in the graph."""
+        if self._values.exists(node):
+            return self._values.atPose3(node).matrix()
+        return self._solver.calculateEstimatePose3(node).matrix()

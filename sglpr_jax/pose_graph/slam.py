@@ -1,0 +1,90 @@
+"""From raw scans to a corrected trajectory: odometry, loops and pose graph in one call (extra `slam`)."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.data.choices import Scale
+from sglpr_jax.data.deskew import deskewed, has_point_times
+from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scan_stream import OnBadScan
+from sglpr_jax.loops.config import DetectorConfig
+from sglpr_jax.loops.search import FoundLoops, find_loops
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.shipped import DEFAULT_WEIGHTS
+from sglpr_jax.models.weights_file import load
+from sglpr_jax.odometry import kiss_icp
+from sglpr_jax.odometry.config import OdometryConfig
+from sglpr_jax.pose_graph import optimize
+
+
+class Slam(NamedTuple):
+    """Odometry of a recording, its loops, and the corrected trajectory."""
+
+    odometry: Float[np.ndarray, "n 4 4"]
+    """Pose of the LiDAR at each scan, in the frame of the first scan."""
+    loops: FoundLoops
+    trajectory: optimize.OptimizedTrajectory
+
+    def __str__(self) -> str:
+        return f"{self.loops}\n{self.trajectory}"
+
+
+def slam(
+    recording: Recording | Path | str,
+    *,
+    params: Params | str = DEFAULT_WEIGHTS,
+    config: DetectorConfig = DetectorConfig(),
+    odometry: OdometryConfig = OdometryConfig(),
+    registered: bool | None = None,
+    scale: Scale = 1,
+    on_bad_scan: OnBadScan | None = None,
+    kept_in: Path | str | None = None,
+) -> Slam:
+    """Compute the odometry of a recording from its scans, find loops and correct the trajectory.
+
+    If scans and points have times, the motion within scans is removed. `bin/loops --odometry auto --optimize` does the
+    same and writes files.
+
+    Arguments:
+      recording: The scans, about 10 a second, or a folder or bag with one recording.
+      params: Weights, or their name or folder.
+      config: Settings of the loop search.
+      odometry: Settings of the odometry.
+      registered: Whether loops are registered by their full scans (`find_loops`).
+      scale: Factor for all lengths, as in `find_loops`.
+      on_bad_scan: Called with id and error of an unreadable scan. The scan is skipped. Without it the error is raised.
+      kept_in: Folder of checkpoints, from which an interrupted call resumes. It is not removed.
+
+    Raises:
+      ValueError: If the recording has ready-made images, or if no scan is readable or has enough points.
+      ImportError: If kiss-icp or gtsam is not installed.
+
+    Example:
+      result = sglpr_jax.slam("my_scans")
+      print(result.trajectory.poses.shape, len(result.loops.loops))
+    """
+    optimize.check_installed()
+    opened = recording if isinstance(recording, Recording) else open_recording(Path(recording))
+    folder = None if kept_in is None else Path(kept_in)
+    poses = kiss_icp.scan_odometry(
+        opened,
+        config=odometry,
+        scale=scale,
+        kept_in=None if folder is None else folder / "odometry.npz",
+        on_bad_scan=on_bad_scan,
+    )
+    found = find_loops(
+        deskewed(opened, poses) if has_point_times(opened) else opened,
+        load(params) if isinstance(params, str) else params,
+        odometry=poses,
+        config=config,
+        registered=registered,
+        scale=scale,
+        on_bad_scan=on_bad_scan,
+        kept_in=None if folder is None else folder / "loops",
+    )
+    return Slam(poses, found, optimize.optimize_trajectory(found))

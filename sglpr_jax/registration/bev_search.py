@@ -1,0 +1,212 @@
+"""Coarse comparison of images, which tells at little cost which scans may show the place of a query.
+
+It has half as many rotations as the search, cells twice as large and blurs twice as wide, and takes a sixth of the
+time. It replaces the descriptors where these do not tell places apart, for instance among trunks.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int, Num
+
+from sglpr_jax.registration.bev_spectra import (
+    DEFAULT,
+    AnyArray,
+    cells,
+    correlations,
+    lower_half,
+    match_spectra,
+    quarters,
+    query_spectra,
+)
+from sglpr_jax.registration.config import VerificationConfig
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def coarse_correlations(
+    query: Complex[AnyArray, "2 s t f"],
+    matches: Complex[AnyArray, "k s f"],
+    count: Int[AnyArray, ""] | int | None = None,
+    *,
+    config: VerificationConfig = DEFAULT,
+) -> Float[Array, " k"]:
+    """Highest correlation of a query with each of k matches at any pose, by the coarse comparison.
+
+    Arguments:
+      query: Result of `spectra.query_spectra`.
+      matches: Result of `spectra.match_spectra`.
+      count: Number of compared matches, by default all. The others get -1.
+      config: Settings of the exact comparison.
+    """
+    turned = quarters(lower_half(jnp.asarray(query)[:, :, ::2].swapaxes(1, 2), config).swapaxes(1, 2))
+    matches = lower_half(jnp.asarray(matches), config)
+    reach = cells(config.max_shift_m, 2 * config.resolution_m * config.coarse)
+
+    def compare(k: Int[Array, ""], found: Float[Array, " k"]) -> Float[Array, " k"]:
+        return found.at[k].set(correlations(turned, matches[k], reach).max((0, 2)).max())
+
+    return jax.lax.fori_loop(0, len(matches) if count is None else count, compare, jnp.full(len(matches), -1.0))
+
+
+class Peak(NamedTuple):
+    """The best pose of a query in the frame of a match, to a fraction of a merged cell."""
+
+    x: Float[AnyArray, "*b"]
+    y: Float[AnyArray, "*b"]
+    """Position of the query in the match's frame, in metres."""
+    yaw: Float[AnyArray, "*b"]
+    """Rotation of the query, in radians, counter-clockwise, from 0 to 2 pi."""
+    correlation: Float[AnyArray, "*b"]
+    """Correlation at the pose: 1 for equal images, about 0 for unrelated ones."""
+    second: Float[AnyArray, "*b"]
+    """Highest correlation at any other pose (`second_m`, `second_deg`)."""
+
+    def one(self, k: int) -> "Peak":
+        """The k-th peak."""
+        return Peak(*(values[k] for values in self))
+
+    def some(self, rows: slice | np.ndarray) -> "Peak":
+        """A selection of the peaks."""
+        return Peak(*(values[rows] for values in self))
+
+
+NO_PEAKS = Peak(*[np.zeros(0, np.float32)] * len(Peak._fields))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def search(
+    query: Num[AnyArray, "h w"], matches: Num[AnyArray, "k h w"], *, config: VerificationConfig = DEFAULT
+) -> Peak:
+    """Return the best pose of a query in the frame of each of k matches.
+
+    Arguments:
+      query: Square image of counts in the orientation of eq. 1, with an even number of cells per side.
+      matches: Images of the same size.
+      config: Settings of the comparison.
+
+    Returns:
+      Peaks with a leading axis of k.
+
+    Raises:
+      ValueError: If the images are not square or have an odd number of cells.
+    """
+    return search_spectra(query_spectra(query, config=config), match_spectra(matches, config=config), config=config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def search_spectra(
+    query: Complex[AnyArray, "2 s t f"],
+    matches: Complex[AnyArray, "k s f"],
+    count: Int[AnyArray, ""] | int | None = None,
+    *,
+    config: VerificationConfig = DEFAULT,
+) -> Peak:
+    """Like `search`, with the results of `query_spectra` and `match_spectra`.
+
+    With `count`, only the first matches are searched. Different counts do not compile different programs.
+    """
+    turned, matches, reach = quarters(jnp.asarray(query)), jnp.asarray(matches), _reach(config)
+
+    def search_one(k: Int[Array, ""], found: Peak) -> Peak:
+        peak = _peak(correlations(turned, matches[k], reach), jnp.full(3, jnp.nan), config)
+        return jax.tree.map(lambda all_found, one: all_found.at[k].set(one), found, peak)
+
+    none = Peak(*[jnp.zeros(len(matches))] * len(Peak._fields))
+    return jax.lax.fori_loop(0, len(matches) if count is None else count, search_one, none)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def search_near(
+    query: Complex[AnyArray, "2 s t f"],
+    match: Complex[AnyArray, "s f"],
+    prior: Float[AnyArray, " 3"],
+    *,
+    config: VerificationConfig = DEFAULT,
+) -> Peak:
+    """Return two peaks: the best pose anywhere, and the best pose near an expected one.
+
+    Arguments:
+      query: Result of `query_spectra`.
+      match: Row of `match_spectra`.
+      prior: Expected x, y (metres) and yaw (radians). NaN if there is no expected pose.
+      config: Settings of the comparison.
+
+    Returns:
+      Peaks with a leading axis of 2.
+    """
+    found = correlations(quarters(jnp.asarray(query)), jnp.asarray(match), _reach(config))
+    priors = jnp.stack([jnp.full(3, jnp.nan), jnp.asarray(prior, jnp.float32)])
+    return jax.lax.map(lambda prior: _peak(found, prior, config), priors)
+
+
+def _reach(config: VerificationConfig) -> int:
+    """Maximum shift, in merged cells."""
+    return cells(config.max_shift_m, config.resolution_m * config.coarse)
+
+
+def _peak(found: Float[Array, "d t r"], prior: Float[Array, " 3"], config: VerificationConfig) -> Peak:
+    reach, step = len(found) // 2, np.float32(2 * np.pi / config.turns)
+    cell_m = config.resolution_m * config.coarse
+    x, y, yaw = prior  # NaN allows all poses
+    expected = reach - y / cell_m, yaw / step, reach + x / cell_m
+    near_prior = _near(found.shape, expected, config.prior_m / cell_m, config.prior_deg)
+    highest = found.max(0)  # a maximum along the slowest axis is fast
+    allowed = jnp.where(jnp.isnan(x), highest, jnp.where(near_prior, found, -1.0).max(0))
+    turn, right = jnp.unravel_index(jnp.argmax(allowed), allowed.shape)
+    column = found[:, turn, right]
+    down = jnp.argmax(jnp.where(near_prior[:, turn, right] | jnp.isnan(x), column, -1.0))
+    second = _second(found, highest, (down, turn, right), cell_m, config)
+    at = down, turn, right
+    down, turn, right = (index + offset for index, offset in zip(at, _offsets(found, at), strict=True))
+    x, y, yaw = (right - reach) * cell_m, (reach - down) * cell_m, jnp.mod(turn * step, 2 * np.pi)
+    return Peak(x, y, yaw, found[at], second)
+
+
+def _second(
+    found: Float[Array, "d t r"],
+    highest: Float[Array, "t r"],
+    at: tuple[Int[Array, ""], ...],
+    cell_m: float,
+    config: VerificationConfig,
+) -> Float[Array, ""]:
+    """Highest correlation away from a peak. `highest` is the maximum over all shifts down."""
+    down, turn, right = at
+    most_turns = int(config.second_deg * config.turns / 360 + 1e-6)
+    turns = jnp.mod(turn + np.arange(-most_turns, most_turns + 1), config.turns)
+    about = found[:, turns]
+    near = _near(about.shape, (down, most_turns, right), config.second_m / cell_m, 360.0)
+    other_turns = jnp.ones(config.turns, bool).at[turns].set(False)
+    return jnp.maximum(jnp.max(jnp.where(other_turns[:, None], highest, 0.0)), jnp.max(jnp.where(~near, about, 0.0)))
+
+
+def _offsets(found: Float[Array, "d t r"], peak: tuple[Int[Array, ""], ...]) -> list[Float[Array, ""]]:
+    """Offset of the peak from its cell along each axis, from a parabola through three values."""
+    offsets = []
+    for axis, at in enumerate(peak):
+        size = found.shape[axis]
+        before, after = at - 1, at + 1
+        if axis != 1:  # rotations wrap around, shifts end
+            before, after = jnp.maximum(before, 0), jnp.minimum(after, size - 1)
+        low, best, high = (
+            found[tuple(where if k == axis else other for k, other in enumerate(peak))]
+            for where in (before % size, at, after % size)
+        )
+        bend = low - 2 * best + high
+        offset = (low - high) / (2 * jnp.where(bend < 0, bend, -1e9))
+        offsets.append(jnp.clip(offset, -0.5, 0.5))
+    return offsets
+
+
+def _near(
+    shape: tuple[int, ...], pose: Sequence[Float[Array, ""] | Int[Array, ""] | int], most_cells: float, most_deg: float
+) -> Bool[Array, "d t r"]:
+    """Whether each pose is near a given pose."""
+    down, turn, right = (jnp.abs(jnp.arange(n) - at) for n, at in zip(shape, pose, strict=True))
+    turn = jnp.mod(turn, shape[1])
+    turn = jnp.minimum(turn, shape[1] - turn) * (360 / shape[1]) <= most_deg
+    down, right = (apart <= most_cells + 1e-6 for apart in (down, right))
+    return down[:, None, None] & turn[None, :, None] & right[None, None, :]

@@ -1,0 +1,240 @@
+"""Rows of the places of a fleet, as Arrow tables. Parquet files and the index have the same columns."""
+
+import contextlib
+import hashlib
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.scaled import scale_of
+from sglpr_jax.fields import Size
+from sglpr_jax.files import file_name, in_short, naming, parse_json, replacing
+from sglpr_jax.methods.method import Method
+from sglpr_jax.methods.registry import network
+from sglpr_jax.models.params import Params
+from sglpr_jax.retrieval.descriptor_file import DescriptorFile
+from sglpr_jax.retrieval.embed import embed
+from sglpr_jax.retrieval.reuse import fingerprint
+from sglpr_jax.schema import check_about
+
+if TYPE_CHECKING:
+    import pyarrow
+
+FORMAT = "sglpr-jax places 1"
+"""Format in every file and index."""
+ABOUT = {"width": Size, "weights_hash": str, "scale": int}
+"""JSON values in the metadata `about` of every file and index. Descriptors with other values are not comparable."""
+KEY = "place"
+"""Column of the unique name of a place: recording/scan."""
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""Columns of the pose in the frame of the recording, in metres and as a quaternion. Unknown values are null."""
+
+
+def schema(about: dict[str, Any]) -> "pyarrow.Schema":
+    """Return the columns of places that were made as `about` states."""
+    import pyarrow
+
+    unique = {"lance-schema:unenforced-primary-key": "true"}  # concurrent writers add a place once
+    fields = [
+        pyarrow.field(KEY, pyarrow.string(), nullable=False, metadata=unique),
+        *(pyarrow.field(name, pyarrow.string(), nullable=False) for name in ("recording", "scan", "site", "source")),
+        *(pyarrow.field(name, pyarrow.float64()) for name in ("time", *POSE)),
+        pyarrow.field("weights", pyarrow.string(), nullable=False),
+        pyarrow.field("descriptor", pyarrow.list_(pyarrow.float32(), about["width"]), nullable=False),
+    ]
+    return pyarrow.schema(fields, metadata={"about": json.dumps({"format": FORMAT, **about})})
+
+
+def place_rows(
+    file: DescriptorFile,
+    recording: str,
+    *,
+    site: str = "",
+    source: str = "",
+    rotations: Float[np.ndarray, "n 3 3"] | None = None,
+) -> "pyarrow.Table":
+    """Return the places of a descriptor file, one row a scan.
+
+    Arguments:
+      file: Descriptors that are compared by L2.
+      recording: Unique name of the recording among all recordings of the fleet.
+      site: Where the recording was made, for queries within one site.
+      source: Address of the recording, for programs that read its scans again.
+      rotations: Rotation of the LiDAR at each scan of the file, in the frame of the positions. None if unknown.
+
+    Raises:
+      ValueError: If another distance compares the descriptors.
+    """
+    import pyarrow
+
+    if file.distance != "l2":
+        raise ValueError(f"expected descriptors compared by l2, found {file.distance}")
+    n, width = file.descriptors.shape
+    pose = dict.fromkeys(POSE, np.full(n, np.nan))
+    if file.positions is not None:
+        pose |= zip(POSE[:3], file.positions.T, strict=True)
+        if rotations is not None:
+            pose |= zip(POSE[3:], Rotation.from_matrix(rotations).as_quat().T, strict=True)
+    times = np.full(n, np.nan) if file.times is None else file.times
+    columns = [
+        [f"{recording}/{scan}" for scan in file.ids],
+        [recording] * n,
+        list(file.ids),
+        [site] * n,
+        [source] * n,
+        *(pyarrow.array(values, from_pandas=True) for values in (times, *pose.values())),  # NaN becomes null
+        [file.weights_hash] * n,
+        pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(file.descriptors.reshape(-1)), width),
+    ]
+    about = {"width": width, "weights_hash": file.weights_hash, "scale": file.scale}
+    return pyarrow.table(columns, schema=schema(about))
+
+
+def about_of(found: "pyarrow.Schema", source: str) -> dict[str, Any]:
+    """Return how the places of a table were made. Raises ValueError, naming `source`, if its columns are others."""
+    about = parse_json((found.metadata or {}).get(b"about", b"null"), source=f"{source}, `about`")
+    with naming(source):
+        check_about(about, ABOUT, format=FORMAT)
+        about = {name: about[name] for name in ABOUT}
+        columns = {field.name: str(field.type) for field in found}
+        for field in schema(about):
+            kind = columns.get(field.name, "none").replace("item:", "element:")
+            if kind != str(field.type).replace("item:", "element:"):
+                raise ValueError(
+                    f"expected a column {field.name} of {field.type}, found {columns.get(field.name, 'none')}"
+                )
+    return about
+
+
+def check_made_alike(expected: dict[str, Any], found: dict[str, Any], source: str) -> None:
+    """Raise ValueError, naming the table `source`, if the places of other weights would be compared with its own."""
+    for name, value in found.items():
+        if value != expected[name]:
+            here, there = (str(one)[:12] or "(none)" for one in (expected[name], value))
+            raise ValueError(
+                f"{source}: expected places with {name} {here}, found {there}: their descriptors are not comparable"
+            )
+
+
+@contextlib.contextmanager
+def usable(address: str) -> Iterator[None]:
+    """Convert the exceptions of storage libraries, of many types, to a ValueError that names the address."""
+    try:
+        yield
+    except ImportError as error:
+        more = "pip install 'sglpr-jax[fleet]', and s3fs for s3://, gcsfs for gs://"
+        raise ImportError(f"{address}: expected the extra `fleet` ({more}), found: {in_short(error)}") from error
+    except Exception as error:
+        found = in_short(error, most=200)
+        raise ValueError(f"{address}: expected a store that can be read and written, found: {found}") from error
+
+
+if TYPE_CHECKING:
+    import pyarrow
+
+
+class Stored(NamedTuple):
+    """Result of `embed_to_store`."""
+
+    address: str
+    """Address of the Parquet file."""
+    added: int | None
+    """Number of places that were computed, or None if the file existed."""
+
+
+def embed_to_store(
+    store: str, method: Params | Method, recording: Recording, *, site: str = "", source: str = "", **options: Any
+) -> Stored:
+    """Describe a recording and write its places to a store, unless they are there already.
+
+    Reads all files of the recording once to compute their hash.
+
+    Arguments:
+      store: Folder, or address in object storage.
+      method: Weights of a model, or another method whose descriptors are compared by L2.
+      recording: Scans or images to describe.
+      site: Where the recording was made.
+      source: Address of the recording.
+      options: Options of `embed`.
+
+    Raises:
+      ValueError: If another distance compares the descriptors, or the store cannot be read or written.
+
+    Example:
+      embed_to_store("s3://bucket/places", sglpr_jax.load("sglpr"), recording, site="berlin")
+    """
+    method = network(method) if isinstance(method, Params) else method
+    made = [method.weights_hash, method.about, options.get("rotation_seed"), scale_of(recording)]
+    hashed = hashlib.sha256(json.dumps(made).encode()).hexdigest()[:12]
+    name = file_name(f"{recording.name}-{fingerprint(recording, contents=True)}")
+    folder = f"{store.rstrip('/')}/{file_name(method.about['method'])}-{hashed}"
+    address = f"{folder}/{name}.parquet"
+    if _exists(address):
+        return Stored(address, None)
+    file = embed(method, recording, **options)
+    rows = place_rows(file, name, site=site, source=source, rotations=_rotations(file, recording))
+    _put(address, rows)
+    return Stored(address, len(rows))
+
+
+def stored_places(store: str) -> list[str]:
+    """Return the addresses of all Parquet files of a store. Raises ValueError if it cannot be read."""
+    with usable(store):
+        filesystem, path = _open(store)
+        return [filesystem.unstrip_protocol(found) for found in sorted(filesystem.find(path)) if _is_places(found)]
+
+
+def read_places(address: str) -> "pyarrow.Table":
+    """Read the rows of one Parquet file. Raises ValueError if it contains other columns."""
+    with usable(address):
+        import pyarrow.parquet
+
+        filesystem, path = _open(address)
+        rows = pyarrow.parquet.read_table(io.BytesIO(filesystem.cat_file(path)))
+    about_of(rows.schema, address)
+    return rows
+
+
+def _is_places(path: str) -> bool:
+    return path.endswith(".parquet") and not path.rpartition("/")[2].startswith(".")
+
+
+def _exists(address: str) -> bool:
+    with usable(address):
+        filesystem, path = _open(address)
+        return filesystem.exists(path)
+
+
+def _put(address: str, rows: "pyarrow.Table") -> None:
+    """Write a Parquet file. In object storage, an object appears when it is complete."""
+    content = io.BytesIO()
+    with usable(address):
+        import pyarrow.parquet
+        from fsspec.implementations.local import LocalFileSystem
+
+        pyarrow.parquet.write_table(rows, content)
+        filesystem, path = _open(address)
+        if isinstance(filesystem, LocalFileSystem):
+            with replacing(Path(path)) as temporary:
+                temporary.write_bytes(content.getbuffer())
+        else:
+            filesystem.pipe_file(path, content.getvalue())
+
+
+def _open(address: str) -> tuple[Any, str]:
+    """Return the file system of an address, and the path in it."""
+    import fsspec
+
+    return fsspec.core.url_to_fs(address)
+
+
+def _rotations(file: DescriptorFile, recording: Recording) -> Float[np.ndarray, "n 3 3"] | None:
+    """Rotations of the described scans, if the recording has poses with rotations."""
+    return None if recording.world_from_lidar is None else recording.world_from_lidar[file.recorded][:, :3, :3]

@@ -1,0 +1,105 @@
+"""Rigid transforms as 4 x 4 matrices, `a_from_b @ b_from_c == a_from_c`."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+ROTATION_TOLERANCE = 0.01
+"""Tolerance for rotations in files with few digits."""
+
+
+def transform(x: float, y: float, yaw: float) -> Float[np.ndarray, "4 4"]:
+    """Transform in the plane, from x and y in metres and yaw in radians counter-clockwise."""
+    found = np.eye(4)
+    found[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    found[:2, 3] = x, y
+    return found
+
+
+def inverse(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
+    """Inverse transform, b_from_a."""
+    turned = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    found = np.zeros_like(a_from_b)
+    found[..., :3, :3] = turned
+    found[..., :3, 3] = -np.einsum("...ij,...j->...i", turned, a_from_b[..., :3, 3])
+    found[..., 3, 3] = 1
+    return found
+
+
+def yaw_of(a_from_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n"]:
+    """Yaw of the x axis of frame b in frame a, in radians."""
+    return np.asarray(np.arctan2(a_from_b[..., 1, 0], a_from_b[..., 0, 0]))
+
+
+def transformed(a_from_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Transform points from frame b to frame a."""
+    return points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+
+
+def adjoint(a_from_b: Float[np.ndarray, "*m 4 4"]) -> Float[np.ndarray, "*m 6 6"]:
+    """Matrix that transforms a small motion of a body (metres, then radians) from its frame b to its frame a."""
+    x, y, z = np.moveaxis(a_from_b[..., :3, 3], -1, 0)
+    turned = a_from_b[..., :3, :3]
+    crossed = np.zeros(turned.shape)
+    crossed[..., 0, 1], crossed[..., 0, 2] = -z, y
+    crossed[..., 1, 0], crossed[..., 1, 2] = z, -x
+    crossed[..., 2, 0], crossed[..., 2, 1] = -y, x
+    found = np.zeros((*turned.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = turned
+    found[..., :3, 3:] = crossed @ turned
+    return found
+
+
+def moved_covariance(covariance: Float[np.ndarray, "*n 6 6"], a_from_b: Float[np.ndarray, "*m 4 4"]) -> np.ndarray:
+    """Transform the covariance of a small motion of a body (metres, then radians) from its frame b to its frame a."""
+    moved = adjoint(a_from_b)
+    return moved @ covariance @ np.swapaxes(moved, -1, -2)
+
+
+def quaternions(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:
+    """Rotations as quaternions x, y, z, w with non-negative w."""
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+
+    return Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+
+
+def from_quaternions(
+    translations: Float[np.ndarray, "n 3"], quaternions: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses from translations and quaternions (x, y, z, w)."""
+    from scipy.spatial.transform import Rotation  # imported here because the import is slow
+
+    poses = np.tile(np.eye(4), (len(translations), 1, 1))
+    poses[:, :3, 3] = translations
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix().reshape(-1, 3, 3)
+    return poses
+
+
+def travelled(poses: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
+    """Travelled distance at each pose, in metres."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def positions_from_camera(world_from_camera: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "n 3"]:
+    """Convert KITTI's camera poses (x right, y down, z forward) to positions (n, 3) in metres, z up.
+
+    The camera's (x, y, z) becomes (z, -x, -y): x forward, y left, z up. The axes are only permuted, so distances in the
+    camera's x and z are distances in x and y.
+    """
+    x, y, z = world_from_camera[:, :, 3].astype(np.float64).T
+    return np.stack([z, -x, -y], axis=1)
+
+
+def are_rotations(matrices: Float[np.ndarray, "*b 3 3"]) -> Bool[np.ndarray, "*b"]:
+    """Whether each matrix R is a rotation: all entries of R R^T - I are below 0.01, and R is not a reflection."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.abs(matrices @ matrices.swapaxes(-1, -2) - np.eye(3)).max((-2, -1))
+        return np.asarray((apart < ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0))
+
+
+def distances(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "n m"]:
+    """Return the Euclidean distances in metres (float64) between every position of `a` and every position of `b`."""
+    squared = np.zeros((len(a), len(b)))
+    for a_axis, b_axis in zip(a.astype(np.float64).T, b.astype(np.float64).T, strict=True):
+        squared += np.subtract.outer(a_axis, b_axis) ** 2
+    return np.sqrt(squared)
