@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -88,11 +89,12 @@ def test_a_dump_gives_the_same_command(name, tmp_path):
 def test_a_dump_has_the_flags_of_the_help(name):
     ended = run_command(name, *LINES[name], "--dump-config")
     shown = run_command(name, *LINES[name], "--help").out
-    flags = {word.strip(",│") for word in shown.split() if word.startswith("--")}
+    flags = set(re.findall(r"^\W*(--[a-z][a-z0-9-]+)", shown, re.MULTILINE))
     positional = {"checkpoint", "recording", "scan", "file", "more", "source", "what"}
     positional |= {"action", "method", "data"} if name == "peers" else set()
-    dumped = {f"--{flag}" for flag in json.loads(ended.out) if flag not in positional}
+    dumped = {f"--{flag}" for flag in json.loads(ended.out) if flag not in positional and "." not in flag}
     assert dumped <= flags and {"--config", "--dump-config"} <= flags - dumped
+    assert len(flags) <= 40
 
 
 def test_a_dump_needs_the_required_flags_and_does_nothing(tmp_path, monkeypatch):
@@ -159,6 +161,18 @@ def test_the_file_may_name_the_preset_and_overrides_it(name, file):
 def test_a_wrong_file_is_one_line(name, values, words, file):
     path = file(values)
     assert_one_line_error(run_command(name, "--config", path), f"error: {path}: ", *words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--candidates.candidats", "7"), "found '--candidates.candidats'; did you mean '--candidates.candidates'?"),
+        (("--candidates.candidates=x",), "--candidates.candidates: expected a value of type int, found 'x'"),
+        (("--candidates.candidates",), "--candidates.candidates: expected a value of type int, found []"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(arguments, words):
+    assert_one_line_error(run_command("loops", "scans", "--out", "found", *arguments), words)
 
 
 def test_a_missing_file_is_one_line(tmp_path):
