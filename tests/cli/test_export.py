@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sglpr_jax
-from sglpr_jax.models import weights_file
+from sglpr_jax.models import shipped
 
 from .conftest import assert_one_line_error
 
@@ -30,8 +30,8 @@ def weights(random_params, tmp_path_factory) -> Path:
 @pytest.fixture
 def exported(command, weights, tmp_path, monkeypatch) -> Path:
     """These weights, exported under the name `circular` into a package folder of their own."""
-    monkeypatch.setattr(weights_file, "FOLDER", tmp_path / "package")
-    folder = weights_file.FOLDER / "circular"
+    monkeypatch.setattr(shipped, "FOLDER", tmp_path / "package")
+    folder = shipped.FOLDER / "circular"
     ended = command("export", "--weights", weights, "--out", folder, "--half")
     assert ended.status == 0, ended.error
     assert f"{folder}: 0." in ended.out and "MB of weights" in ended.out
