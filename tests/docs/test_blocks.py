@@ -63,7 +63,7 @@ def test_flags_of_benchmarks_exist(line):
 
 
 def test_nothing_else_is_unknown():
-    known = ("bin/", "python ", "pip install", "for ", "done", "docker ")  # the last: tests/test_docker.py
+    known = ("bin/", "python ", "pip install", "for ", "done", "taskset ", "docker ")  # the last: tests/test_docker.py
     assert not [(name_of(page), line) for page, line in COMMANDS if not line.startswith(known) and "s." not in line]
     assert {block.language for page in PAGES for block in blocks(page)} <= {"bash", "python", "text"}
 
