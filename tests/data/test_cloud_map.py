@@ -6,7 +6,7 @@ import pytest
 
 from sglpr_jax.data.cloud_map import TILE_M, tiled_cloud
 from sglpr_jax.data.formats import las
-from sglpr_jax.data.formats.cloud_files import cloud_blocks
+from sglpr_jax.data.formats.scan_files import cloud_blocks
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
 from sglpr_jax.data.warning import DataWarning
@@ -87,7 +87,7 @@ def test_points_are_in_the_frame_of_the_lidar(opened):
 @pytest.mark.parametrize("write", [write_pcd, write_ply, write_las])
 def test_every_format_has_the_same_points(write, tmp_path, monkeypatch):
     points = street()[::50]
-    for module in ("scan_size", "las"):
+    for module in ("clouds", "las"):
         monkeypatch.setattr(f"sglpr_jax.data.formats.{module}.BLOCK_POINTS", 1000)
     blocks = list(cloud_blocks(write(tmp_path / f"map.{write.__name__[6:]}", points)))
     assert len(blocks) > 1 and max(map(len, blocks)) == 1000

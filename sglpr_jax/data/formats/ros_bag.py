@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import (
     CUSTOM_MSG,
     IMU,

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.bin_records import Records
-from sglpr_jax.data.formats.cloud_text import check_points
+from sglpr_jax.data.formats.clouds import Records, check_points
 from sglpr_jax.data.point_times import FIELDS, TimeField, time_field_of
 from sglpr_jax.data.poses import interpolate, poses_of
 from sglpr_jax.data.times import doubt

@@ -1,27 +1,35 @@
-"""Reads single scans: points in all supported formats, and SemanticKITTI labels."""
+"""Reads single scans in all supported formats, point cloud maps in parts, and SemanticKITTI labels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.arrays import read_npy, read_npz
-from sglpr_jax.data.formats.bin_records import Records, is_record, read_records, record_of_scan
-from sglpr_jax.data.formats.las import las_records
-from sglpr_jax.data.formats.pcd import pcd_records
-from sglpr_jax.data.formats.ply import ply_records
+from sglpr_jax.data.formats.arrays import read_points
+from sglpr_jax.data.formats.bin_records import is_record, read_records, record_of_scan
+from sglpr_jax.data.formats.clouds import Records
+from sglpr_jax.data.formats.las import las_blocks, las_records
+from sglpr_jax.data.formats.pcd import pcd_blocks, pcd_records
+from sglpr_jax.data.formats.ply import ply_blocks, ply_records
 from sglpr_jax.fields import check_value
 
 READERS: dict[ScanFormat, Callable[[Path], Records]] = {
     "pcd": pcd_records,
     "ply": ply_records,
-    "npy": lambda path: Records(read_npy(path), None),
-    "npz": lambda path: Records(read_npz(path), None),
+    "npy": lambda path: Records(read_points(path)),
+    "npz": lambda path: Records(read_points(path)),
     "las": las_records,
 }
 """Readers of formats with a header. The name of each format is also its file ending."""
+BLOCKS: dict[str, Callable[[Path], Iterator[Float64[np.ndarray, "_ 3"]]]] = {
+    ".pcd": pcd_blocks,
+    ".ply": ply_blocks,
+    ".las": las_blocks,
+    ".laz": las_blocks,
+}
+"""Readers of point cloud maps in parts by file ending, so that a map may be larger than the memory."""
 ENDINGS = (".bin", ".pcd", ".ply")
 """File endings of scans."""
 ARRAY_ENDINGS = (".npy", ".npz", ".las")
@@ -35,10 +43,9 @@ def scan_id(path: Path) -> str:
 
 
 def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
-    """Return the format of a scan by its name, for "auto".
+    """Return the format of a scan by its ending. `*.pcd.bin` is nuscenes, and a file in `velodyne_sync` is nclt.
 
-    The ending defines the format of files with a header. `*.pcd.bin` is nuscenes. A file in a folder `velodyne_sync` is
-    nclt. The name of any other .bin file does not define a format. Such a file has the format `records`.
+    The name of any other .bin file does not define a format. Such a file has the format `records`.
     """
     for format in READERS:
         if path.suffix.lower() == f".{format}":
@@ -107,6 +114,16 @@ def read_scan_records(path: Path, *, format: ScanFormat = "auto", records: Recor
     if is_record(known):
         return read_records(path, known)
     return READERS[known](path)
+
+
+def is_cloud_file(path: Path) -> bool:
+    """Whether the path is a file with the ending of a point cloud map."""
+    return path.suffix.lower() in BLOCKS and path.is_file()
+
+
+def cloud_blocks(path: Path) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the points of a map in parts, in metres. Raises the errors of the readers."""
+    return BLOCKS[path.suffix.lower()](path)
 
 
 def read_labels(path: Path, *, points: int) -> Int32[np.ndarray, " n"]:

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.data.choices import PoseFormat, TimeUnit
 from sglpr_jax.data.cloud_map import TiledCloud, tiled_cloud, visible_points
-from sglpr_jax.data.formats.cloud_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.formats.pose_files import read_trajectory
+from sglpr_jax.data.formats.scan_files import cloud_blocks, is_cloud_file
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, common_mounting, estimate_mounting
 from sglpr_jax.data.poses import poses_of
 from sglpr_jax.data.reader import Reader

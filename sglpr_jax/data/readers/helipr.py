@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.point_times import TimeField, time_field_of
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.readers.stamped import read_table, stamped_recording

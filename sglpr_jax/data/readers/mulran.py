@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sglpr_jax.data.formats.bin_records import Records, described, read_records
+from sglpr_jax.data.formats.bin_records import described, read_records
+from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.reader import Reader
 from sglpr_jax.data.readers.stamped import read_table, stamped_recording
 from sglpr_jax.data.recording import Recording

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sglpr_jax.data.formats.arrays import read_npy
+from sglpr_jax.data.formats.arrays import read_points
 from sglpr_jax.data.formats.pose_files import check_positions, rotations_of, rows_of
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.reader import Reader
@@ -121,7 +121,7 @@ def _read(
 ) -> Record:
     """Read a scan. Caches of its points use `poses_hash` to detect changed poses."""
     world_from_lidar, position = poses[path]
-    x, y, z = ((read_npy(path) - position) @ world_from_lidar).T
+    x, y, z = ((read_points(path) - position) @ world_from_lidar).T
     return Record(points=np.stack([y, -x, z], axis=1).astype(np.float32))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sglpr_jax.data.formats.bin_records import Records
+from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import match_times
 from sglpr_jax.data.recording import Record, Recording, found_record

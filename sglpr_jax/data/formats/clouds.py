@@ -1,13 +1,15 @@
-"""Bounds of the size of a scan, and blocks of larger clouds. Headers may declare any size, so it is checked first."""
+"""Parts of the readers of .pcd, .ply, .las and numpy files: bounds of a scan, columns, text, and blocks of maps."""
 
 import mmap
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int32
 
+from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.files import in_short
 
 MOST_POINTS = 1 << 24
@@ -18,12 +20,28 @@ BLOCK_POINTS = 1 << 21
 """Number of points of a point cloud map that are read at a time."""
 
 
+class Records(NamedTuple):
+    """Points of one scan, with their lasers and times."""
+
+    points: Float32[np.ndarray, "n 3"]
+    """Points in metres: x forward, y left, z up if the format defines its axes, or else the axes of the file."""
+    lasers: Int32[np.ndarray, " n"] | None = None
+    """Laser number of each point, or None if the format has none."""
+    times: TimeField | None = None
+    """Field with the times of the points, or None if the format has none."""
+
+
+def records_of(columns: Sequence[np.ndarray], time: str | None) -> Records:
+    """Records of the columns x, y, z and, if `time` names it, of the column of times after them."""
+    with np.errstate(over="ignore", invalid="ignore"):  # invalid points are dropped by the callers
+        points = np.stack(columns[:3], axis=1).astype(np.float32)
+    return Records(points, times=None if time is None else TimeField(time, np.array(columns[3])))
+
+
 def check_points(points: int, *, bytes_each: int = 1) -> None:
     """Raise ValueError if a header declares no points, or more points or bytes than a scan has.
 
-    Arguments:
-      points: Declared number of points.
-      bytes_each: Declared size of a point, in bytes.
+    Headers may declare any size, so call this before memory is allocated.
     """
     if points < 1:
         raise ValueError(f"expected at least one point, found {points or 'none'}")
@@ -39,7 +57,9 @@ def check_bytes(size: int) -> None:
 
 
 def read_content(path: Path) -> bytes:
-    """Return the content of a scan file. Raises ValueError if the file exceeds `MOST_BYTES`."""
+    """Return the content of a scan file. Raises ValueError if the file is missing or exceeds `MOST_BYTES`."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a {path.suffix.lower()} file, found none")
     check_bytes(path.stat().st_size)
     return path.read_bytes()
 
@@ -50,12 +70,22 @@ def mapped_content(path: Path) -> memoryview:
         return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
 
 
-def blocks_of(records: np.ndarray, axes: Iterable[str]) -> Iterator[Float64[np.ndarray, "_ 3"]]:
-    """Yield the coordinates of records with named fields, `BLOCK_POINTS` points at a time. `axes` names x, y and z."""
-    names = tuple(axes)
+def packed_type(fields: Iterable[tuple[str, str, int]], names: Sequence[str]) -> np.dtype:
+    """Numpy type of packed fields (name, type, size in bytes), with only the fields in `names`. Names are unique."""
+    wanted, offset = {}, 0
+    for name, kind, size in fields:
+        if name in names:
+            wanted[name] = (kind, offset)
+        offset += size
+    kinds, offsets = zip(*wanted.values(), strict=True)
+    return np.dtype({"names": list(wanted), "formats": kinds, "offsets": offsets, "itemsize": offset})
+
+
+def blocks_of(records: np.ndarray) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    """Yield the coordinates of records with the fields x, y and z, `BLOCK_POINTS` points at a time."""
     for start in range(0, len(records), BLOCK_POINTS):
         block = records[start : start + BLOCK_POINTS]
-        yield np.stack([block[axis].astype(np.float64) for axis in names], axis=1)
+        yield np.stack([block[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
 _NOT_A_NUMBER = re.compile(rb"[-+]?(?:nan\([^\s()]*\)|1\.#(?:ind|[qs]?nan)\w*)", re.IGNORECASE)
