@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
-from sglpr_jax.data.formats.clouds import Records
+from sglpr_jax.data.formats.clouds import Records, TimeField
 from sglpr_jax.data.formats.png import read_label_image
 from sglpr_jax.data.formats.scan_files import read_labels, read_scan_records
 from sglpr_jax.data.mounting import Mounting
-from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.files import naming
 from sglpr_jax.labels import to_classes
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data.readers.bev_images import open_recording, recording_names
+from sglpr_jax.data.readers import open_recording, recording_names
 
 
 def test_a_sequence(bev_root):

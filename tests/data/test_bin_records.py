@@ -5,13 +5,17 @@ import pytest
 
 from sglpr_jax.data.formats.bin_records import find_record, read_records, unusual_record
 from sglpr_jax.data.formats.scan_files import read_scan
-from sglpr_jax.data.readers import kitti
-from sglpr_jax.data.readers.scan_folder import open_recording
+from sglpr_jax.data.reader import ReadOptions
+from sglpr_jax.data.readers import kitti, scan_folder
 from sglpr_jax.data.warning import DataWarning
 
 BEAMS = np.radians(np.linspace(-15, 15, 16))
 FIRING = np.arange(16).reshape(2, 8).T.reshape(-1)
 """Low and high beams in turn, as a VLP-16 fires."""
+
+
+def open_recording(folder, **options):
+    return scan_folder.open_recording(folder, folder.name, ReadOptions(**options))
 
 
 def scan(seed: int, *, steps: int = 180) -> np.ndarray:
@@ -126,16 +130,18 @@ def test_names_that_say_it_are_believed(tmp_path):
 def test_own_scans_in_the_layout_of_kitti(kitti_root):
     """Read as what they are; a fixture of a few points, and scans that are KITTI's, as KITTI's."""
     folder = kitti_root / "sequences" / "08" / "velodyne"
-    assert kitti.open_recording(kitti_root, "08").found == ("format: kitti (16 bytes a point)",)
+    assert kitti.open_recording(kitti_root, "08", ReadOptions()).found == ("format: kitti (16 bytes a point)",)
     for layout in ("float32x6", "float32x3", "kitti"):
         for i, path in enumerate(sorted(folder.iterdir())):
             columns(scan(i), LAYOUTS[layout]).astype("<f4").tofile(path)
-        recording = kitti.open_recording(kitti_root, "08")
+        recording = kitti.open_recording(kitti_root, "08", ReadOptions())
         size = {"float32x6": 24, "float32x3": 12, "kitti": 16}[layout]
         said = "" if layout == "kitti" else ", not KITTI's"
         assert recording.found == (f"format: {layout} ({size} bytes a point){said}",)
         np.testing.assert_array_equal(recording.points(1), scan(1).astype(np.float32))
-    assert kitti.open_recording(kitti_root, "08", format="float64x3").found == ("format: float64x3, as given",)
+    assert kitti.open_recording(kitti_root, "08", ReadOptions(format="float64x3")).found == (
+        "format: float64x3, as given",
+    )
 
 
 def test_one_scan_that_fits_nothing_is_named(tmp_path):

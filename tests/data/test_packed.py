@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import shutil
-import threading
 
 import numpy as np
 import pytest
@@ -143,71 +142,6 @@ def test_an_interruption_leaves_nothing(recording, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         packed(recording, tmp_path / "cache", on_progress=interrupt)
     assert packs(tmp_path / "cache") == []
-
-
-@pytest.mark.parametrize("size", [10, 400])
-def test_a_full_disk_is_one_error_that_names_the_file_and_leaves_nothing(recording, tmp_path, small_files, size):
-    with small_files(size), pytest.raises(OSError, match=r"cache/.*08-.*: cannot be written: File too large"):
-        packed(recording, tmp_path / "cache")
-    assert packs(tmp_path / "cache") == []
-
-
-def test_two_that_pack_at_once_end_with_one_pack(recording, tmp_path):
-    both, found = threading.Barrier(2, timeout=30), []
-
-    def pack() -> None:
-        found.append(packed(recording, tmp_path / "cache", on_progress=lambda done: both.wait()))
-
-    threads = [threading.Thread(target=pack) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(packs(tmp_path / "cache")) == 1
-    for each in found:
-        require_same_scans(each, recording)
-    assert len(found) == 2
-
-
-def test_what_a_killed_process_left_is_removed_once_it_is_old(recording, tmp_path):
-    old, new = (tmp_path / f".08-x.{32 * letter}.tmp" for letter in "ab")
-    for folder in (old, new):
-        folder.mkdir()
-        (folder / "points.bin").write_bytes(b"half")
-    for path in (old / "points.bin", old):
-        os.utime(path, (0, 0))
-    packed(recording, tmp_path)
-    assert sorted(packs(tmp_path))[0] == new.name and not old.exists()
-
-
-@pytest.mark.parametrize("name", ["../../escaped", "/escaped", "a/b", "x" * 5000])
-def test_the_pack_of_a_recording_of_any_name_lies_in_the_folder_of_packs(recording, tmp_path, name):
-    cache = tmp_path / "out" / "a" / "cache"
-    found = packed(dataclasses.replace(recording, name=name), cache)
-    assert found.name == name and [path.name for path in cache.parents[1].iterdir()] == ["a"]
-    assert len(list(cache.iterdir())) == 1 and next(cache.iterdir()).joinpath("pack.json").is_file()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda arrays: arrays.update({"../points": arrays.pop("points")}),
-        lambda arrays: arrays.pop("points"),
-        lambda arrays: arrays["points"].update(dtype="<i4"),
-        lambda arrays: arrays["points"].update(row=[1]),
-        lambda arrays: arrays["labels"].update(dtype="<i2"),
-        lambda arrays: arrays["points"].update(offsets=[0, arrays["points"]["offsets"][-1]], checksums=None),
-        lambda arrays: arrays.update(points=[1]),
-    ],
-)
-def test_a_pack_of_another_program_is_refused(recording, tmp_path, change):
-    packed(recording, tmp_path / "cache")
-    (path,) = (tmp_path / "cache").rglob("pack.json")
-    about = json.loads(path.read_text())
-    change(about["arrays"])
-    path.write_text(json.dumps(about))
-    with pytest.raises(ValueError, match=r"cache/08-.*: expected a packed recording, found a damaged one"):
-        packed(recording, tmp_path / "cache")
 
 
 @pytest.mark.parametrize("file", ["points.bin", "pack.json"])

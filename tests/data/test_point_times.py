@@ -8,9 +8,9 @@ from bags import CLOUD, FILES, cloud, write_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sglpr_jax.data.formats.clouds import TimeField
 from sglpr_jax.data.formats.pcd import pcd_records
 from sglpr_jax.data.formats.ply import ply_records
-from sglpr_jax.data.point_times import TimeField
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Record, scan_record
 

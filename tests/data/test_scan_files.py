@@ -52,18 +52,6 @@ def test_format_and_id_come_from_the_name(name, format, stem):
     assert scan_id(Path(name)) == stem
 
 
-def test_the_format_can_be_named(tmp_path):
-    path = tmp_path / "000000.bin"
-    np.arange(20, dtype="<f4").tofile(path)
-    assert read_scan(path).shape == (5, 3)
-    assert read_scan(path, format="nuscenes").shape == (4, 3)
-    assert read_scan(path, format="nclt").shape == (10, 3)
-    assert read_scan_records(path)[1] is None
-    (tmp_path / "a.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 1\nDATA ascii\n1 2 3\n")
-    assert read_scan_records(tmp_path / "a.pcd")[1] is None
-    np.testing.assert_array_equal(read_scan_records(path, format="nuscenes")[1], [4, 9, 14, 19])
-
-
 @pytest.mark.parametrize(
     "format, size, expected",
     [("kitti", 0, 16), ("kitti", 40, 16), ("nuscenes", 36, 20), ("nclt", 12, 8)],
@@ -76,11 +64,6 @@ def test_an_empty_or_cut_off_scan_names_file_sizes_and_formats(tmp_path, format,
     ) as error:
         read_scan(path, format=format)
     assert all(other in str(error.value) for other in ("kitti", "nuscenes", "nclt", "pcd"))
-
-
-def test_a_missing_scan_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"000009\.bin: expected a scan, found none"):
-        read_scan(tmp_path / "000009.bin")
 
 
 def test_labels_lose_their_instance(tmp_path):

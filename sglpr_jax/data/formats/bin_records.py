@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sglpr_jax.data.choices import RecordFormat
-from sglpr_jax.data.formats.clouds import Records, check_points
-from sglpr_jax.data.point_times import TimeField
+from sglpr_jax.data.formats.clouds import Records, TimeField, check_points
 from sglpr_jax.data.warning import warn
 from sglpr_jax.files import naming
 

@@ -8,8 +8,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float64
 
-from sglpr_jax.data.formats.clouds import BLOCK_POINTS, Records, check_points, records_of
-from sglpr_jax.data.point_times import time_field_of
+from sglpr_jax.data.formats.clouds import BLOCK_POINTS, Records, check_points, records_of, time_field_of
 from sglpr_jax.files import in_short, naming
 
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60

@@ -18,9 +18,9 @@ from sglpr_jax.data.formats.clouds import (
     read_content,
     records_of,
     text_lines,
+    time_field_of,
     whole_number,
 )
-from sglpr_jax.data.point_times import time_field_of
 
 _NUMBERS = {(kind, str(size)): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
 _NUMBERS |= {("F", "4"): "<f4", ("F", "8"): "<f8"}

@@ -18,9 +18,9 @@ from sglpr_jax.data.formats.clouds import (
     read_content,
     records_of,
     text_lines,
+    time_field_of,
     whole_number,
 )
-from sglpr_jax.data.point_times import time_field_of
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy.typing import ArrayLike
 
-from sglpr_jax.data.formats.clouds import Records, check_points
-from sglpr_jax.data.point_times import FIELDS, TimeField, time_field_of
+from sglpr_jax.data.formats.clouds import TIME_FIELDS, Records, TimeField, check_points, time_field_of
 from sglpr_jax.data.poses import interpolate, poses_of
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
@@ -139,7 +138,7 @@ def _record(message: Any, order: str) -> np.dtype:
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"expected the fields x, y and z, found {' '.join(fields) or 'none'}")
     wanted = [name for name in ("x", "y", "z", *_LASERS) if name in fields]
-    wanted += [name for name in FIELDS if name in fields and fields[name].datatype in _TYPES]
+    wanted += [name for name in TIME_FIELDS if name in fields and fields[name].datatype in _TYPES]
     types = [_TYPES.get(fields[name].datatype) for name in wanted]
     if None in types:
         raise ValueError(f"expected numbers of types 1 to 8, found {[fields[name].datatype for name in wanted]}")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.data.pseudo_labels import with_pseudo_labels
 from sglpr_jax.data.readers import open_recording
+from sglpr_jax.data.training_recordings import with_pseudo_labels
 from sglpr_jax.files import file_name
 
 
