@@ -88,13 +88,3 @@ def test_an_archive_that_inflates_is_refused_before_it_is_read(tmp_path, monkeyp
     assert (tmp_path / "a.npz").stat().st_size < 10**4
     with pytest.raises(ValueError, match=r"a\.npz: .*expected a scan of at most 1000000 bytes, found 1200128"):
         read_points(tmp_path / "a.npz")
-
-
-def test_other_files_in_an_archive_are_no_arrays(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr("points.txt", b"1 2 3")
-    with pytest.raises(ValueError, match=r"a\.npz: .*expected one array, or one named points"):
-        read_points(tmp_path / "a.npz")
-    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
-        archive.writestr("lidar.npy", header_of((4, 3)) + CLOUD.tobytes())
-    np.testing.assert_array_equal(read_points(tmp_path / "a.npz"), CLOUD)

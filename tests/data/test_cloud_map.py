@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sglpr_jax.data.cloud_map import BEHIND_M, NEAREST_M, TILE_M, on_trail, tiled_cloud, visible_points
-from sglpr_jax.data.formats import las
 from sglpr_jax.data.formats.scan_files import cloud_blocks
 from sglpr_jax.data.readers import cloud_map, open_recording
 from sglpr_jax.data.readers.cloud_map import REACH_M
@@ -47,13 +46,6 @@ def test_low_things_on_ground_that_was_seen_are_removed(ground, thing, moved):
     found = on_trail(points)
     assert not found[: len(ground)].any()
     assert found[len(ground) :].mean() > 0.75 if moved else not found.any()
-
-
-def test_order_does_not_matter_and_an_empty_map_has_no_trail():
-    points = np.concatenate([STREET, sheet((-2, 2), (0.4, 1.5))]).astype(np.float32)
-    order = np.random.default_rng(0).permutation(len(points))
-    np.testing.assert_array_equal(on_trail(points[order]), on_trail(points)[order])
-    assert on_trail(np.zeros((0, 3), np.float32)).shape == (0,)
 
 
 SPACING_M = 0.1
@@ -200,19 +192,6 @@ def test_every_format_has_the_same_points(write, tmp_path, monkeypatch):
     blocks = list(cloud_blocks(write(tmp_path / f"map.{write.__name__[6:]}", points)))
     assert len(blocks) > 1 and max(map(len, blocks)) == 1000
     np.testing.assert_allclose(np.concatenate(blocks), points, atol=6e-4)
-
-
-def test_text_is_read_as_one_block(tmp_path):
-    path = tmp_path / "map.pcd"
-    path.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n")
-    np.testing.assert_array_equal(*cloud_blocks(path), [[1, 2, 3], [4, 5, 6]])
-
-
-def test_a_laz_file_needs_lazrs(tmp_path, monkeypatch):
-    monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
-    path = write_las(tmp_path / "map.las", street()[::50]).rename(tmp_path / "map.laz")
-    with pytest.raises(ImportError, match=r"map\.laz: \.laz files need lazrs \(pip install 'sglpr-jax\[las\]'\)"):
-        next(las.las_blocks(path))
 
 
 def test_a_tiled_cloud_has_one_point_per_voxel_near_the_trajectory(tmp_path):

@@ -93,14 +93,6 @@ def test_helipr(helipr_root, sensor):
     assert recording.found[0] == f"format: HeLiPR's {sensor} ({PACKED[sensor][1]} bytes a point)"
 
 
-def test_helipr_through_a_link(helipr_root, tmp_path):
-    (tmp_path / "links").mkdir()
-    (tmp_path / "links" / "today").symlink_to(helipr_root / "Roundabout01")
-    assert "today-Ouster" in recording_names(tmp_path / "links")
-    recording = open_recording(tmp_path / "links", "today-Ouster", sensor_height=1.8)
-    np.testing.assert_array_equal(recording.points(0), POINTS)
-
-
 def test_helipr_aeva_had_no_intensity_at_first(tmp_path):
     path = tmp_path / f"{helipr.AEVA_CHANGED}.bin"
     path.write_bytes(helipr_scan("Aeva", "fffffiB"))

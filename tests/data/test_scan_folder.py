@@ -37,22 +37,6 @@ def test_scans_without_poses(tmp_path):
     np.testing.assert_array_equal(sequence.points(0), np.ones((3, 3)))  # a.bin was written second
 
 
-def test_poses_beside_the_scans(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
-    write_poses(folder / "poses.txt", [[1, 2, 3], [4, 5, 6]])
-    sequence = open_recording(folder)
-    assert sequence.pose_source == "poses.txt"
-    np.testing.assert_array_equal(sequence.positions, [[1, 2, 3], [4, 5, 6]])
-
-
-def test_each_scan_needs_a_pose(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
-    write_poses(folder / "poses.txt", np.zeros((3, 3)))
-    message = r"poses\.txt: expected 2 poses, one for each scan of scans, found 3, and the file has no times"
-    with pytest.raises(ValueError, match=message):
-        open_recording(folder)
-
-
 def test_a_folder_without_scans_is_refused(tmp_path):
     assert recording_names(tmp_path) == ()
     assert recording_names(tmp_path / "none") == ()
@@ -163,17 +147,6 @@ def test_what_is_left_aside_is_said(tmp_path):
 def test_two_files_of_one_scan_are_refused(tmp_path):
     folder = write_scans(tmp_path / "scans", "0.bin", "1.bin", "1.pcd")
     with pytest.raises(ValueError, match=r"scans: expected one file for each scan, found 1\.bin and 1\.pcd"):
-        open_recording(folder)
-
-
-def test_times_beside_the_scans(tmp_path):
-    folder = write_scans(tmp_path / "scans", "0.bin", "1.bin", "2.bin")
-    (folder / "times.txt").write_text("0\n0.1\n0.2\n")
-    recording = open_recording(folder)
-    np.testing.assert_array_equal(recording.times, [0, 0.1, 0.2])
-    assert "times: over 0.2 s; poses: none" in recording.description
-    (folder / "times.txt").write_text("0\n0.1\n")
-    with pytest.raises(ValueError, match=r"times\.txt: expected 3 rows, one per scan, found 2"):
         open_recording(folder)
 
 
