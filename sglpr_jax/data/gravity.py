@@ -18,6 +18,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import scan_stream
 from sglpr_jax.data.warning import warn
 from sglpr_jax.fields import check_value, require
+from sglpr_jax.se3 import travelled
 
 SCANS = 11
 """Number of scans for estimating the mounting, spread over the recording."""
@@ -262,7 +263,7 @@ def with_odometry(recording: Recording, world_from_lidar: Float[np.ndarray, "n 4
     turn = world_from_lidar[:, :3, :3]
     up = np.einsum("nij,nj->ni", turn, np.array([one.up for one in recording.mountings]))
     weight = np.array([1 / (one.tilt_deviation_deg or GROUND_TILT_DEG) ** 2 for one in recording.mountings])
-    mean = _averaged(up, weight, world_from_lidar[:, :3, 3])
+    mean = _averaged(up, weight, travelled(world_from_lidar))
     left = np.quantile(_angles_deg(up, mean), 0.9)
     whole = np.quantile(_angles_deg(np.array([one.up for one in recording.mountings]), None), 0.9)
     if left > EXPLAINED * whole:
@@ -302,13 +303,12 @@ def _beside(mean: Mounting, apart: Float[np.ndarray, "3"], deviation_m: float, d
 
 
 def _averaged(
-    values: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"], positions: Float[np.ndarray, "n 3"]
+    values: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"], way_m: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Weighted Gaussian average of directions along a path."""
     from scipy.ndimage import gaussian_filter1d  # imported here because the import is slow
 
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    metre = np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    metre = way_m.astype(np.int64)
     sums = np.zeros((metre[-1] + 1, 3))
     np.add.at(sums, metre, values * weight[:, None])
     mean = gaussian_filter1d(sums, AVERAGED_M, axis=0, mode="constant")[metre]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Recording
+from sglpr_jax.data.times import usual_step
 from sglpr_jax.se3 import are_rotations
 
 WIDEST_S = (1.0, 2.0)
@@ -78,9 +79,7 @@ def widest_gap_s(stamps: Float[np.ndarray, " n"]) -> float:
 
     It is 1.5 s for poses at 1 Hz, to allow for jitter, and from 1 s to 2 s for other rates.
     """
-    steps = np.diff(stamps)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    return float(np.clip(JITTER * usual, *WIDEST_S))
+    return float(np.clip(JITTER * usual_step(stamps), *WIDEST_S))
 
 
 def interpolate(

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Num
 
 from sglpr_jax.data.choices import TimeUnit
 from sglpr_jax.data.warning import warn
@@ -70,7 +70,7 @@ def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
         return ""
     if counts_rows(times):
         return f"row numbers ({times[0]:g}, {times[1]:g}, {times[2]:g}, ...)"
-    usual = _usual_step(times)
+    usual = usual_step(times)
     if usual > SLOWEST_S:
         unit = next((unit for unit in NAMES if usual <= SLOWEST_S * PER_SECOND[unit]), "ns")
         return f"steps of {usual:g}, which fit {NAMES[unit]}"
@@ -79,7 +79,7 @@ def doubt(times: Float[np.ndarray, " n"], *, numbers: bool = True) -> str:
     return ""
 
 
-def _usual_step(times: Float[np.ndarray, " n"]) -> float:
+def usual_step(times: Float[np.ndarray, " n"]) -> float:
     """Median of the positive steps between consecutive times, or 0."""
     steps = np.diff(times)
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
@@ -105,7 +105,7 @@ def unit_change(times: Float[np.ndarray, " n"]) -> UnitChange | None:
     row = int(np.argmax(times[1:] / before)) + 1
     if any(np.count_nonzero(np.diff(part) > 0) < 2 for part in (times[:row], times[row:])):
         return None
-    grown = np.array([times[row] / before[row - 1], _usual_step(times[row:]) / _usual_step(times[:row])])
+    grown = np.array([times[row] / before[row - 1], usual_step(times[row:]) / usual_step(times[:row])])
     for factor in FACTORS:
         if (grown > factor / SAME_FACTOR).all() and (grown < factor * SAME_FACTOR).all():
             found = f"{times[row]:g} after {times[row - 1]:g}, and steps about {factor:g} times as large"
@@ -150,3 +150,10 @@ def check_jumps(times: Float[np.ndarray, " n"], *, source: str) -> None:
             f"{source}: expected one drive, found {steps[row] / 3600:.3g} h between scans {row} and {row + 1} "
             f"({far.size} jumps); scans before and after a jump count as separate visits of a place"
         )
+
+
+def nearest_rows(stamps: Num[np.ndarray, " n"], times: Num[np.ndarray, " q"]) -> Int[np.ndarray, " q"]:
+    """Return the row of the nearest of the ordered `stamps` for each of `times`. Ties go to the earlier one."""
+    later = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
+    earlier = (later - 1).clip(0)
+    return np.where(np.abs(times - stamps[earlier]) <= np.abs(stamps[later] - times), earlier, later)

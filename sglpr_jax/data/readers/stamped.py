@@ -11,7 +11,7 @@ from jaxtyping import Float, Int64
 from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.listing import scans_in
 from sglpr_jax.data.recording import Record, Recording, found_record
-from sglpr_jax.data.times import check_unit
+from sglpr_jax.data.times import check_unit, nearest_rows
 
 MAX_GAP_S = 0.1
 """Maximum time between a scan and its pose, in seconds: the duration of one sweep."""
@@ -68,7 +68,7 @@ def stamped_recording(
     order = np.argsort(stamps, kind="stable")
     check_unit(stamps[order] * tick_s, source=pose_file)
     check_unit(times * tick_s, source=folder)
-    nearest = order[_nearest_rows(stamps[order], times)]
+    nearest = order[nearest_rows(stamps[order], times)]
     gaps_s = np.abs(stamps[nearest] - times) * tick_s
     rows = np.flatnonzero(gaps_s <= max_gap_s)
     if not len(rows):
@@ -89,13 +89,6 @@ def stamped_recording(
         rows=rows,
         **fields,
     )
-
-
-def _nearest_rows(stamps: Int64[np.ndarray, " n"], times: Int64[np.ndarray, " q"]) -> np.ndarray:
-    """Row of the nearest of the ordered `stamps` for each of `times`. Ties go to the earlier one."""
-    later = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
-    earlier = (later - 1).clip(0)
-    return np.where(np.abs(times - stamps[earlier]) <= np.abs(stamps[later] - times), earlier, later)
 
 
 def _read(path: Path, labels: Path | None, lasers: bool, *, read_points: Callable[[Path], Records]) -> Record:
