@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.times import usual_step
-from sglpr_jax.se3 import are_rotations
+from sglpr_jax.se3 import are_rotations, quaternions
 
 WIDEST_S = (1.0, 2.0)
 """Maximum time between two poses for interpolation, in seconds: the least and the greatest value (`widest_gap_s`)."""
@@ -97,15 +97,18 @@ def interpolate(
 
 
 def interpolate_turns(
-    stamps: Float[np.ndarray, " n"], quaternions: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
+    stamps: Float[np.ndarray, " n"], turns: Float[np.ndarray, "n 4"], times: Float[np.ndarray, " q"]
 ) -> Float[np.ndarray, "q 3 3"]:
-    """Interpolate rotations at `times` with constant angular velocity. At least two `stamps` are required."""
+    """Interpolate rotations (quaternions x, y, z, w) at `times` with constant angular velocity.
+
+    At least two `stamps` are required.
+    """
     from scipy.spatial.transform import Rotation  # imported here because the import is slow
 
     order = np.argsort(stamps, kind="stable")
-    stamps, quaternions = stamps[order], quaternions[order]
+    stamps, turns = stamps[order], turns[order]
     later = np.searchsorted(stamps, times).clip(1, len(stamps) - 1)
-    before, after = Rotation.from_quat(quaternions[later - 1]), Rotation.from_quat(quaternions[later])
+    before, after = Rotation.from_quat(turns[later - 1]), Rotation.from_quat(turns[later])
     widths = stamps[later] - stamps[later - 1]
     shares = ((times - stamps[later - 1]) / np.where(widths > 0, widths, 1)).clip(0, 1)
     turned = before * Rotation.from_rotvec(shares[:, None] * (before.inv() * after).as_rotvec())
@@ -169,7 +172,8 @@ def poses_at_scans(
     missing = len(kept) - int(kept.sum())
     left_out = f"; {missing} of {len(kept)} scans left out, which have no pose" if missing else ""
     said = f"interpolated at the times of the scans{left_out}"
-    return ScanPoses(kept, poses_of(positions, _turned(poses, stamps, times))[kept], said)
+    rotations = interpolate_turns(stamps, quaternions(poses), times)
+    return ScanPoses(kept, poses_of(positions, rotations)[kept], said)
 
 
 def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray, " n"] | None) -> str | None:
@@ -183,11 +187,3 @@ def _row_by_row(stamps: Float[np.ndarray, " n"] | None, times: Float[np.ndarray,
     if elsewhere and np.ptp(behind) <= SAME_S:
         return f"row by row: the scans have the same intervals and start {behind.mean():.1f} s later"
     return None
-
-
-def _turned(
-    poses: Float[np.ndarray, "m 4 4"], stamps: Float[np.ndarray, " m"], times: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n 3 3"]:
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
-
-    return interpolate_turns(stamps, Rotation.from_matrix(poses[:, :3, :3]).as_quat(), times)

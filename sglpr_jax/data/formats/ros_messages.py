@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Int, Int64, UInt8
 from numpy.typing import ArrayLike
 
 from sglpr_jax.data.formats.clouds import TIME_FIELDS, Records, TimeField, check_points, time_field_of
-from sglpr_jax.data.poses import interpolate, poses_of
+from sglpr_jax.data.poses import interpolate
 from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
+from sglpr_jax.se3 import from_quaternions
 
 
 class Header(NamedTuple):
@@ -330,13 +331,10 @@ def times_on_one_clock(stamps: Stamps, scans: Stamps) -> tuple[Float[np.ndarray,
 
 def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np.ndarray, "4 4"] | None:
     """Return the transform frame_from_other along static tracks, or None if no static tracks connect the two frames."""
-    from scipy.spatial.transform import Rotation  # imported here because the import is slow
-
     steps: dict[str, list[tuple[str, np.ndarray]]] = defaultdict(list)
     for track in tracks:
         if len(track) and not track.moves and abs(np.linalg.norm(track.quaternions[0]) - 1) <= UNIT:
-            turned = Rotation.from_quat(track.quaternions[:1]).as_matrix()
-            frame_from_child = poses_of(track.positions[:1], turned)[0]
+            frame_from_child = from_quaternions(track.positions[:1], track.quaternions[:1])[0]
             steps[track.frame].append((track.child, frame_from_child))
             steps[track.child].append((track.frame, np.linalg.inv(frame_from_child)))
     reached, queue = {frame: np.eye(4)}, [frame]
