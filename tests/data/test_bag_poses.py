@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.poses import interpolate, interpolate_turns
 from sglpr_jax.data.readers import open_recording, recording_names
-from sglpr_jax.data.warning import DataWarning
 
 CLOUD, ODOMETRY, POSE = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 LATE_S = 1000.0
@@ -137,16 +136,6 @@ def test_the_topic_with_most_scans_is_taken_and_a_goal_is_none(tmp_path):
     assert "poses not used: /goal (poses for 0% of the scans)" in recording.found
 
 
-def test_where_clocks_of_sensors_do_not_meet_the_recorders_is_taken(tmp_path):
-    times = np.arange(5.0, 6.0, 0.1)
-    strange = [
-        (topic, name, t, pose("ros2", 77 + i, (t - LATE_S, 0.0, 0.0)))
-        for i, (topic, name, t, _) in enumerate(poses("ros2", "/odom", times))
-    ]
-    recording = opened(tmp_path, "ros2", scans("ros2", times) + strange)
-    np.testing.assert_allclose(recording.positions[:, 0], times, atol=1e-6)
-
-
 QUARTER = Rotation.from_euler("xyz", [3.0, 1.0, 90.0], degrees=True).as_quat()
 BASE_FROM_LIDAR = np.eye(4)
 BASE_FROM_LIDAR[:3, :3], BASE_FROM_LIDAR[:3, 3] = Rotation.from_quat(QUARTER).as_matrix(), (1.0, 0.2, 1.5)
@@ -187,14 +176,6 @@ def test_rotations_that_nobody_measured_are_none(tmp_path, quaternion):
     recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
     assert recording.world_from_lidar is None and len(recording.positions) == len(times)
     assert recording.pose_source.endswith("interpolated; its rotations are constant or missing)")
-
-
-def test_one_message_without_rotation_is_dropped_and_the_others_turn(tmp_path):
-    times = np.arange(5.0, 11.0, 0.1)
-    track = poses("ros2", "/odom", times, turns=lambda t: turned(t) if t != times[7] else (0.0, 0.0, 0.0, 0.0))
-    with pytest.warns(DataWarning, match=r"expected valid poses on /odom, found 1 of 60 without finite position or"):
-        recording = opened(tmp_path, "ros2", scans("ros2", times) + track)
-    np.testing.assert_allclose(recording.world_from_lidar, expected_poses(times, np.eye(4)), atol=1e-5)
 
 
 def test_bags_of_two_days_are_two_recordings(tmp_path):

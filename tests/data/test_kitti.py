@@ -39,13 +39,6 @@ def test_the_pose_file_is_chosen_and_named(kitti_root, poses, source, height):
     assert sequence.positions[0, 2] == height
 
 
-def test_poses_of_kitti_are_taken_where_there_are_no_others(kitti_root):
-    (kitti_root / "sequences/08/poses.txt").unlink()
-    assert open_recording(kitti_root, "08").pose_source == "poses/08.txt"
-    with pytest.raises(FileNotFoundError, match=r"expected poses in sequences/08/poses\.txt, found none"):
-        open_recording(kitti_root, "08", pose_source="semantickitti")
-
-
 def test_a_sequence_without_poses_opens_and_those_that_were_asked_for_are_named(kitti_root):
     (kitti_root / "sequences/08/poses.txt").unlink()
     (kitti_root / "poses/08.txt").unlink()
@@ -63,11 +56,6 @@ def test_too_few_rows_name_the_frame(kitti_root, file, what):
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     with pytest.raises(ValueError, match=rf"{what}\.txt: expected at least 4 rows \(frame 3\), found 3"):
         open_recording(kitti_root, "08")
-
-
-def test_times_are_optional(kitti_root):
-    (kitti_root / "sequences/08/times.txt").unlink()
-    assert open_recording(kitti_root, "08").times is None
 
 
 def test_simulated_drives_know_how_high_their_sensor_stood(kitti_root):

@@ -91,15 +91,6 @@ def test_a_broken_ground_truth_is_named(root, text, words):
         open_recording(root, DATE)
 
 
-def test_missing_files_are_named_with_the_places_looked_at(root):
-    truth = root / DATE / f"groundtruth_{DATE}.csv"
-    truth.unlink()
-    with pytest.raises(FileNotFoundError, match=rf"groundtruth_{DATE}.csv or {DATE}/.* or ground_truth/.*found none"):
-        open_recording(root, DATE)
-    with pytest.raises(FileNotFoundError, match=f"expected sequence '2012-02-04', found {DATE}"):
-        open_recording(root, "2012-02-04")
-
-
 def test_a_scan_cut_short_or_of_another_name_is_refused(root):
     path = root / DATE / "velodyne_sync" / f"{FIRST}.bin"
     path.write_bytes(path.read_bytes()[:-3])

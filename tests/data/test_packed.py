@@ -1,6 +1,5 @@
 """A packed recording equals that of the files, to the bit; a pack is whole or not there, and follows its source."""
 
-import dataclasses
 import json
 import os
 import shutil
@@ -10,7 +9,6 @@ import pytest
 from PIL import Image
 
 from sglpr_jax.data import packed as packing
-from sglpr_jax.data.corruption import CORRUPTIONS, corrupted
 from sglpr_jax.data.packed import packed
 from sglpr_jax.data.readers import open_recording
 from sglpr_jax.data.recording import Recording
@@ -57,13 +55,6 @@ def test_points_and_labels_are_those_of_the_files(recording, tmp_path):
 def test_real_scans_are_those_of_the_files(shared, tmp_path):
     recording = open_recording(shared / "data/kitti_odometry", "08")
     require_same_scans(packed(recording, tmp_path), recording)
-
-
-def test_a_drive_without_labels_has_none(recording, tmp_path):
-    plain = dataclasses.replace(recording, label_paths=(None,) * 3)
-    found = packed(plain, tmp_path / "cache")
-    assert not found.has_labels and found.labels(0) is None
-    assert not list((tmp_path / "cache").rglob("labels.bin"))
 
 
 def test_a_scan_whose_bytes_have_changed_is_refused_and_the_others_are_not(recording, tmp_path):
@@ -141,12 +132,3 @@ def test_a_damaged_pack_is_refused(recording, tmp_path, file):
     path.write_bytes(path.read_bytes()[:-5])
     with pytest.raises(ValueError, match=r"cache/08-.*: expected a packed recording, found a damaged one"):
         packed(recording, tmp_path / "cache")
-
-
-def test_only_drives_as_they_lie_on_disk_are_packed(recording, tmp_path):
-    with pytest.raises(
-        ValueError, match="sequence 08: expected a recording that is read from its files, found a packed"
-    ):
-        packed(corrupted(recording, CORRUPTIONS[-1], seed=0), tmp_path)
-    with pytest.raises(ValueError, match="found a packed, corrupted or simulated one"):
-        packed(packed(recording, tmp_path), tmp_path)

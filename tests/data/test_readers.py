@@ -1,7 +1,5 @@
 """A reader is a file of its own: whatever defines READER is found, in the order of its rank."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -92,14 +90,6 @@ def test_an_unknown_layout_says_what_was_expected(tmp_path):
         FileNotFoundError, match=r"none: expected the folder of a recording, or a bag, found no such folder$"
     ):
         open_recording(tmp_path / "none", "08")
-
-
-def test_a_single_file_is_no_recording(tmp_path):
-    np.zeros((2, 4), dtype="<f4").tofile(tmp_path / "000000.bin")
-    with pytest.raises(FileNotFoundError, match=r"000000\.bin: expected the folder .*, found a single file;"):
-        open_recording(tmp_path / "000000.bin")
-    with pytest.raises(FileNotFoundError, match=r"found a single file$"):
-        recording_names(Path(__file__))
 
 
 @pytest.mark.parametrize("name", ["pose_source", "format"])

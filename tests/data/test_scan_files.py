@@ -96,10 +96,3 @@ def test_real_samples(shared):
     # Forward is forward: the roof that carries the sensor is longer than it is wide.
     roof = nuscenes[np.linalg.norm(nuscenes, axis=1) < 1.5]
     assert np.ptp(roof[:, 0]) > 1.5 * np.ptp(roof[:, 1])
-
-
-def test_a_format_that_there_is_not_is_told_with_those_that_there_are(as_installed, tmp_path):
-    path = tmp_path / "000000.bin"
-    np.zeros((2, 4), dtype="<f4").tofile(path)
-    with pytest.raises(ValueError, match=r"000000\.bin, format: expected one of 'auto', 'pcd', .*, found 'kiti'$"):
-        read_scan(path, format="kiti")

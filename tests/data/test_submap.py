@@ -104,15 +104,6 @@ def test_labels_stay_with_their_points(tmp_path):
     assert submaps(recording, poses).record(2).labels is None
 
 
-def test_recordings_with_other_submaps_are_other_recordings():
-    poses = np.array([pose(2.0 * i) for i in range(3)])
-    recording, _ = drive(poses)
-    further = poses + 0.1 * np.eye(4, k=3)
-    kinds = [submaps(recording, poses), submaps(recording, poses, length_m=5.0), submaps(recording, further)]
-    assert len({one.read_options["submaps"] for one in kinds}) == 3
-    assert "submaps: the scans of the last 10 m, 1 m apart" in kinds[0].found[-1]
-
-
 @pytest.mark.parametrize(
     ("poses", "options", "message"),
     [

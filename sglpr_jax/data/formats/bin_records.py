@@ -66,8 +66,10 @@ def find_record(paths: Sequence[Path]) -> tuple[RecordFormat | None, str]:
     if sum(path.stat().st_size for path in chosen) < FEWEST * record_type("kitti").itemsize:
         return None, "too few points to detect it"
     misfits: dict[RecordFormat, str] = {name: _misfit(chosen, name) for name in CANDIDATES}
-    fits = [name for name in CANDIDATES if not misfits[name]]
-    simplest = [name for name in fits if not any(_repeats(name, other) for other in fits if other != name)]
+    fits: list[RecordFormat] = [name for name in CANDIDATES if not misfits[name]]
+    simplest: list[RecordFormat] = [
+        name for name in fits if not any(_repeats(name, other) for other in fits if other != name)
+    ]
     if len(simplest) == 1:
         return simplest[0], f"found from {len(chosen)} of {len(paths)} scans"
     tried = "; ".join(f"{described(name)}: {misfits[name] or 'fits'}" for name in CANDIDATES)
