@@ -1,4 +1,4 @@
-"""Assigns the points of a scan to rings, one ring per laser of the sensor."""
+"""Corruptions of scans for robustness tests: occlusion, fewer beams, noise, dropout and a moved sensor."""
 
 import dataclasses
 import difflib

@@ -46,7 +46,6 @@ def test_a_record_opens_each_of_its_files_once(recording, opened):
     record = recording.record(0)
     assert record.labels is not None and opened == {"000000.bin": 1, "000000.label": 1}
     assert (record.name, record.time) == ("scan 000000 of sequence 08", 0.0)
-    np.testing.assert_array_equal(record.position, recording.positions[0])
 
 
 def test_a_corrupted_record_opens_each_of_its_files_once(recording, opened):

@@ -55,7 +55,7 @@ def open_recording(
     """Open one sequence of `root`, in any supported layout.
 
     Arguments:
-      root: Folder of a dataset or of scans, a bag, or a point cloud map with `se3`.
+      root: Folder of a dataset or of scans, a bag, or a point cloud map with `poses`.
       name: Name of the sequence. It may be omitted if `root` has only one sequence.
       pose_source: Choice between the two pose files of KITTI's layout. Other layouts ignore it.
       format: Format of the scan files, for a plain folder and for KITTI's layout. "auto" detects it.
@@ -72,7 +72,7 @@ def open_recording(
 
     Raises:
       FileNotFoundError: If the sequence or one of its files is missing.
-      ValueError: If a file is malformed, if times decrease, or if `se3`, `times` or a topic does not apply to the
+      ValueError: If a file is malformed, if times decrease, or if `poses`, `times` or a topic does not apply to the
         layout.
       ImportError: If `root` is a bag and the extra `ros` is not installed.
 

@@ -1,7 +1,7 @@
 """Reader of ready-made BEV images in BEVPlace's layout.
 
 - `00/imgs/000000.png`: 8-bit density image. The file name is the number of the frame. Frames may be missing.
-- `00/labels/000000.png`: label image (`label_images.py`), optional for each frame.
+- `00/labels/000000.png`: label image (`read_label_image`), optional for each frame.
 - `00/pose.txt`: poses of the LiDAR, 12 numbers a line, one line per frame (optional).
 """
 

@@ -4,7 +4,7 @@
 - `sequences/08/labels/000000.label`: SemanticKITTI's labels, optional for each frame.
 - `sequences/08/times.txt`: timestamps in seconds, one line per frame (optional).
 - `sequences/08/poses.txt`: SemanticKITTI's poses. Their loops are also closed in height.
-- `se3/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
+- `poses/08.txt`: KITTI's ground truth. Its height drifts. The test sequences 11 to 21 have no poses.
 
 Both pose files contain poses of the left camera. Positions are computed without `calib.txt`.
 """

@@ -1,4 +1,4 @@
-"""Gravity of the scans of a bag by the IMU beside the LiDAR."""
+"""Reader of bags of ROS 1 and ROS 2: point clouds of a topic, with poses and the gravity by an IMU if there are any."""
 
 import dataclasses
 import itertools

@@ -1,7 +1,7 @@
-"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_poses.py`).
+"""Reader of a plain folder of scans, one file each. Poses and timestamps are optional (`folder_trajectory`).
 
 - `my_scans/full0.bin`, `full1.bin`, ..., `full10.bin`: scans in the order of their numbers. Hidden files are ignored.
-- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `se3.tum` and `se3.csv` work, too.
+- `my_scans/poses.txt`: 12 numbers a line (LiDAR frame, z up) or 8 (TUM). `poses.tum` and `poses.csv` work, too.
 - `my_scans/times.txt`: timestamps, one number a line, in seconds unless `time_unit` names another unit.
 """
 
