@@ -19,6 +19,18 @@ CAMERA_FROM_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 
 """Transform from LiDAR axes (x forward, y left, z up) to camera axes (x right, y down, z forward), same origin."""
 FARTHEST_M = 1e8
 """Maximum absolute coordinate of a position, in metres."""
+MOST_HEIGHT_M = 100.0
+"""Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
+JUMP_M = 10.0
+JUMP_STEPS = 8.0
+"""A step between two scans is a jump if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step."""
+TIME_COLUMNS = ("t", "time", "timestamp")
+"""Names of the csv column with the times in seconds."""
+TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
+"""Names with a unit, used if none of `TIME_COLUMNS` exists."""
+KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
+POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
+TIMES_FILE = "times.txt"
 
 
 def read_poses(path: Path) -> Float[np.ndarray, "n 3 4"]:
@@ -171,13 +183,6 @@ def numbers_of(words: Sequence[str], *, columns: int, where: str) -> Float[np.nd
     return values
 
 
-MOST_HEIGHT_M = 100.0
-"""Maximum range of heights in metres. A larger range is accepted if both horizontal ranges exceed it."""
-JUMP_M = 10.0
-JUMP_STEPS = 8.0
-"""A step between two scans is a jump if it exceeds `JUMP_M` metres and `JUMP_STEPS` times the median step."""
-
-
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Positions and times of the frames of a sequence."""
@@ -197,13 +202,6 @@ class Trajectory:
     def poses(self) -> Float[np.ndarray, "n 4 4"]:
         """Poses of the frames, with identity rotations if the rotations are unknown."""
         return poses_of(self.positions, self.rotations)
-
-
-TIME_COLUMNS = ("t", "time", "timestamp")
-"""Names of the csv column with the times in seconds."""
-TIME_COLUMNS_S = ("t_s", "time_s", "timestamp_s", "seconds")
-"""Names with a unit, used if none of `TIME_COLUMNS` exists."""
-KNOWN_CLOCKS = (*TIME_COLUMNS, *TIME_COLUMNS_S)
 
 
 def read_trajectory(
@@ -330,10 +328,6 @@ def _header(path: Path) -> tuple[list[str], str | None]:
     if unused:
         warn(f"{path}: expected seconds in one of {', '.join(KNOWN_CLOCKS)}, found {', '.join(unused)}, not used")
     return names, clocks[0] if clocks else None
-
-
-POSE_FILES = ("poses.txt", "poses.csv", "poses.tum")
-TIMES_FILE = "times.txt"
 
 
 def folder_trajectory(

@@ -19,6 +19,29 @@ from sglpr_jax.data.times import doubt
 from sglpr_jax.data.warning import warn
 from sglpr_jax.se3 import from_quaternions
 
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_LEAST_M, _MOST_M = 1e-3, 1e4
+"""Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
+_LASERS = ("ring", "channel", "line", "laser_id", "laser")
+"""Field names that drivers use for the laser number of a point."""
+CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+POINT = {
+    "offset_time": "u4",
+    "x": "f4",
+    "y": "f4",
+    "z": "f4",
+    "reflectivity": "u1",
+    "tag": "u1",
+    "line": "u1",
+}
+"""Fields of a point, and their numpy types."""
+LEAST_SHARE = 0.5
+"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
+UNIT = 0.01
+"""Maximum deviation of the length of a quaternion from 1."""
+IMU = "sensor_msgs/msg/Imu"
+"""Message type of an IMU."""
+
 
 class Header(NamedTuple):
     """std_msgs/Header."""
@@ -73,13 +96,6 @@ class RosMessage:
         found = np.frombuffer(self._raw, kind, count, self._at) if count else np.zeros(0, kind)
         self._at = end
         return found
-
-
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_LEAST_M, _MOST_M = 1e-3, 1e4
-"""Range of most nonzero coordinates, in metres. Numbers in the other byte order are spread over 10**-38 to 10**38."""
-_LASERS = ("ring", "channel", "line", "laser_id", "laser")
-"""Field names that drivers use for the laser number of a point."""
 
 
 def read_point_cloud2(message: Any, *, name: str = "cloud") -> Records:
@@ -156,19 +172,6 @@ def _record(message: Any, order: str) -> np.dtype:
         raise ValueError(f"expected fields within {message.point_step} bytes, found others ({error})") from error
 
 
-CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-POINT = {
-    "offset_time": "u4",
-    "x": "f4",
-    "y": "f4",
-    "z": "f4",
-    "reflectivity": "u1",
-    "tag": "u1",
-    "line": "u1",
-}
-"""Fields of a point, and their numpy types."""
-
-
 def read_custom_msg(message: RosMessage) -> Records:
     """Return the points (n, 3) in the axes of the message, their line numbers and their times.
 
@@ -222,12 +225,6 @@ POSES: dict[str, Callable[[RosMessage], StampedPose]] = {
 """Message types with poses of the vehicle, and their readers."""
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 """Message types of tf."""
-
-
-LEAST_SHARE = 0.5
-"""Minimum fraction of scans with a pose on a topic. Topics with fewer, such as a navigation goal, are not used."""
-UNIT = 0.01
-"""Maximum deviation of the length of a quaternion from 1."""
 
 
 class Stamps(NamedTuple):
@@ -344,10 +341,6 @@ def fixed_transform(tracks: Iterable[Track], frame: str, other: str) -> Float[np
                 reached[there] = reached[here] @ here_from_there
                 queue.append(there)
     return reached.get(other)
-
-
-IMU = "sensor_msgs/msg/Imu"
-"""Message type of an IMU."""
 
 
 class ImuMessages(NamedTuple):
