@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sglpr_jax.data.formats.scan_files import guess_format, read_labels, read_scan, read_scan_records, scan_id
+from sglpr_jax.data.formats.scan_files import named_format, read_labels, read_scan, read_scan_records, scan_id
 
 
 def test_kitti_keeps_its_axes(tmp_path):
@@ -39,16 +39,16 @@ def test_nclt_is_decoded_in_double_precision_and_turned_not_mirrored(tmp_path):
 @pytest.mark.parametrize(
     "name, format, stem",
     [
-        ("velodyne/000052.bin", "kitti", "000052"),
+        ("velodyne/000052.bin", None, "000052"),
         ("sweeps/a__LIDAR_TOP__1.pcd.bin", "nuscenes", "a__LIDAR_TOP__1"),
         ("velodyne_sync/1326652795280148.bin", "nclt", "1326652795280148"),
         ("clouds/16_beams.pcd", "pcd", "16_beams"),
         ("clouds/16_BEAMS.PCD", "pcd", "16_BEAMS"),
-        ("clouds/1.25.bin", "kitti", "1.25"),
+        ("clouds/1.25.bin", None, "1.25"),
     ],
 )
 def test_format_and_id_come_from_the_name(name, format, stem):
-    assert guess_format(Path(name)) == format
+    assert named_format(Path(name)) == format
     assert scan_id(Path(name)) == stem
 
 

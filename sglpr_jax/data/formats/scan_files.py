@@ -42,30 +42,25 @@ def scan_id(path: Path) -> str:
     return Path(name).stem if Path(name).suffix.lower()[1:] in READERS else name
 
 
-def guess_format(path: Path, *, records: RecordFormat = "kitti") -> ScanFormat:
-    """Return the format of a scan by its ending. `*.pcd.bin` is nuscenes, and a file in `velodyne_sync` is nclt.
+def named_format(path: Path) -> ScanFormat | None:
+    """Return the format that the name of a scan file defines, or None: that of most .bin files is in their content.
 
-    The name of any other .bin file does not define a format. Such a file has the format `records`.
+    `*.pcd.bin` is nuscenes, and a file in a folder `velodyne_sync` is nclt.
     """
     for format in READERS:
         if path.suffix.lower() == f".{format}":
             return format
     if path.name.lower().endswith(".pcd.bin"):
         return "nuscenes"
-    return "nclt" if path.parent.name == "velodyne_sync" else records
-
-
-def says_its_format(path: Path) -> bool:
-    """Whether the name of a scan file defines its format."""
-    return guess_format(path) != "kitti"
+    return "nclt" if path.parent.name == "velodyne_sync" else None
 
 
 def found_format(path: Path) -> ScanFormat:
-    """Return the format of one scan by its name or, for a .bin whose name does not define it, by its content.
+    """Return the format of one scan by its name or its content.
 
     Raises ValueError if the content fits no format, as for a folder of scans.
     """
-    return guess_format(path) if says_its_format(path) else record_of_scan(path)
+    return named_format(path) or record_of_scan(path)
 
 
 def read_scan(path: Path | str, *, format: ScanFormat = "auto") -> Float32[np.ndarray, "n 3"]:
@@ -110,7 +105,7 @@ def read_scan_records(path: Path, *, format: ScanFormat = "auto", records: Recor
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a scan, found none")
     check_value(format, ScanFormat, f"{path}, format")
-    known = guess_format(path, records=records) if format == "auto" else format
+    known = (named_format(path) or records) if format == "auto" else format
     if is_record(known):
         return read_records(path, known)
     return READERS[known](path)

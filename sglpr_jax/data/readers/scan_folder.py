@@ -12,7 +12,7 @@ from pathlib import Path
 from sglpr_jax.data.choices import RecordFormat, ScanFormat
 from sglpr_jax.data.formats.bin_records import check_record, described, find_record, is_record
 from sglpr_jax.data.formats.pose_files import POSE_FILES, TIMES_FILE, check_order, folder_trajectory
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, guess_format, says_its_format, scan_id
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format, scan_id
 from sglpr_jax.data.listing import files_in, left_aside, scans_in
 from sglpr_jax.data.reader import Reader, ReadOptions
 from sglpr_jax.data.recording import Recording, scan_record
@@ -76,12 +76,12 @@ def _ids(root: Path, paths: tuple[Path, ...]) -> tuple[str, ...]:
 
 def _formats(paths: tuple[Path, ...], format: ScanFormat) -> tuple[RecordFormat, str]:
     """Record of the .bin files whose name does not define it, and a description of all formats."""
-    unsaid = [path for path in paths if not says_its_format(path)] if format == "auto" else []
+    unsaid = [path for path in paths if named_format(path) is None] if format == "auto" else []
     found, how = find_record(unsaid) if unsaid else (None, "")
     if is_record(format):
         check_record(paths, format)
     records: RecordFormat = found or "kitti"
-    counts = Counter(guess_format(path, records=records) if format == "auto" else format for path in paths)
+    counts = Counter((named_format(path) or records) if format == "auto" else format for path in paths)
     said = {name: described(name) if is_record(name) else name for name in counts}
     kinds = ", ".join(said[name] if len(counts) == 1 else f"{count} {said[name]}" for name, count in counts.items())
     return records, f"{kinds}, {how}" if unsaid else kinds

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sglpr_jax.data.choices import RecordFormat
 from sglpr_jax.data.formats.bin_records import record_of_scan
-from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, says_its_format
+from sglpr_jax.data.formats.scan_files import ARRAY_ENDINGS, ENDINGS, named_format
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.recording import scan_record
 from sglpr_jax.data.times import EPOCH
@@ -121,7 +121,7 @@ class FolderSource:
 
     def _record_of(self, path: Path) -> RecordFormat:
         """Format of .bin files whose name does not define it, by the content of the first one."""
-        if self._records is None and self._options.format == "auto" and not says_its_format(path):
+        if self._records is None and self._options.format == "auto" and named_format(path) is None:
             self._records = record_of_scan(path)
         return self._records or "kitti"
 
