@@ -3,7 +3,7 @@
 import itertools
 import threading
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import numpy as np
 from sglpr_jax.data.formats.clouds import Records
 from sglpr_jax.data.formats.ros_messages import (
     CUSTOM_MSG,
-    IMU,
     POINT,
     POSES,
     TRANSFORMS,
@@ -63,32 +62,20 @@ class RosBag:
         spans = zip(self.paths, self._reader.readers, strict=True)
         return [(path, part.start_time, part.end_time) for path, part in spans if part.message_count]
 
-    @property
-    def has_clouds(self) -> bool:
-        """Whether the bag has a point cloud topic."""
-        return any(kind in CLOUDS for kind in self.topics.values())
+    def topics_of(self, kinds: Container[str]) -> tuple[str, ...]:
+        """Return the topics with one of some message types, in order of their names."""
+        return tuple(sorted(topic for topic, kind in self.topics.items() if kind in kinds))
 
     @property
     def cloud_topics(self) -> tuple[str, ...]:
         """Point cloud topics. Raises ValueError, with a list of all topics, if the bag has no point clouds."""
-        topics = self.topics
-        clouds = tuple(sorted(topic for topic, kind in topics.items() if kind in CLOUDS))
+        clouds = self.topics_of(CLOUDS)
         if not clouds:
-            found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topics"
+            found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.topics.items())) or "no topics"
             raise ValueError(
                 f"{self.paths[0]}: expected a topic of point clouds ({' or '.join(CLOUDS)}), found {found}"
             )
         return clouds
-
-    @property
-    def pose_topics(self) -> tuple[str, ...]:
-        """Pose topics."""
-        return tuple(sorted(topic for topic, kind in self.topics.items() if kind in POSES))
-
-    @property
-    def imu_topics(self) -> tuple[str, ...]:
-        """IMU topics."""
-        return tuple(sorted(topic for topic, kind in self.topics.items() if kind == IMU))
 
     def imu(self, topic: str) -> ImuMessages:
         """Read the messages of an IMU topic, in one pass over the bag. Raises ValueError if the bag is broken."""
@@ -109,9 +96,8 @@ class RosBag:
 
     def transforms(self) -> list[Track]:
         """Read the tf transforms: the poses of each frame in its parent frame. Needs one pass for each tf topic."""
-        topics = sorted(topic for topic, kind in self.topics.items() if kind in TRANSFORMS)
         with self._lock, _broken(self.paths[0]):
-            messages = [pair for topic in topics for pair in self._messages(topic)]
+            messages = [pair for topic in self.topics_of(TRANSFORMS) for pair in self._messages(topic)]
             return tracks_of((time, pose) for time, message in messages for pose in read_transforms(message))
 
     def frame(self, topic: str, time: int) -> str:

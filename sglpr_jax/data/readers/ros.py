@@ -10,8 +10,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sglpr_jax.data.formats.pose_files import check_height, check_order
-from sglpr_jax.data.formats.ros_bag import COMPRESSED, METADATA, RosBag
-from sglpr_jax.data.formats.ros_messages import LEAST_SHARE, Stamps, Track, fixed_transform, times_on_one_clock
+from sglpr_jax.data.formats.ros_bag import CLOUDS, COMPRESSED, METADATA, RosBag
+from sglpr_jax.data.formats.ros_messages import (
+    IMU,
+    LEAST_SHARE,
+    POSES,
+    Stamps,
+    Track,
+    fixed_transform,
+    times_on_one_clock,
+)
 from sglpr_jax.data.imu import Imu
 from sglpr_jax.data.listing import files_in
 from sglpr_jax.data.poses import interpolate, interpolate_turns, poses_of
@@ -28,7 +36,7 @@ def imu_topic_of(bag: RosBag, lidar_topic: str, imu_topic: str | None) -> str | 
 
     Raises ValueError if `imu_topic` does not exist.
     """
-    topics = bag.imu_topics
+    topics = bag.topics_of((IMU,))
     if imu_topic is None:
         return max(topics, key=lambda topic: _shared(topic, lidar_topic), default=None)
     if imu_topic not in topics:
@@ -166,7 +174,7 @@ def bag_files(root: Path) -> tuple[Path, ...]:
 def _recordings(root: Path) -> dict[str, tuple[RosBag, str]]:
     """Bag and point cloud topic of each recording, by name."""
     whole = RosBag(bag_files(root))
-    drives = [bag for bag in _drives(whole) if bag.has_clouds] or [whole]
+    drives = [bag for bag in _drives(whole) if bag.topics_of(CLOUDS)] or [whole]
     lone = root.resolve().stem if root.is_file() else root.resolve().name
     found = {}
     for bag in drives:
@@ -218,7 +226,7 @@ def _with_poses(recording: Recording, bag: RosBag, scans: Stamps, topic: str | N
     `lidar` is the frame of the scans. The unused topics are listed in `found`.
     """
     transforms = bag.transforms()
-    tracks = {one: bag.track(one) for one in bag.pose_topics} | _tracks_of_lidar(transforms, lidar)
+    tracks = {one: bag.track(one) for one in bag.topics_of(POSES)} | _tracks_of_lidar(transforms, lidar)
     placed = {one: _Placed.at(scans, track) for one, track in tracks.items()}
     used = _chosen(placed, topic, bag.paths[0])
     others = [f"{one} (poses for {found.share:.0%} of the scans)" for one, found in placed.items() if one != used]
