@@ -79,20 +79,6 @@ def test_poses_of_any_format_beside_the_scans_or_named(tmp_path, name, text, tim
     assert readers.open_recording(folder, **named, times=tmp_path / "other.txt").times.tolist() == [2, 2]
 
 
-def test_poses_of_other_times_are_interpolated_or_name_the_scans_without(tmp_path):
-    folder = write_scans(tmp_path / "scans", "1.bin", "2.bin", "3.bin")
-    (folder / "poses.tum").write_text(TUM)
-    (folder / "times.txt").write_text("1.5\n2\n2.5\n")
-    np.testing.assert_array_equal(open_recording(folder).positions[:, 0], [1, 2.5, 4])
-    (folder / "times.txt").write_text("1.5\n2\n9\n")
-    message = r"poses\.tum: expected poses at the times of all 3 scans, found none for 1, the first at 9\.0 s"
-    with pytest.raises(ValueError, match=message):
-        open_recording(folder)
-    (folder / "times.txt").unlink()
-    with pytest.raises(ValueError, match=r"poses\.tum: expected 3 poses, .* found 2, and the scans have no times"):
-        open_recording(folder)
-
-
 def test_poses_that_do_not_fit_are_refused(tmp_path):
     folder = write_scans(tmp_path / "scans", "1.bin", "2.bin")
     (folder / "times.txt").write_text("7\n9\n")
