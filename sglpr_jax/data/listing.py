@@ -25,7 +25,7 @@ def files_in(folder: Path, *endings: str) -> tuple[Path, ...]:
 
 
 def scans_in(folder: Path, *endings: str, kind: str = "scans") -> tuple[Path, ...]:
-    """Return the files of a folder like `files_in`. Raises FileNotFoundError, which names `kind`, if there are none."""
+    """Return the files of a folder like `files_in`. Raises FileNotFoundError if the folder has no such file."""
     paths = files_in(folder, *endings)
     if not paths:
         expected = ", ".join(f"*{ending}" for ending in endings)

@@ -90,7 +90,7 @@ def _read(paths: tuple[Path, ...], format: ScanFormat) -> dict[str, Any]:
 
 
 def _pose_file(root: Path, name: str, choice: PoseChoice) -> str | None:
-    """Name of the chosen pose file. "auto" prefers SemanticKITTI's, and returns None if there is none."""
+    """Name of the chosen pose file. "auto" prefers SemanticKITTI's, and returns None without any file."""
     files = {"semantickitti": f"sequences/{name}/poses.txt", "kitti": f"poses/{name}.txt"}
     wanted = list(files.values()) if choice == "auto" else [files[choice]]
     found = next((file for file in wanted if (root / file).is_file()), None)
