@@ -40,7 +40,6 @@ from .loops.detector import LoopDetector as LoopDetector
 from .loops.search import find_loops as find_loops
 from .loops.search_between import find_loops_between as find_loops_between
 from .maps.place_map import PlaceMap as PlaceMap
-from .models.average import average as average
 from .models.config import MODELS as MODELS
 from .models.config import CircularConfig as CircularConfig
 from .models.config import HeadConfig as HeadConfig
@@ -69,6 +68,7 @@ from .models.sglpr import (
     segment as segment,
 )
 from .models.shipped import shipped_weights as shipped_weights
+from .models.weights import average as average
 from .models.weights import for_places as for_places
 from .models.weights_file import load as load
 from .models.weights_file import save as save
@@ -84,11 +84,11 @@ from .retrieval.fleet_index import FleetIndex as FleetIndex
 from .retrieval.index import Index as Index
 from .retrieval.nearest import Nearest as Nearest
 from .retrieval.nearest import nearest as nearest
-from .sim.carriers import CARRIERS as CARRIERS
+from .sim.dataset import simulate as simulate
+from .sim.drive import CARRIERS as CARRIERS
 from .sim.recording import simulate_recording as simulate_recording
 from .sim.repeating import simulate_repeating as simulate_repeating
 from .sim.sensor import SENSORS as SENSORS
-from .sim.simulation import simulate as simulate
 from .training.presets import preset as preset
 from .training.recipe import TrainResult as TrainResult
 from .training.recipe import train as train

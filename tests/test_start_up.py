@@ -40,7 +40,7 @@ from pathlib import Path
 from sglpr_jax.cli.datasets import open_recording
 assert len(open_recording(Path({str(tmp_path)!r}), None, sensor_height=1.7)) == 1
 """
-    assert imported_by(program, of=("scipy", "sglpr_jax.sim.simulation")) == set()
+    assert imported_by(program, of=("scipy", "sglpr_jax.sim.dataset")) == set()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -42,7 +42,7 @@ def main(
     for seed in seeds:
         for route in routes:
             for session in plan_sessions(DATES, route=route, scans=scans, seed=seed):
-                name = f"{seed}-{route}-{session.date}"
+                name = f"{seed}-{route}-{session.name}"
                 tables[name] = place_rows(sglpr_jax.embed(params, session.simulate()), name)
     right = {tuple(sorted((one, one.replace(*DATES)))) for one in tables if one.endswith(DATES[0])}
     with tempfile.TemporaryDirectory() as folder:

@@ -8,8 +8,8 @@ from pathlib import Path
 from benchmarks.gpu.kept_rows import KeptRows, Row
 from benchmarks.gpu.simulator_rates import RateConfig, lidar, measurements
 from benchmarks.speed.throughput import about
+from sglpr_jax.sim.dataset import Simulated, simulate
 from sglpr_jax.sim.layouts import LAYOUTS
-from sglpr_jax.sim.simulation import Simulated, simulate
 
 FILE = "simulate.json"
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import tyro
 
-from sglpr_jax.sim.simulation import simulate
+from sglpr_jax.sim.dataset import simulate
 
 TRAIN, TRAIN_IMAGES, HELD_OUT, TEST = "train", "train-images", "held-out", "test"
 

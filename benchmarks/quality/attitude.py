@@ -38,9 +38,10 @@ from sglpr_jax.loops.search import FoundLoops, find_loops
 from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse, yaw_of
+from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
-from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS
+from sglpr_jax.sim.styles import SCENERIES
 
 UNSEEN = np.array([3, 4, 2])
 """Roll, pitch and height in an error of 6 degrees of freedom."""
@@ -127,7 +128,11 @@ def simulated(drives: Sequence[str], sensors: Sequence[str], scans: int) -> Iter
         carrier, scenery, route, seed = name.split(":")
         for sensor in sensors:
             lidar = dataclasses.replace(SENSORS[sensor], azimuth_steps=STEPS[sensor])
-            options = {"sensor": lidar, "scenery": SCENERIES[scenery], "handheld": carrier == "hand"}
+            options = {
+                "sensor": lidar,
+                "scenery": SCENERIES[scenery],
+                "carrier": CARRIERS["handheld" if carrier == "hand" else "vehicle"],
+            }
             yield Drive(name, sensor, simulate_recording(route, scans=scans, seed=int(seed), **options))
 
 

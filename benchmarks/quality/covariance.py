@@ -31,8 +31,8 @@ from sglpr_jax.registration.bev_alignment import align
 from sglpr_jax.registration.gicp import register
 from sglpr_jax.se3 import inverse, moved_covariance
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
-from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS, Sensor
+from sglpr_jax.sim.styles import SCENERIES
 
 ALIAS_M, ALIAS_DEG = 3.0, 10.0
 """Poses farther off are another peak of the correlation."""

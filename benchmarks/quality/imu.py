@@ -23,10 +23,10 @@ from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
 from sglpr_jax.data.mounting import Mounting
 from sglpr_jax.data.recording import Record, Recording
-from sglpr_jax.sim.drive import TimedPoses
+from sglpr_jax.sim.drive import CARRIERS, TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
-from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import SENSORS
+from sglpr_jax.sim.styles import SCENERIES
 
 WALK = 0.2
 """Speed of a person as a share of that of the simulated drive."""
@@ -56,7 +56,7 @@ def main(
     for name in drives:
         scenery, route, seed = name.split(":")
         lidar = dataclasses.replace(SENSORS[sensor], azimuth_steps=STEPS[sensor])
-        options = {"sensor": lidar, "scenery": SCENERIES[scenery], "handheld": True}
+        options = {"sensor": lidar, "scenery": SCENERIES[scenery], "carrier": CARRIERS["handheld"]}
         recording = simulate_recording(route, scans=scans, seed=int(seed), **options)
         imu = measured_imu(recording.poses, np.random.default_rng(int(seed)))
         ups = imu.ups(recording.poses.times)[0]

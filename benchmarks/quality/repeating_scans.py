@@ -29,13 +29,13 @@ from sglpr_jax.data.choices import Scale
 from sglpr_jax.data.scaled import scaled
 from sglpr_jax.files import replacing
 from sglpr_jax.loops.candidates import CandidateFinder
-from sglpr_jax.sim.carriers import CARRIERS
+from sglpr_jax.sim.drive import CARRIERS
 from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording
 from sglpr_jax.sim.repeating import simulate_repeating
 from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.scenery import SCENERIES
 from sglpr_jax.sim.sensor import HDL64E, SENSORS
+from sglpr_jax.sim.styles import SCENERIES
 
 ROUTES: dict[Revisit, tuple[str, ...]] = {"none": ("01", "04"), "same": ("06", "00"), "opposite": ("08",)}
 """Routes of the towns; the seed chooses."""

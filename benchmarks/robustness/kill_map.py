@@ -23,7 +23,7 @@ import sglpr_jax
 from sglpr_jax.files import half_written, remove_half_written
 from sglpr_jax.maps.place_map import PlaceMap
 from sglpr_jax.pose_graph.files import write_tum
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
@@ -72,7 +72,7 @@ def main(kills: int = 100, scans: int = 200, seed: int = 0) -> None:
 
 def prepared(folder: Path, scans: int) -> tuple[list[str], Path]:
     """A simulated recording with poses; the command that maps it, and the map."""
-    write_dataset(folder / "town", names=("08",), scans=scans, sensor=SENSOR)
+    simulate(folder / "town", routes=("08",), scans=scans, sensor=SENSOR)
     write_poses(folder)
     out = folder / "map" / "town.safetensors"
     command = [sys.executable, "-m", "sglpr_jax.cli.map", folder / "town", "--seq", "08", "--out", out]

@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from sglpr_jax.sim.drive import plan_scan_path, poses_on
+from sglpr_jax.sim.drive import plan_path, poses_on, thinned
 from sglpr_jax.sim.sensor import SENSORS, Sensor, cast_turn, first_surface, returned_points, scan, view_of
 from sglpr_jax.sim.shapes import at_time
 from sglpr_jax.sim.world import World, build_world
@@ -54,7 +54,7 @@ class Along:
     """A drive through its town, and the sensor that makes it."""
 
     def __init__(self, seq: str, scans: int, sensor: Sensor):
-        xy, yaw, self.times = plan_scan_path(np.random.default_rng(0), seq, scans=scans)
+        xy, yaw, self.times = thinned(plan_path(np.random.default_rng(0), seq, scans=scans), scans)
         self.world: World = build_world(0, xy, self.times)
         self.poses = poses_on(self.world.ground.relief, xy, yaw, height_m=sensor.height_m)
         self.sensor, self.key = sensor, jax.random.key(0)

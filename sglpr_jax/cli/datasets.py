@@ -13,7 +13,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.scan_stream import readable
 
 if TYPE_CHECKING:
-    from sglpr_jax.sim.simulation import Simulated
+    from sglpr_jax.sim.dataset import Simulated
 
 
 def dataset_root(data: Path | None, *, write: bool = True) -> Path:
@@ -21,7 +21,7 @@ def dataset_root(data: Path | None, *, write: bool = True) -> Path:
     use. Raises FileNotFoundError if they do not exist and `write` is false."""
     if data is not None:
         return data
-    from sglpr_jax.sim.simulation import default_dataset  # imports the simulator, not needed for real data
+    from sglpr_jax.sim.dataset import default_dataset  # imports the simulator, not needed for real data
 
     root, options = default_dataset(cache_folder())
     if not write and not root.is_dir():
@@ -41,7 +41,7 @@ def dataset_root(data: Path | None, *, write: bool = True) -> Path:
 def cached_sessions() -> Path:
     """Return the folder of the simulated sessions in NCLT's layout. They are created in the user's cache on first
     use."""
-    from sglpr_jax.sim.simulation import default_sessions
+    from sglpr_jax.sim.dataset import default_sessions
 
     root, options = default_sessions(cache_folder())
     print(f"no --nclt: using the simulated sessions in {root} (for real NCLT: --nclt FOLDER)", file=sys.stderr)
@@ -50,8 +50,8 @@ def cached_sessions() -> Path:
 
 
 def simulate(root: Path, **options: Any) -> "Simulated":
-    """Run `sim.simulation.simulate`, with a message about the size and a progress bar."""
-    from sglpr_jax.sim import simulation
+    """Run `sim.dataset.simulate`, with a message about the size and a progress bar."""
+    from sglpr_jax.sim import dataset as simulation
 
     with contextlib.ExitStack() as opened:
         bars = []

@@ -82,8 +82,7 @@ def export(command: ExportCommand) -> Path:
 
 def _load(command: ExportCommand) -> "Params":
     """Load the weights, or the mean of several, with the segmentation head if it is kept."""
-    from sglpr_jax.models.average import average
-    from sglpr_jax.models.weights import for_places
+    from sglpr_jax.models.weights import average, for_places
     from sglpr_jax.models.weights_file import load
 
     if command.shares and not command.average:

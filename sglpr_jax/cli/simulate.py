@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from sglpr_jax.cli.runtime import parse_command, run
-from sglpr_jax.sim.choices import SCANS
+from sglpr_jax.sim import SCANS
 
 
 @dataclasses.dataclass(frozen=True)

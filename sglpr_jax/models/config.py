@@ -1,4 +1,7 @@
-"""Configuration of the paper's Swin-Unet."""
+"""Configuration of a model: its image, backbone and heads; presets, and the configuration in a file.
+
+This module imports no JAX, so a command line can list its fields quickly.
+"""
 
 import dataclasses
 import math
@@ -25,8 +28,72 @@ from sglpr_jax.files import naming
 from sglpr_jax.grid import Grid, ImageKind
 
 
+class BackboneSizes:
+    """What every configuration of a backbone says about it. Sizes are rows and columns of the image that it sees."""
+
+    @property
+    def token(self) -> tuple[int, int]:
+        """Rows and columns of the image that one feature represents."""
+        raise NotImplementedError
+
+    @property
+    def width(self) -> int:
+        """Channels of the features."""
+        raise NotImplementedError
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        """The image's rows and columns must be a multiple of this: the size of one feature of the coarsest map."""
+        return self.token
+
+    @property
+    def needs_polar(self) -> bool:
+        """Whether the backbone requires a polar image, because its layers wrap around."""
+        raise NotImplementedError
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Maps to draw as heat maps: from the title of each picture to the name of its map in `Seen.named`."""
+        raise NotImplementedError
+
+
+class _Stages(BackboneSizes):
+    """Backbone of Swin stages. Stage i has `embed_dim` * 2**i channels."""
+
+    embed_dim: int
+    depths: tuple[int, ...]
+    heads: tuple[int, ...]
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.depths or len(self.depths) != len(self.heads):
+            raise ValueError(
+                "expected at least one stage, and a number of heads for each, found "
+                f"depths {self.depths}, heads {self.heads}"
+            )
+        for i, number in enumerate(self.heads):
+            if (channels := self.embed_dim * 2**i) % number:
+                raise ValueError(f"heads: expected a divisor of the {channels} channels of stage {i}, found {number}")
+
+    @property
+    def width(self) -> int:
+        return self.embed_dim
+
+    @property
+    def multiple(self) -> tuple[int, int]:
+        rows, columns = self.token
+        coarsest = 2 ** (len(self.depths) - 1)
+        return rows * coarsest, columns * coarsest
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        # Normalised maps have the same strength everywhere.
+        last = len(self.depths) - 1
+        return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
+
+
 @dataclasses.dataclass(frozen=True)
-class SwinConfig:
+class SwinConfig(_Stages):
     """Swin-Unet with the paper's values as defaults. Stage i has `embed_dim` * 2**i channels."""
 
     kind: Literal["swin"] = "swin"
@@ -43,55 +110,17 @@ class SwinConfig:
     """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
     block."""
 
-    def __post_init__(self):
-        check_fields(self)
-        check_stages(self.embed_dim, self.depths, self.heads)
-
     @property
     def token(self) -> tuple[int, int]:
-        """Rows and columns of the image that one token represents."""
         return self.patch, self.patch
 
     @property
-    def width(self) -> int:
-        """Channels of the tokens."""
-        return self.embed_dim
-
-    @property
-    def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this, the size of one token of the coarsest stage."""
-        return (self.patch * 2 ** (len(self.depths) - 1),) * 2
-
-    @property
     def needs_polar(self) -> bool:
-        """Always False: windows fit any image."""
         return False
-
-    @property
-    def pictures(self) -> dict[str, str]:
-        """Maps to draw as heat maps. Normalised maps are left out, because they have the same strength everywhere."""
-        last = len(self.depths) - 1
-        return {"encoder, first": "enc0_out", "encoder, last": f"enc{last}_out", "decoder": f"dec{last}_out"}
-
-
-def check_stages(embed_dim: int, depths: tuple[int, ...], heads: tuple[int, ...]) -> None:
-    """Raises ValueError unless each stage has blocks and a number of heads that divides its channels.
-
-    Stage i has `embed_dim` * 2**i channels.
-    """
-    if not depths or len(depths) != len(heads):
-        raise ValueError(
-            f"expected at least one stage, and a number of heads for each, found depths {depths}, heads {heads}"
-        )
-    for i, number in enumerate(heads):
-        if embed_dim * 2**i % number:
-            raise ValueError(
-                f"heads: expected a divisor of the {embed_dim * 2**i} channels of stage {i}, found {number}"
-            )
 
 
 @dataclasses.dataclass(frozen=True)
-class CircularConfig:
+class CircularConfig(BackboneSizes):
     """Circular convolutions on the polar image, with one block for each width."""
 
     kind: Literal["circular"] = "circular"
@@ -124,34 +153,24 @@ class CircularConfig:
 
     @property
     def token(self) -> tuple[int, int]:
-        """Rows and columns of the polar image that one pixel of the last map represents."""
         return self.average * math.prod(self.strides), self.average * math.prod(self.means)
 
     @property
     def width(self) -> int:
-        """Channels of the last map."""
         return self.widths[-1]
 
     @property
-    def multiple(self) -> tuple[int, int]:
-        """Numbers that must divide the rows and columns of the image: how many of its pixels one pixel of the last map
-        covers."""
-        return self.token
-
-    @property
     def needs_polar(self) -> bool:
-        """Always True: the convolutions are circular."""
         return True
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Maps to draw as heat maps: those of the first, the middle and the last block."""
-        last = len(self.widths) - 1
+        last = len(self.widths) - 1  # the first, the middle and the last block
         return {f"block {i + 1}": f"circular_block{i}" for i in sorted({0, last // 2, last})}
 
 
 @dataclasses.dataclass(frozen=True)
-class SglprConfig:
+class SglprConfig(_Stages):
     """Swin-Unet whose tokens come from circular convolutions on the polar image."""
 
     kind: Literal["sglpr"] = "sglpr"
@@ -170,42 +189,17 @@ class SglprConfig:
     """Stochastic depth: fraction of samples for which training skips the last block. It rises from 0 at the first
     block."""
 
-    def __post_init__(self):
-        check_fields(self)
-        check_stages(self.embed_dim, self.depths, self.heads)
-
     @property
     def token(self) -> tuple[int, int]:
-        """Rows and columns of the polar image that one token represents."""
         return self.stem.token
 
     @property
-    def width(self) -> int:
-        """Channels of the tokens."""
-        return self.embed_dim
-
-    @property
-    def multiple(self) -> tuple[int, int]:
-        """The image's rows and columns must be a multiple of this, the size of one token of the coarsest stage."""
-        rows, columns = self.token
-        coarsest = 2 ** (len(self.depths) - 1)
-        return rows * coarsest, columns * coarsest
-
-    @property
     def needs_polar(self) -> bool:
-        """Always True: the convolutions and windows wrap around."""
         return True
 
     @property
     def pictures(self) -> dict[str, str]:
-        """Maps to draw as heat maps: the stem, the first and last stage of the encoder, and the decoder."""
-        stem, last = len(self.stem.widths) - 1, len(self.depths) - 1
-        return {
-            "stem": f"circular_block{stem}",
-            "encoder, first": "enc0_out",
-            "encoder, last": f"enc{last}_out",
-            "decoder": f"dec{last}_out",
-        }
+        return {"stem": f"circular_block{len(self.stem.widths) - 1}", **super().pictures}
 
 
 BackboneConfig = SwinConfig | CircularConfig | SglprConfig
@@ -426,7 +420,8 @@ def _read_dataclass(expected: Any, value: Any, field: str) -> Any:
     annotations = field_types(expected)
     older = {name: ADDED_LATER[prefix + name] for name in annotations if prefix + name in ADDED_LATER}
     value = {**older, **value}
-    unknown, missing = (min(map(str, names), default=None) for names in _differing(value, annotations))
+    unknown = min(map(str, set(value) - set(annotations)), default=None)
+    missing = min(set(annotations) - set(value), default=None)
     every = f"the fields of a {expected.__name__} ({', '.join(annotations)})"
     require(unknown, unknown is None, every, field)
     if missing is not None:
@@ -436,10 +431,6 @@ def _read_dataclass(expected: Any, value: Any, field: str) -> Any:
         return expected(**read)
     except ValueError as error:  # the fields are inconsistent
         raise ValueError(f"{prefix.removesuffix('.')}{': ' if prefix else ''}{error}") from error
-
-
-def _differing(value: dict[str, Any], annotations: dict[str, Any]) -> tuple[set[str], set[str]]:
-    return set(value) - set(annotations), set(annotations) - set(value)
 
 
 def _member(members: tuple[Any, ...], value: Any, field: str) -> Any:

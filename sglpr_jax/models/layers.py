@@ -6,7 +6,7 @@ image (`ModelConfig.compute`), except where a module requests float32.
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -15,6 +15,19 @@ from jaxtyping import Array, Float
 
 from sglpr_jax.models import initial
 from sglpr_jax.models.initial import Initial
+
+NORM_FLOOR = 1e-12
+
+
+class Seen(NamedTuple):
+    """Output of a backbone for a batch of images."""
+
+    features: Float[Array, "b p q c"]
+    """Input of the place head and of the decoder."""
+    finer: list[Array]
+    """Intermediate maps that the decoder uses again, finest first."""
+    named: dict[str, Array]
+    """All maps by name, for pictures and tests."""
 
 
 def weight(module: nn.Module, name: str, init: Initial, shape: tuple[int, ...]) -> Any:
@@ -130,9 +143,6 @@ def _statistics(x: Float[Array, "n c"], epsilon: float) -> tuple[Float[Array, "n
 
 def _mean(x: Float[Array, "n c"]) -> Float[Array, "n 1"]:
     return x.mean(-1, keepdims=True)
-
-
-NORM_FLOOR = 1e-12
 
 
 def l2_normalize(x: Float[Array, "*dims"], *, axis: int = -1) -> Float[Array, "*dims"]:

@@ -1,4 +1,4 @@
-"""CBAM: weights a feature map by channel, then by position (Woo et al. 2018)."""
+"""Place head: CBAM (Woo et al. 2018), convolutions, pooling by NetVLAD, mean or spectrum, and whitening."""
 
 import functools
 
@@ -18,6 +18,8 @@ from sglpr_jax.models.layers import LayerNorm, Linear, l2_normalize, weight
 from sglpr_jax.models.swin import PatchEmbed
 
 ROUNDING = 1e-6
+FLOOR = 1e-6
+"""Added to squared amplitudes, because the gradient of a square root at zero is not finite."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -131,10 +133,6 @@ class NetVLAD(nn.Module):
             return y
         gate_init = initial.normal(self.output**-0.5)
         return y * nn.sigmoid(Linear(self.output, kernel_init=gate_init, name="gate")(y))
-
-
-FLOOR = 1e-6
-"""Added to squared amplitudes, because the gradient of a square root at zero is not finite."""
 
 
 class Spectrum(nn.Module):

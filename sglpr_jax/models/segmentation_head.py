@@ -1,4 +1,4 @@
-"""Adds the image to the features of the segmentation head."""
+"""Segmentation head: logits on the grid, from the decoder's pixels and the image."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from sglpr_jax.models.config import ModelConfig
 from sglpr_jax.models.convolution import Convolution
 from sglpr_jax.models.initial import lecun_normal, torch_uniform
+from sglpr_jax.models.input_image import from_polar
 from sglpr_jax.models.layers import Linear, gelu
-from sglpr_jax.models.polar import from_polar
 
 _LOCAL = ((5, 16), (3, 16))
 """Kernel size in cells, and channels, of the convolutions. Together they reach three cells in each direction."""

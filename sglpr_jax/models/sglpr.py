@@ -1,4 +1,4 @@
-"""Maps the configuration of a backbone to its layers. Configurations do not import layers, which require JAX."""
+"""The network, and the calls that users make: `describe`, `segment`, `forward`, `is_describable` and `init`."""
 
 from typing import Any, NamedTuple
 
@@ -8,16 +8,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from sglpr_jax.labels import UNLABELLED
-from sglpr_jax.models.backbone import Backbone, Seen
 from sglpr_jax.models.circular import CircularBackbone
 from sglpr_jax.models.config import BackboneConfig, CircularConfig, ModelConfig, SglprConfig, SwinConfig, model_preset
 from sglpr_jax.models.initial import draw_all
 from sglpr_jax.models.input_image import FEWEST_CELLS, backbone_view, field_of_view, prepare
+from sglpr_jax.models.layers import Seen
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.place_head import PlaceHead, raw_input
 from sglpr_jax.models.segmentation_head import segmentation_head
-from sglpr_jax.models.swin_on_circular import SglprBackbone
-from sglpr_jax.models.swin_unet import SwinBackbone
+from sglpr_jax.models.swin_unet import SglprBackbone, SwinBackbone
+
+Backbone = SwinBackbone | CircularBackbone | SglprBackbone
+"""Layers of a backbone, with two calls: from images to `Seen`, and from `Seen` to pixels (`decode`, at most once).
+
+They belong to the Flax module that calls them, and get their names there.
+"""
 
 
 def build(config: BackboneConfig, *, circular: bool) -> Backbone:

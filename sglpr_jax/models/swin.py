@@ -18,6 +18,8 @@ from sglpr_jax.models.layers import LayerNorm, Linear, gelu, weight
 
 BLOCKED = -100.0
 """Value added to the score of two tokens that are neighbours only because the image was rolled."""
+MLP_RATIO = 4
+"""Hidden units of a block's MLP per channel, in the paper."""
 
 
 @cache
@@ -100,10 +102,6 @@ class WindowAttention(nn.Module):
         one_hot = jax.nn.one_hot(relative_position_index(window).reshape(-1), rows)
         bias = jnp.matmul(one_hot, table, precision=jax.lax.Precision.HIGHEST)
         return bias.T.reshape(self.heads, tokens, tokens)
-
-
-MLP_RATIO = 4
-"""Hidden units of a block's MLP per channel, in the paper."""
 
 
 class PatchEmbed(nn.Module):
@@ -208,9 +206,9 @@ class SwinStage(nn.Module):
     """Blocks at one resolution, every second one shifted. `drop_paths` has a rate for each block."""
 
     heads: int
+    drop_paths: tuple[float, ...]
     window: int
     mlp_ratio: int
-    drop_paths: tuple[float, ...]
     circular: bool = False
     shift_each_way: bool = False
 
@@ -219,16 +217,8 @@ class SwinStage(nn.Module):
         """Returns the outputs of all blocks. The last one is the output of the stage."""
         outputs = []
         for i, rate in enumerate(self.drop_paths):
-            block = SwinBlock(
-                self.heads,
-                self.window,
-                i % 2 == 1,
-                self.mlp_ratio,
-                rate,
-                self.circular,
-                self.shift_each_way,
-                name=f"block_{i}",
-            )
+            options = (self.window, i % 2 == 1, self.mlp_ratio, rate, self.circular, self.shift_each_way)
+            block = SwinBlock(self.heads, *options, name=f"block_{i}")
             x = block(x, train=train)
             outputs.append(x)
         return outputs
@@ -247,30 +237,18 @@ class PatchMerging(nn.Module):
 
 
 class PatchExpand(nn.Module):
-    """Doubles height and width and halves the channels."""
+    """Expands each token to factor x factor tokens or pixels: a linear layer, then norm.
+
+    The outputs of the linear layer are in the order (row offset, column offset, channel).
+    """
+
+    factor: int
+    channels: int
 
     @nn.compact
-    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b 2*h 2*w c//2"]:
-        """Expands each token to 2 x 2 tokens."""
-        return _expand(x, factor=2, channels=x.shape[-1] // 2)
-
-
-class FinalPatchExpand(nn.Module):
-    """Expansion of patches to pixels."""
-
-    patch: int = 4
-    channels: int | None = None
-    """Output channels. None: the channels of the input."""
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b {self.patch}*h {self.patch}*w _"]:
-        """Expands each token to patch x patch pixels."""
-        return _expand(x, factor=self.patch, channels=self.channels or x.shape[-1])
-
-
-def _expand(x: Float[Array, "b h w c"], *, factor: int, channels: int) -> Float[Array, "b _ _ _"]:
-    """Linear layer with outputs in the order (row offset, column offset, channel), then norm: layers of the caller."""
-    b, h, w, _ = x.shape
-    tokens = Linear(factor**2 * channels, use_bias=False, name="expand")(x)
-    strips = tokens.reshape(b * h, w, factor, factor * channels).transpose(0, 2, 1, 3)
-    return LayerNorm(name="norm")(strips.reshape(b, h * factor, w * factor, channels))
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b _ _ {self.channels}"]:
+        """Multiplies height and width by `factor`."""
+        b, h, w, _ = x.shape
+        tokens = Linear(self.factor**2 * self.channels, use_bias=False, name="expand")(x)
+        strips = tokens.reshape(b * h, w, self.factor, self.factor * self.channels).transpose(0, 2, 1, 3)
+        return LayerNorm(name="norm")(strips.reshape(b, h * self.factor, w * self.factor, self.channels))

@@ -1,16 +1,24 @@
-"""Swin-Unet: an encoder and a decoder of Swin blocks with skip connections."""
+"""Swin-Unet: an encoder and a decoder of Swin blocks with skip connections, on patches or on circular convolutions.
+
+A patch of eight sectors changes under rotations smaller than the patch. The result of a convolution shifts with such
+rotations. Therefore the stem of the backbone `sglpr` reduces the polar image like the circular CNN, and the attention
+windows use the resulting tokens. A rotation by a whole number of windows of the coarsest map is a shift of the tokens.
+Other rotations must be learnt.
+"""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sglpr_jax.models.backbone import Seen
-from sglpr_jax.models.config import SwinConfig
-from sglpr_jax.models.layers import LayerNorm, Linear
-from sglpr_jax.models.swin import MLP_RATIO, FinalPatchExpand, PatchEmbed, PatchExpand, PatchMerging, SwinStage
+from sglpr_jax.models.circular import CircularDecoder, CircularNet
+from sglpr_jax.models.config import SglprConfig, SwinConfig
+from sglpr_jax.models.layers import LayerNorm, Linear, Seen
+from sglpr_jax.models.swin import MLP_RATIO, PatchEmbed, PatchExpand, PatchMerging, SwinStage
 
 
 def drop_path_rates(depths: tuple[int, ...], rate: float) -> list[tuple[float, ...]]:
@@ -27,13 +35,10 @@ class SwinUnet(nn.Module):
     With `circular`, the left and right borders of the image are neighbours, as in a polar image.
     """
 
-    embed_dim: int
-    depths: tuple[int, ...]
-    heads: tuple[int, ...]
-    window: int
-    mlp_ratio: int = MLP_RATIO
+    config: SwinConfig | SglprConfig
+    """Widths, depths, heads, window and drop path of the stages."""
     patch: int = 4
-    drop_path: float = 0.0
+    mlp_ratio: int = MLP_RATIO
     circular: bool = False
     shift_each_way: bool = False
     """Whether windows that span the map in one direction are still shifted in the other."""
@@ -41,20 +46,15 @@ class SwinUnet(nn.Module):
     @nn.compact
     def __call__(
         self, image: Float[Array, "b h w c"], *, train: bool = False
-    ) -> tuple[Float[Array, "b h//{self.patch} w//{self.patch} {self.embed_dim}"], dict[str, Float[Array, "b _ _ _"]]]:
+    ) -> tuple[
+        Float[Array, "b h//{self.patch} w//{self.patch} {self.config.embed_dim}"], dict[str, Float[Array, "b _ _ _"]]
+    ]:
         """Return the tokens, and the intermediate maps by name: `enc0_block1`, `bottleneck_norm`, `dec2_out`, ..."""
-        stages = [
-            {
-                "heads": heads,
-                "window": self.window,
-                "mlp_ratio": self.mlp_ratio,
-                "drop_paths": rates,
-                "circular": self.circular,
-                "shift_each_way": self.shift_each_way,
-            }
-            for heads, rates in zip(self.heads, drop_path_rates(self.depths, self.drop_path), strict=True)
-        ]
-        x = PatchEmbed(self.embed_dim, (self.patch, self.patch), name="patch_embed")(image)
+        config = self.config
+        options = (config.window, self.mlp_ratio, self.circular, self.shift_each_way)
+        rates = drop_path_rates(config.depths, config.drop_path)
+        stages = [functools.partial(SwinStage, *of, *options) for of in zip(config.heads, rates, strict=True)]
+        x = PatchEmbed(config.embed_dim, (self.patch, self.patch), name="patch_embed")(image)
         seen = {"patch_embed": x}
         x = self._encode(x, stages, seen, train)
         x = seen["bottleneck_norm"] = LayerNorm(name="norm")(x)
@@ -62,7 +62,7 @@ class SwinUnet(nn.Module):
         x = seen["norm_up"] = LayerNorm(name="norm_up")(x)
         return x, seen
 
-    def _encode(self, x, stages: list[dict], seen: dict, train: bool):
+    def _encode(self, x, stages: list[Callable], seen: dict, train: bool):
         for i, stage in enumerate(stages):
             seen[f"skip{i}"] = x
             x = _run_stage(x, f"encoder_{i}", stage, seen, f"enc{i}", train)
@@ -71,7 +71,7 @@ class SwinUnet(nn.Module):
             seen[f"enc{i}_out"] = x
         return x
 
-    def _decode(self, x, stages: list[dict], seen: dict, train: bool):
+    def _decode(self, x, stages: list[Callable], seen: dict, train: bool):
         """Return the map of the last decoder stage for the bottleneck features `x`.
 
         Decoder stage i has the resolution of encoder stage n - 1 - i and adds the channels of that stage from `seen`.
@@ -80,17 +80,17 @@ class SwinUnet(nn.Module):
         for i, level in enumerate(reversed(range(len(stages)))):
             if i > 0:
                 x = jnp.concatenate([x, seen[f"skip{level}"]], axis=-1)
-                x = Linear(self.embed_dim * 2**level, name=f"decoder_{i}_fuse")(x)
+                x = Linear(self.config.embed_dim * 2**level, name=f"decoder_{i}_fuse")(x)
                 seen[f"dec{i}_concat_linear"] = x
                 x = _run_stage(x, f"decoder_{i}", stages[level], seen, f"dec{i}", train)
             if level > 0:
-                x = PatchExpand(name=f"decoder_{i}_expand")(x)
+                x = PatchExpand(2, x.shape[-1] // 2, name=f"decoder_{i}_expand")(x)
             seen[f"dec{i}_out"] = x
         return x
 
 
-def _run_stage(x, name: str, stage: dict, seen: dict, label: str, train: bool):
-    outputs = SwinStage(**stage, name=name)(x, train=train)
+def _run_stage(x, name: str, stage: Callable, seen: dict, label: str, train: bool):
+    outputs = stage(name=name)(x, train=train)
     seen.update({f"{label}_block{i}": output for i, output in enumerate(outputs)})
     return outputs[-1]
 
@@ -104,20 +104,40 @@ class SwinBackbone:
 
     def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
         """Computes the tokens."""
-        config = self.config
-        swin_unet = SwinUnet(
-            embed_dim=config.embed_dim,
-            depths=config.depths,
-            heads=config.heads,
-            window=config.window,
-            patch=config.patch,
-            drop_path=config.drop_path,
-            circular=self.circular,
-            name="backbone",
-        )
+        swin_unet = SwinUnet(self.config, self.config.patch, circular=self.circular, name="backbone")
         tokens, named = swin_unet(image, train=train)
         return Seen(tokens, [], named)
 
     def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
         """Computes a pixel for each pixel of the image by a linear layer."""
-        return FinalPatchExpand(self.config.patch, name="expand")(seen.features)
+        return PatchExpand(self.config.patch, seen.features.shape[-1], name="expand")(seen.features)
+
+
+@dataclasses.dataclass(frozen=True)
+class SglprBackbone:
+    """Swin-Unet with a stem, and a decoder that uses the stem's maps: layers `backbone` and `decoder`."""
+
+    config: SglprConfig
+
+    def __call__(self, image: Float[Array, "b p q c"], *, train: bool) -> Seen:
+        """Computes the tokens and the maps of the stem. The tokens replace the last map."""
+        return CircularSwin(self.config, name="backbone")(image, train=train)
+
+    def decode(self, seen: Seen) -> Float[Array, "b _ _ _"]:
+        """Computes a pixel for each pixel of the averaged image."""
+        return CircularDecoder(self.config.stem.widths, name="decoder")([*seen.finer, seen.features])
+
+
+class CircularSwin(nn.Module):
+    """Network from the polar image to a token for each pixel of the stem's last map."""
+
+    config: SglprConfig
+
+    @nn.compact
+    def __call__(self, polar: Float[Array, "b p q c"], *, train: bool = False) -> Seen:
+        """Returns the tokens as features. The maps are named as in the circular CNN and the Swin-Unet."""
+        config = self.config
+        maps = CircularNet(config.stem, name="stem")(polar)
+        swin_unet = SwinUnet(config, 1, config.mlp_ratio, circular=True, shift_each_way=True, name="swin_unet")
+        tokens, named = swin_unet(maps[-1], train=train)
+        return Seen(tokens, maps[:-1], {f"circular_block{i}": x for i, x in enumerate(maps[1:])} | named)

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from sglpr_jax.models.input_image import field_of_view
+from sglpr_jax.models.input_image import field_of_view, from_polar
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.polar import from_polar
 from sglpr_jax.models.sglpr import forward
 
 

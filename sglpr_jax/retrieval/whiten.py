@@ -8,7 +8,7 @@ from sglpr_jax.data.recording import Recording
 from sglpr_jax.data.warning import warn
 from sglpr_jax.models.config import WHITENING_POWER
 from sglpr_jax.models.params import Params
-from sglpr_jax.models.whitening import unwhitened, whitened
+from sglpr_jax.models.weights import unwhitened, whitened
 from sglpr_jax.retrieval.embed import embed
 
 

@@ -1,4 +1,4 @@
-"""Writing of simulated drives to disk. An interrupted run can be resumed, and the same seed gives the same bytes."""
+"""Simulated datasets: `simulate` plans the recordings and writes them. An interrupted run can be resumed."""
 
 import dataclasses
 import functools
@@ -10,17 +10,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from sglpr_jax.files import read_json, replacing
-from sglpr_jax.sim.carriers import VEHICLE, Carrier
-from sglpr_jax.sim.choices import RATE_HZ
-from sglpr_jax.sim.drive import check_drawing, name_of_path, read_path, thinned
+from sglpr_jax.sim import RATE_HZ, SCANS
+from sglpr_jax.sim.drive import CARRIERS, check_drawing, name_of_path, read_path, thinned
 from sglpr_jax.sim.layouts import LAYOUTS, Layout
-from sglpr_jax.sim.recording import SimulatedRecording, simulate_recording, with_submaps
+from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, simulate_recording, with_submaps
 from sglpr_jax.sim.repeating import default_rate, simulate_repeating
 from sglpr_jax.sim.routes import ROLES
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.scenery import TOWN, Scenery
-from sglpr_jax.sim.sensor import HDL64E, SENSORS, Sensor
+from sglpr_jax.sim.sensor import SENSORS, Sensor
 from sglpr_jax.sim.sessions import plan_sessions
+from sglpr_jax.sim.styles import SCENERIES, TOWN
 
 SETTINGS_FILE = "simulation.json"
 VERSION = 3
@@ -29,141 +28,227 @@ OLD_NAMES = {"crossing_every": "crossing_every_m", "wavelength": "wavelength_m"}
 """Field names of a scenery in older datasets, and their current names."""
 WORKERS = 2
 """Number of rendering threads. The compiled program leaves capacity for more than one."""
+ROUTES = ("00", "05", "08")
+"""Default routes in towns."""
+REVISITED = ("01", "06", "08")
+"""Default routes where places repeat: without revisits, in the same and in the opposite direction."""
+DAYS = ("2012-01-15", "2012-02-04", "2012-03-17")
+AZIMUTH_STEPS = 900
+"""Firings per revolution in the default datasets."""
+BYTES_PER_RAY = {"scans": 16, "nclt": 5}
+"""Approximate size of a scan with its labels, in bytes per ray, by layout.
 
-Progress = Callable[[str, int, int], None]
+Layout "scans" stores 20 bytes per return, and most rays return. NCLT stores 8, but many rays go into the sky.
+"""
+BYTES_PER_IMAGE = 3500
+"""Approximate size of an image with its label image, in bytes."""
 
 
-def write_dataset(
-    root: Path,
+@dataclasses.dataclass(frozen=True)
+class Simulated:
+    """Description of a simulated dataset, before or after it is written."""
+
+    root: Path
+    names: tuple[str, ...]
+    """Names of the recordings."""
+    scans: int
+    """Maximum number of scans in each recording."""
+    layout: str
+    """Name of the layout, from `LAYOUTS`."""
+    sensor: Sensor
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Recordings that are not complete."""
+        return tuple(name for name in self.names if not LAYOUTS[self.layout].is_finished(self.root, name))
+
+    @property
+    def missing_bytes(self) -> int:
+        """Approximate size of the missing recordings, in bytes."""
+        rays = len(self.sensor.elevations_deg) * self.sensor.azimuth_steps
+        each = BYTES_PER_RAY[self.layout] * rays if self.layout in BYTES_PER_RAY else BYTES_PER_IMAGE
+        return each * self.scans * len(self.missing)
+
+    def __str__(self) -> str:
+        return f"{self.root}: recordings {', '.join(self.names)}"
+
+
+def simulate(
+    out: Path | str,
     *,
-    names: Sequence[str] = ("00", "05", "08"),
+    routes: Sequence[str] | None = None,
     along: Sequence[Path] = (),
-    scans: int = 300,
-    sensor: Sensor = HDL64E,
+    sessions: Sequence[str] = (),
+    scans: int = SCANS,
+    sensor: str | Sensor | None = None,
+    azimuth_steps: int | None = None,
     seed: int = 0,
     rate_hz: float | None = None,
-    scenery: Scenery | str = TOWN,
-    carrier: Carrier = VEHICLE,
+    scenery: str = "town",
+    carrier: str = "vehicle",
     submap_m: float = 0.0,
-    layout: str = "scans",
-    progress: Progress | None = None,
-) -> Path:
-    """Writes simulated drives into a folder.
+    images: bool = False,
+    vary: bool = False,
+    on_start: Callable[[Simulated], None] = lambda dataset: None,
+    on_progress: Callable[[int], None] = lambda done: None,
+) -> Simulated:
+    """Drives a simulated LiDAR through simulated towns and writes scans, labels and poses.
 
-    Each drive has its own town, which depends on `seed` and the name of the drive. Existing files are kept. The same
-    call resumes an interrupted run and gives the same bytes. Files are written atomically.
-
-    In sceneries of `REPEATING`, a route stands only for the direction of its revisits, and the drive is that of
-    `simulate_repeating`.
+    Existing files are kept. The same call completes an interrupted dataset and gives the same bytes. Files are written
+    atomically. Recordings can be added to a dataset, but not sessions, because their streets depend on the number of
+    days.
 
     Arguments:
-      root: Output folder.
-      names: Routes, from `ROLES`.
+      out: Output folder.
+      routes: Routes "00" to "10", each with its own town, which depends on `seed` and the route. None drives 00, 05 and
+        08, or no route if there is `along`.
       along: KITTI pose files to drive along, see `read_path`.
-      scans: Number of scans of each drive. Along a pose file it is the maximum, see `simulate_recording`.
-      sensor: LiDAR.
+      sessions: Dates such as "2012-01-15". One town is driven on each of these days, in NCLT's layout, see
+        `plan_sessions`. `routes` may then hold one route; None is 00.
+      scans: Number of scans of each recording, at least 2. Along a pose file it is the maximum.
+      sensor: LiDAR, or its name from `SENSORS`. None is hdl64e, or hdl32e-nclt with `sessions`.
+      azimuth_steps: Firings per revolution. None is the sensor's own number.
       seed: Seed of the towns, at least 0.
-      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, elsewhere the rate
-        of the carrier or of the scenery.
-      scenery: Scenery of the towns, or a name from `REPEATING`.
-      carrier: Carrier of the sensor. In towns, only its height and sway are used.
-      submap_m: Travelled distance of submaps, in metres (`sglpr_jax.submaps`). 0 writes scans.
-      layout: "scans", "images" or "varied", see `LAYOUTS`.
-      progress: Function that is called as `progress(name, done, scans)` whenever scans are done.
+      rate_hz: Scans per second of a route. Not used along pose files. None is 4 in towns, elsewhere the rate of the
+        carrier or of the scenery.
+      scenery: Name from `SCENERIES` (towns), or from `REPEATING`. In the latter, a route stands only for the direction
+        of its revisits, and the drive is that of `simulate_repeating`.
+      carrier: Name from `CARRIERS`. In towns, only its height and sway are used. `sessions` need a vehicle.
+      submap_m: Travelled distance of submaps, in metres. 0 writes scans.
+      images: Whether to write density images with label images instead of scans.
+      vary: Whether the images show scans that are rotated about z, some of them with lost points. See `layouts.vary`.
+      on_start: Function that is called with the dataset's description after all arguments are checked.
+      on_progress: Function that is called with the number of completed scans, counting `scans` for each recording.
 
     Returns:
-      `root`.
+      Description of the dataset.
 
     Raises:
-      ValueError: A route, the scenery or the layout is unknown, two drives have one name, or `scans` is below 2. Or
-        `rate_hz` is not positive, `seed` or `submap_m` is negative, or a pose file is malformed. Or `root` holds other
-        files, or a dataset with other settings. Or the scenery is from `REPEATING`, and there is a pose file, or two
-        routes have revisits in the same direction.
+      ValueError: An argument is unknown or out of range, a pose file is malformed, or arguments contradict each other.
+        Or `out` holds other files, or a dataset with other settings.
       OSError: A file cannot be read or written. The message names the file.
+
+    Example:
+      print(sglpr_jax.simulate("towns", routes=["08"], scans=400))
     """
-    rate_hz = _checked_rate(scenery, names, along, rate_hz, carrier)
-    check_drawing(rate_hz, seed)
+    lidar = _lidar(sensor or ("hdl32e-nclt" if sessions else "hdl64e"), azimuth_steps)
+    _check_names(routes, along, sessions, scenery, carrier, submap_m=submap_m, images=images, vary=vary)
+    repeats = scenery in REPEATING
+    if routes is None:
+        routes = () if along or sessions else REVISITED if repeats else ROUTES
+    if rate_hz is None:
+        rate_hz = default_rate(REPEATING[scenery], CARRIERS[carrier]) if repeats else RATE_HZ
+    layout = "nclt" if sessions else "varied" if vary else "images" if images else "scans"
+    options = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
+    surroundings = {"repeating": scenery} if repeats else dataclasses.asdict(SCENERIES[scenery])
+    sensed = {"sensor": dataclasses.asdict(lidar), "carrier": dataclasses.asdict(CARRIERS[carrier])}
+    settings = {"version": VERSION, "layout": layout, "scenery": surroundings, **sensed, **options}
+    if sessions:
+        route = next(iter(routes), "00")
+        plans = plan_sessions(sessions, route=route, sensor=lidar, scenery=SCENERIES[scenery], **options)
+        settings |= {"sessions": sessions, "route": route}
+        drives = {}
+    else:
+        check_drawing(rate_hz, seed)
+        drives = _drives(routes, along, scans)
+        record = functools.partial(_recording, scenery=scenery, carrier=carrier, sensor=lidar, submap_m=submap_m)
+        plans = [_plan(name, file, functools.partial(record, **options), scans) for name, file in drives.items()]
+        settings |= {"submap_m": submap_m} if submap_m else {}
+    out = Path(out)
+    _claim(out, settings, {f"drive {name}": _fingerprint(file) for name, file in drives.items()})
+    dataset = Simulated(out, tuple(plan.name for plan in plans), scans, layout, lidar)
+    on_start(dataset)
+    for k, plan in enumerate(plans):
+        count = len(plan.ids)
+        _write_drive(out, plan, LAYOUTS[layout], lambda done, k=k, n=count: on_progress(k * scans + done * scans // n))
+    return dataset
+
+
+def default_dataset(cache: Path) -> tuple[Path, dict]:
+    """Folder below `cache`, and options of `simulate`, for the dataset that is used by default."""
+    return _below(cache, "simulated"), {"scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
+
+
+def default_sessions(cache: Path) -> tuple[Path, dict]:
+    """Like `default_dataset`, for one town on three days."""
+    return _below(cache, "sessions"), {"sessions": DAYS, "scans": SCANS, "azimuth_steps": AZIMUTH_STEPS, "seed": 0}
+
+
+def _below(cache: Path, kind: str) -> Path:
+    return cache / f"{kind}-v{VERSION}-{SCANS}x{AZIMUTH_STEPS}-seed0"
+
+
+def _lidar(sensor: str | Sensor, azimuth_steps: int | None) -> Sensor:
+    if isinstance(sensor, str):
+        if sensor not in SENSORS:
+            raise ValueError(f"expected a sensor among {', '.join(SENSORS)}, found {sensor!r}")
+        sensor = SENSORS[sensor]
+    return sensor if azimuth_steps is None else dataclasses.replace(sensor, azimuth_steps=azimuth_steps)
+
+
+def _check_names(
+    routes: Sequence[str] | None,
+    along: Sequence[Path],
+    sessions: Sequence[str],
+    scenery: str,
+    carrier: str,
+    *,
+    submap_m: float,
+    images: bool,
+    vary: bool,
+) -> None:
+    """Raises ValueError if a name is unknown, or if arguments contradict each other."""
+    if sessions and (along or images or len(routes or ()) > 1):
+        found = f"{len(routes or ())} routes, {len(along)} pose files, images {images}"
+        raise ValueError(f"with sessions, expected at most one route, no pose files and no images, found {found}")
+    known = SCENERIES if sessions else {**SCENERIES, **REPEATING}
+    if scenery not in known:
+        raise ValueError(f"expected a scenery among {', '.join(known)}, found {scenery!r}")
+    if carrier not in CARRIERS:
+        raise ValueError(f"expected a carrier among {', '.join(CARRIERS)}, found {carrier!r}")
+    if sessions and carrier != "vehicle":
+        raise ValueError(f"with sessions, expected the carrier vehicle, found {carrier!r}")
+    if sessions and submap_m:
+        raise ValueError(f"with sessions, expected no submaps, found submaps of {submap_m:g} m")
     if not 0 <= submap_m < math.inf:
         raise ValueError(f"submap_m: expected metres, at least 0, found {submap_m}")
-    files = {**dict.fromkeys(names), **{name_of_path(file): file for file in along}}
-    unknown = [name for name in names if name not in ROLES]
+    if vary and not images:
+        raise ValueError("vary: expected images, found scans; vary changes scans before they are converted to images")
+    revisits = [ROLES[name].revisit for name in routes or () if name in ROLES]
+    if scenery in REPEATING and (along or len(set(revisits)) < len(revisits)):
+        expected = "no pose files and routes with different revisits, such as 01 06 08"
+        raise ValueError(
+            f"scenery {scenery}: expected {expected}, found {' '.join([*(routes or ()), *map(str, along)])}"
+        )
+
+
+def _drives(routes: Sequence[str], along: Sequence[Path], scans: int) -> dict[str, Path | None]:
+    """Names of the drives, and the pose files along which they lead."""
+    unknown = [name for name in routes if name not in ROLES]
     if unknown or scans < 2:
         raise ValueError(f"expected drives among {', '.join(ROLES)} with 2 scans or more, found {unknown}, {scans}")
-    if len(files) < len(names) + len(along) or layout not in ("scans", "images", "varied"):
-        drives = [*names, *map(name_of_path, along)]
-        expected = "different names and layout scans, images or varied"
-        raise ValueError(f"expected {expected}, found {', '.join(drives)} and {layout}")
-    what = {"scans": scans, "seed": seed, "rate_hz": rate_hz}
-    ways = {f"drive {name}": _fingerprint(file) for name, file in files.items()}
-    lengths = {"submap_m": submap_m} if submap_m else {}
-    _claim(root, {"layout": layout, **what, **lengths, **_settings(sensor, scenery, carrier)}, ways)
-    options = {"sensor": sensor, "scenery": scenery, "carrier": carrier, "submap_m": submap_m, **what}
-    for name, file in files.items():
-        count = scans if file is None else len(thinned(read_path(file), scans).times)
-        simulate = functools.partial(_recording, name, along=file, **options)
-        show = functools.partial(progress, name) if progress else lambda done, scans: None
-        ids = tuple(f"{i:06d}" for i in range(count))
-        _write_drive(root, name, simulate, ids=ids, layout=LAYOUTS[layout], progress=show)
-    return root
+    names = [*routes, *map(name_of_path, along)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"expected different names, found {', '.join(names)}")
+    return dict(zip(names, [*[None] * len(routes), *along], strict=True))
 
 
-def _checked_rate(
-    scenery: Scenery | str, names: Sequence[str], along: Sequence[Path], rate_hz: float | None, carrier: Carrier
-) -> float:
-    """Scans per second, after a check that the scenery has the drives."""
-    if isinstance(scenery, Scenery):
-        return RATE_HZ if rate_hz is None else rate_hz
-    if scenery not in REPEATING:
-        raise ValueError(f"expected a scenery among {', '.join(REPEATING)}, found {scenery!r}")
-    revisits = [ROLES[name].revisit for name in names if name in ROLES]
-    if along or len(set(revisits)) < len(revisits):
-        expected = "no pose files and routes with different revisits, such as 01 06 08"
-        raise ValueError(f"scenery {scenery}: expected {expected}, found {' '.join([*names, *map(str, along)])}")
-    return default_rate(REPEATING[scenery], carrier) if rate_hz is None else rate_hz
+def _plan(name: str, file: Path | None, record: Callable[..., SimulatedRecording], scans: int) -> PlannedRecording:
+    count = scans if file is None else len(thinned(read_path(file), scans).times)
+    ids = tuple(f"{i:06d}" for i in range(count))
+    return PlannedRecording(name, ids, functools.partial(record, name, along=file))
 
 
 def _recording(
-    name: str, *, along: Path | None, scenery: Scenery | str, submap_m: float, **options
+    name: str, *, along: Path | None, scenery: str, carrier: str, submap_m: float, **options
 ) -> SimulatedRecording:
     """Drive of a route or along a pose file, with submaps of `submap_m`."""
-    if isinstance(scenery, str):
+    options |= {"carrier": CARRIERS[carrier]}
+    if scenery in REPEATING:
         recording = simulate_repeating(scenery, revisit=ROLES[name].revisit, **options)
     else:
-        recording = simulate_recording(name, along=along, scenery=scenery, **options)
+        recording = simulate_recording(name, along=along, scenery=SCENERIES[scenery], **options)
     return with_submaps(recording, submap_m)
-
-
-def write_sessions(
-    root: Path,
-    *,
-    dates: Sequence[str],
-    route: str = "00",
-    scans: int = 300,
-    sensor: Sensor = SENSORS["hdl32e-nclt"],
-    seed: int = 0,
-    rate_hz: float = RATE_HZ,
-    scenery: Scenery = TOWN,
-    progress: Progress | None = None,
-) -> Path:
-    """Writes one town on several days into the folder `root`, in NCLT's layout, and returns `root`.
-
-    `plan_sessions` describes the other arguments and the drives. `write_dataset` describes files, progress and errors.
-    Sessions cannot be added to a dataset, because the streets depend on the number of days.
-    """
-    what = {"route": route, "scans": scans, "seed": seed, "rate_hz": rate_hz}
-    sessions = plan_sessions(dates, sensor=sensor, scenery=scenery, **what)
-    _claim(root, {"layout": "nclt", "sessions": dates, **what, **_settings(sensor, scenery)}, {})
-    for date, ids, simulate in sessions:
-        show = functools.partial(progress, date) if progress else lambda done, scans: None
-        _write_drive(root, date, simulate, ids=ids, layout=LAYOUTS["nclt"], progress=show)
-    return root
-
-
-def _settings(sensor: Sensor, scenery: Scenery | str, carrier: Carrier = VEHICLE) -> dict:
-    """Settings that are stored with every dataset."""
-    surroundings = {"repeating": scenery} if isinstance(scenery, str) else dataclasses.asdict(scenery)
-    sensed = {"sensor": dataclasses.asdict(sensor), "carrier": dataclasses.asdict(carrier)}
-    return {"version": VERSION, "scenery": surroundings, **sensed}
 
 
 def _fingerprint(file: Path | None) -> str:
@@ -205,41 +290,33 @@ def _read_settings(path: Path) -> dict:
     sensor = settings.get("sensor")
     rings = {name: getattr(Sensor, name) for name in ("azimuths_deg", "pattern")}
     sensor = {**rings, **sensor} if isinstance(sensor, dict) else sensor
-    carrier = settings.get("carrier", dataclasses.asdict(VEHICLE))
+    carrier = settings.get("carrier", dataclasses.asdict(CARRIERS["vehicle"]))
     return {**settings, **json.loads(json.dumps({"carrier": carrier, "sensor": sensor, "scenery": scenery}))}
 
 
-def _write_drive(
-    root: Path,
-    name: str,
-    simulate: Callable[[], SimulatedRecording],
-    *,
-    ids: Sequence[str],
-    layout: Layout,
-    progress: Callable[[int, int], None],
-) -> None:
+def _write_drive(root: Path, plan: PlannedRecording, layout: Layout, progress: Callable[[int], None]) -> None:
     """Writes the missing files of one drive. The town is built only if files are missing."""
-    scans = len(ids)
-    missing = [i for i in range(scans) if not all(file.exists() for file in layout.files_of_scan(root, name, ids[i]))]
-    progress(scans - len(missing), scans)
-    if not missing and layout.is_finished(root, name):
+    files = [layout.files_of_scan(root, plan.name, scan_id) for scan_id in plan.ids]
+    missing = [i for i, of_scan in enumerate(files) if not all(file.exists() for file in of_scan)]
+    progress(len(files) - len(missing))
+    if not missing and layout.is_finished(root, plan.name):
         return
-    recording = simulate()
+    recording = plan.simulate()
 
     def write_scan(i: int) -> None:
         contents = layout.scan_contents(*recording.render(i), recording.mounting)
-        for file, content in zip(layout.files_of_scan(root, name, ids[i]), contents, strict=True):
+        for file, content in zip(files[i], contents, strict=True):
             _write(file, content)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         try:
-            for done, _ in enumerate(pool.map(write_scan, missing), scans - len(missing) + 1):
-                progress(done, scans)
+            for done, _ in enumerate(pool.map(write_scan, missing), len(files) - len(missing) + 1):
+                progress(done)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
     for file, content in layout.drive_contents(recording.poses).items():
-        _write(layout.file_of_drive(root, name, file), content)
+        _write(layout.file_of_drive(root, plan.name, file), content)
 
 
 def _write(path: Path, content: bytes) -> None:

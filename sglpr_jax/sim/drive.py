@@ -1,5 +1,6 @@
-"""Path and times of the vehicle, along one of the eleven routes or along a given pose file."""
+"""Path, times and poses of the sensor, along one of the eleven routes or a pose file, and the sensor's carriers."""
 
+import dataclasses
 import hashlib
 import math
 from pathlib import Path
@@ -12,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from sglpr_jax.data.formats.pose_files import read_poses, read_times
 from sglpr_jax.se3 import positions_from_camera
-from sglpr_jax.sim.choices import RATE_HZ
+from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.ground import Relief, relief_gradient, relief_height
-from sglpr_jax.sim.routes import ROLES, STEP_M, plan_route, travelled
+from sglpr_jax.sim.objects import Range
+from sglpr_jax.sim.routes import ROLES, STEP_M, Line, plan_route, travelled
 
 PATH_HZ = 10.0
 """Approximate number of poses per second along the path. The scans use some of these poses."""
@@ -33,6 +35,22 @@ ACCELERATION = 1.5
 """Maximum lateral and longitudinal acceleration, in m/s^2. They limit speed in corners and changes of speed."""
 FREE_SPEED = 1.35
 """Speed on a free street, as a multiple of the mean speed."""
+TILT_DEG = 0.6
+"""Standard deviation of pitch and of roll relative to the ground, in degrees, due to springs, bumps and rough roads."""
+TILT_S = 0.5
+"""Approximate duration of a tilt, in seconds."""
+HAND_HEIGHT_M, HAND_BOB_M = 1.4, 0.04
+"""Mean height of a hand-held sensor above the ground, and amplitude of its vertical motion, in metres."""
+HAND_TILT_DEG = 15.0
+"""Maximum pitch and roll of a hand-held sensor, in degrees."""
+STEPS_HZ = 2.0
+"""Steps of a walking person per second."""
+SHIFT_S = 3.0
+"""Duration of standing before and after a reversal, in seconds."""
+BRAKING_S = 1.0
+"""Standard deviation of the Gaussian that smooths starts and stops, in seconds."""
+REVERSE_SPEED = 0.5
+"""Speed in reverse, as a fraction of the speed forward."""
 
 
 class PlanarPath(NamedTuple):
@@ -50,25 +68,14 @@ class TimedPoses(NamedTuple):
     times: np.ndarray  # (n,) seconds
 
 
-def plan_scan_path(rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ) -> PlanarPath:
-    """Returns the poses of the `scans` scans of route `name`, evenly spaced in time.
-
-    The drive lasts `scans / rate_hz` seconds, but at least SHORTEST_S. The vehicle keeps right with a small sway that
-    differs between visits. It slows down in corners.
-
-    Raises:
-      ValueError: The route is unknown.
-    """
-    return thinned(plan_path(rng, name, scans=scans, rate_hz=rate_hz), scans)
-
-
 def plan_path(
     rng: np.random.Generator, name: str, *, scans: int, rate_hz: float = RATE_HZ, days: int = 1
 ) -> PlanarPath:
-    """Returns the complete path of `plan_scan_path`, with a pose about every 0.1 s.
+    """Returns the path of a drive along route `name`, with a pose about every 0.1 s.
 
-    The number of poses is a multiple of `scans * days`. If `days` is above 1, the path has one part for each day. The
-    parts are equally long and use the same streets.
+    The drive lasts `scans / rate_hz` seconds, but at least SHORTEST_S. The vehicle keeps right with a small sway that
+    differs between visits. It slows down in corners. The number of poses is a multiple of `scans * days`. If `days` is
+    above 1, the path has one part for each day. The parts are equally long and use the same streets.
     """
     if name not in ROLES:
         raise ValueError(f"expected a route among {', '.join(ROLES)}, found {name!r}")
@@ -197,19 +204,23 @@ def poses_over(
     return poses
 
 
-def _waves(rng: np.random.Generator, length: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def waves(rng: np.random.Generator, length: Float[np.ndarray, " n"], wavelength_m: Range) -> Float[np.ndarray, " n"]:
     """Slowly varying random values along a path, between -1 and 1."""
-    wavelengths, phases = rng.uniform(*SWAY_WAVELENGTH_M, 3), rng.uniform(0, 2 * np.pi, 3)
+    wavelengths, phases = rng.uniform(*wavelength_m, 3), rng.uniform(0, 2 * np.pi, 3)
     return np.sin(2 * np.pi * length[:, None] / wavelengths + phases).mean(axis=1)
 
 
-def _in_lane(rng: np.random.Generator, middle: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def shifted(line: Line, left_m: Float[np.ndarray, " n"] | float) -> Line:
+    """Shifts `line` to the left by `left_m` metres."""
+    ahead = np.gradient(line, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    return line + np.reshape(left_m, (-1, 1)) * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+
+
+def _in_lane(rng: np.random.Generator, middle: Line) -> Line:
     """`middle` shifted to the right, with a slow sway."""
-    offset = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * _waves(rng, travelled(middle))
-    tangent = np.gradient(middle, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    lane = middle + offset[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
-    return gaussian_filter1d(lane, STEERING_M / STEP_M, axis=0, mode="nearest")
+    offset = np.mean(LANE_M) + np.ptp(LANE_M) / 2 * waves(rng, travelled(middle), SWAY_WAVELENGTH_M)
+    return gaussian_filter1d(shifted(middle, -offset), STEERING_M / STEP_M, axis=0, mode="nearest")
 
 
 def _clock(
@@ -218,9 +229,137 @@ def _clock(
     """Time of each point of `path`, for the highest speed that streets, corners and a car's acceleration allow."""
     length = travelled(path)
     curvature = np.abs(np.gradient(heading, length)).clip(min=1e-6)
-    limit = np.minimum((free_mps * (1 + 0.2 * _waves(rng, length))) ** 2, LATERAL_ACCELERATION / curvature)
+    limit = np.minimum(
+        (free_mps * (1 + 0.2 * waves(rng, length, SWAY_WAVELENGTH_M))) ** 2, LATERAL_ACCELERATION / curvature
+    )
     gain = 2 * ACCELERATION * length  # v^2 grows by at most 2 a s
     limit = np.minimum.accumulate(limit - gain) + gain
     limit = np.minimum.accumulate((limit + gain)[::-1])[::-1] - gain
     speed = np.sqrt(limit)
     return np.concatenate([[0.0], np.cumsum(np.diff(length) / ((speed[1:] + speed[:-1]) / 2))])
+
+
+class Motion(NamedTuple):
+    """Motion of the sensor relative to the ground below the path."""
+
+    tilt: np.ndarray  # (n, 2) pitch and roll, radians
+    height: np.ndarray | float  # (n,) or one value for all, metres above the ground
+    left: np.ndarray | float  # (n,) or one value for all, metres to the left of the path
+
+
+@dataclasses.dataclass(frozen=True)
+class Carrier:
+    """Vehicle or person that carries the sensor."""
+
+    speed_mps: Range | None = None
+    """Range of the speed, in m/s. None uses the speed of the scenery."""
+    rate_hz: float | None = None
+    """Scans per second. None uses the rate of the scenery."""
+    height_m: float | None = None
+    """Mean height of the sensor above the ground, in metres. None uses the height of the scenery or of the sensor."""
+    walks: bool = False
+    """Whether the sensor sways with the steps of a person. Otherwise it tilts like the body of a car."""
+    tilt_deg: float = TILT_DEG
+    """Standard deviation of pitch and roll, in degrees. With `walks`, their maximum."""
+    bob_m: float = 0.0
+    """Amplitude of the vertical motion with the steps, in metres."""
+    sway_m: float = 0.0
+    """Amplitude of the motion to the left and right with the steps, in metres."""
+    halt_every_s: Range | None = None
+    """Range of the driving time between two halts, in seconds. A halt is a stand or, every second time, a reversal.
+
+    None never halts.
+    """
+    stand_s: Range = (5.0, 60.0)
+    """Range of the duration of a stand, in seconds."""
+    reverse_m: Range = (5.0, 15.0)
+    """Range of the length of a reversal, in metres."""
+
+    def motion(self, rng: np.random.Generator, times: Float[np.ndarray, " n"], *, height_m: float) -> Motion:
+        """Draws the motion of the sensor at `times`. Its mean height is `height_m` if the carrier has no height."""
+        height_m = height_m if self.height_m is None else self.height_m
+        if not self.walks:
+            return Motion(body_tilt(rng, times) * (self.tilt_deg / TILT_DEG), height_m, 0.0)
+        swing, bob = steps(rng, times)
+        return Motion(np.radians(self.tilt_deg) * swing, height_m + self.bob_m * bob, -self.sway_m * swing[:, 1])
+
+    def halted(self, rng: np.random.Generator, path: PlanarPath, *, poses: int) -> PlanarPath:
+        """Inserts the halts into the drive along `path`, which must not stand.
+
+        The number of poses is a multiple of `se3`. The heading stays that of the path where the carrier reverses.
+        """
+        if self.halt_every_s is None:
+            return path
+        clock, progress = self._halts(rng, path)
+        even = np.arange(0, clock[-1], 1 / PATH_HZ)
+        smooth = gaussian_filter1d(np.interp(even, clock, progress), BRAKING_S * PATH_HZ, mode="nearest")
+        times = np.linspace(0, even[-1], poses * max(1, round(even[-1] * PATH_HZ / poses)))
+        at = np.interp(times, even, smooth)
+        x, y, yaw = (np.interp(at, path.times, values) for values in (*path.xy.T, path.yaw))
+        return PlanarPath(np.stack([x, y], axis=1), yaw, times)
+
+    def _halts(self, rng: np.random.Generator, path: PlanarPath) -> tuple[list[float], list[float]]:
+        """Knots of the drive with halts: times, and the times at which `path` is at the same places."""
+        assert self.halt_every_s is not None
+        clock, progress, length = [0.0], [0.0], travelled(path.xy)
+
+        def go(seconds: float, to: float) -> None:
+            clock.append(clock[-1] + seconds)
+            progress.append(to)
+
+        reverses, there = rng.random() < 0.5, rng.uniform(*self.halt_every_s)
+        while there < path.times[-1]:
+            go(there - progress[-1], there)
+            if reverses:
+                metres = np.interp(there, path.times, length) - rng.uniform(*self.reverse_m)
+                back = float(np.interp(metres, length, path.times))
+                go(SHIFT_S, there)
+                go((there - back) / REVERSE_SPEED, back)
+                go(SHIFT_S, back)
+            else:
+                go(rng.uniform(*self.stand_s), there)
+            reverses, there = not reverses, there + rng.uniform(*self.halt_every_s)
+        go(float(path.times[-1]) - progress[-1], float(path.times[-1]))
+        return clock, progress
+
+
+VEHICLE = Carrier()
+HANDHELD = Carrier(
+    speed_mps=(1.2, 1.2), rate_hz=5.0, height_m=HAND_HEIGHT_M, walks=True, tilt_deg=HAND_TILT_DEG, bob_m=HAND_BOB_M
+)
+CARRIERS = {
+    "vehicle": VEHICLE,
+    "backpack": Carrier(
+        speed_mps=(1.0, 1.4), rate_hz=2.0, height_m=1.8, walks=True, tilt_deg=5.0, bob_m=0.03, sway_m=0.04
+    ),
+    "handheld": HANDHELD,
+    "cart": Carrier(speed_mps=(0.8, 1.2), height_m=0.6, tilt_deg=0.0),
+    "stop-and-reverse": Carrier(halt_every_s=(12.0, 35.0)),
+}
+"""Carriers by name."""
+
+
+def body_tilt(rng: np.random.Generator, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+    """Draws pitch and roll of the vehicle's body relative to the ground at `times`, in radians."""
+    steps = np.arange(0, times[-1] + 1 / PATH_HZ, 1 / PATH_HZ)
+    width = TILT_S * PATH_HZ
+    noise = gaussian_filter1d(rng.normal(size=(len(steps), 2)), width, axis=0, mode="wrap")
+    noise *= np.sqrt(2 * width * np.sqrt(np.pi)) * np.radians(TILT_DEG)  # undoes the loss of variance in the filter
+    return np.stack([np.interp(times, steps, axis) for axis in noise.T], axis=1)
+
+
+def steps(
+    rng: np.random.Generator, times: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Draws the motion of a walking person at `times`, as fractions of its amplitudes, between -1 and 1.
+
+    Pitch and roll oscillate with the steps, around directions that change over some seconds.
+
+    Returns:
+      Pitch and roll, and height.
+    """
+    phase = np.pi * STEPS_HZ * times[:, None] * rng.uniform(0.97, 1.03, 2)  # the body sways once every two steps
+    sway = np.sin(phase * [2, 1] + rng.uniform(0, 2 * np.pi, 2))
+    seconds = rng.uniform(3, 8, 2)
+    drift = np.sin(2 * np.pi * times[:, None] / seconds + rng.uniform(0, 2 * np.pi, 2))
+    return 0.6 * sway + 0.4 * drift, np.sin(2 * phase[:, 0])

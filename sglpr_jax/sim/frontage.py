@@ -5,13 +5,13 @@ Positions are in the frame of the side: s is the distance along the street, d th
 
 import itertools
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from sglpr_jax.sim import buildings, plants, vehicles
-from sglpr_jax.sim.raw_ids import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN
+from sglpr_jax.sim import objects
+from sglpr_jax.sim.objects import FENCE, OTHER_OBJECT, POLE, TERRAIN, TRAFFIC_SIGN, Beside, Part, Range, Thing, Zone
 from sglpr_jax.sim.styles import Side, draw_house
-from sglpr_jax.sim.things import Part, Placed, Range, Thing, Zone
 
 Clock = tuple[float, float]
 """Start and end of a period, such as the drive, in seconds."""
@@ -23,7 +23,7 @@ CHANGING_BUSHES = 0.1
 
 def frontage(
     rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock, bystanders: Iterator[Callable]
-) -> Iterator[Placed]:
+) -> Iterator[Beside]:
     """Yields the things along one side from s = `start` to `stop`, where no other street joins.
 
     `bystanders` yields functions that draw people, bicycles and similar things, in the order of their use.
@@ -35,7 +35,7 @@ def frontage(
     for s in _poisson(rng, side.style.bystanders, start, stop):
         d = side.verge - rng.uniform(0.3, max(side.strips[-1].width, 0.6) if side.strips else 0.6)
         make = next(bystanders)
-        make = vehicles.people if side.style.groups and make is vehicles.person else make
+        make = objects.people if side.style.groups and make is objects.person else make
         yield from _changing(rng, make, s, d, rng.choice((0.0, np.pi)) + rng.normal(0, 0.2), "verge", clock, 0.65)
     if side.wood:
         yield from _wood(rng, side, start, stop)
@@ -84,41 +84,40 @@ def _changing(
     zone: Zone,
     clock: Clock,
     occupied: float,
-) -> Iterator[Placed]:
+) -> Iterator[Beside]:
     """Yields the things that occupy one place one after another."""
     for since, until in stays(rng, clock, occupied):
         shift, turn = rng.normal(0, 0.15, 2), rng.normal(0, 0.03)
-        yield Placed(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, zone, since, until)
+        yield Beside(make(rng), s + shift[0], d + shift[1] / 2, yaw + turn, zone, since, until)
 
 
-def _parked_cars(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
+def _parked_cars(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
     d = side.strips[0].width / 2 + 0.1
     for s in _steps(rng, start + 4, stop - 4, (5.4, 6.4)):
         yaw = rng.choice((0.0, np.pi))
-        yield from _changing(rng, vehicles.parked, s, d, yaw, "bay", clock, side.occupied)
+        yield from _changing(rng, objects.parked, s, d, yaw, "bay", clock, side.occupied)
 
 
-def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+def _street_furniture(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Lamp posts, bins, benches, posts and signs at the edge of the sidewalk nearest to the road."""
     d = side.verge - side.strips[-1].width + 0.35 if side.strips else 0.7
     zone: Zone = "verge" if side.strips else "plot"
-    if side.style.lamps:
+    if side.style.street.lamps:
         spacing = rng.uniform(20, 40)
         for s in _steps(rng, start, stop, (spacing, spacing + 3)):
-            yield Placed((Part("cylinder", POLE, (0.18, 0.18, rng.uniform(5, 8))),), s, d, zone=zone)
+            yield Beside((objects.post(POLE, 0.18, rng.uniform(5, 8)),), s, d, zone=zone)
         for s in _steps(rng, start, stop, (40.0, 120.0)):
-            yield Placed(bin_or_bench(rng), s, d + 0.3, zone=zone)
+            yield Beside(bin_or_bench(rng), s, d + 0.3, zone=zone)
     if side.post_spacing:
         for s in _steps(rng, start, stop, (side.post_spacing, side.post_spacing + 0.2)):
-            yield Placed((Part("cylinder", POLE, (0.15, 0.15, 1.4)),), s, d, zone=zone)
-    for s in _poisson(rng, side.style.signs, start, stop):
+            yield Beside((objects.post(POLE, 0.15, 1.4),), s, d, zone=zone)
+    for s in _poisson(rng, side.style.street.signs, start, stop):
         size, low = rng.uniform(0.5, 0.9), rng.uniform(1.3, 2.1)
-        post = Part("cylinder", POLE, (0.08, 0.08, low + size))
-        plate = Part("box", TRAFFIC_SIGN, (0.06, size, size), x=0.06, bottom=low)
-        yield Placed((post, plate), s, d, rng.normal(0, 0.2), zone)
+        plate = objects.block(TRAFFIC_SIGN, 0.06, size, size, x=0.06, bottom=low)
+        yield Beside((objects.post(POLE, 0.08, low + size), plate), s, d, rng.normal(0, 0.2), zone)
 
 
-def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Street trees, on the median if the street has one. The median of a highway has a guard rail instead."""
     if side.median and side.border == "rail":
         yield from _in_pieces(rng, "rail", start, stop, side.median / 2, "verge")
@@ -131,162 +130,161 @@ def _tree_row(rng: np.random.Generator, side: Side, start: float, stop: float) -
     for d in rows:
         for s in _steps(rng, start + 2, stop - 2, (side.tree_spacing, side.tree_spacing + 1)):
             spread = (2.0, 4.0) if side.median or side.strips else (3.0, 7.0)
-            yield Placed(_tree(rng, side, spread), s, d, zone="verge" if side.strips else "plot")
+            yield Beside(_tree(rng, side, spread), s, d, zone="verge" if side.strips else "plot")
 
 
 def _tree(rng: np.random.Generator, side: Side, spread: Range) -> Thing:
-    return plants.limbed_tree(rng, spread) if side.style.old_trees else plants.tree(rng, spread)
+    return objects.limbed_tree(rng, spread) if side.style.plants.old_trees else objects.tree(rng, spread)
 
 
-_BORDERS: dict[str, tuple[float, Range, float]] = {
-    # thickness and range of heights in metres, fraction of the line that is closed
-    "hedge": (1.0, (0.9, 2.6), 0.9),
-    "trimmed": (0.8, (0.9, 2.2), 0.9),
-    "hedgerow": (0.3, (1.2, 3.0), 0.95),
-    "fence": (0.06, (0.9, 1.8), 0.85),
-    "lattice": (0.08, (0.8, 1.5), 0.9),
-    "wall": (0.25, (0.7, 2.2), 0.9),
-    "screen": (0.2, (1.6, 3.5), 1.0),
-    "rail": (0.15, (0.75, 0.8), 1.0),
-}
+class Border(NamedTuple):
+    """Border of a plot: its sizes in metres, and the function that makes a piece of it along x."""
+
+    thickness: float
+    height: Range
+    closed: float  # fraction of the line that is closed
+    make: Callable[[np.random.Generator, float, float, float], Thing]
+    """Function of a random generator, length, thickness and height."""
 
 
-def _piece(rng: np.random.Generator, border: str, length: float, thickness: float, height: float) -> Thing:
-    if border == "hedge":
-        return plants.hedge(length, thickness, height)
-    if border == "trimmed":
-        return plants.trimmed_hedge(rng, length, thickness, height)
-    if border == "lattice":
-        return _lattice(rng, length, thickness, height)
-    if border == "hedgerow":
-        return plants.hedgerow(rng, length, thickness, height)
-    if border == "rail":
-        return (
-            Part("box", FENCE, (length, thickness, 0.35), bottom=height - 0.35),
-            Part("cylinder", FENCE, (0.12, 0.12, height)),
-        )
-    porosity = 0.45 if border == "fence" else 0.0
-    return (Part("box", FENCE, (length, thickness, height + 0.3), bottom=-0.3, porosity=porosity),)
+def _fence(porosity: float) -> Callable[..., Thing]:
+    """Function that makes a piece of a fence, or of a wall with porosity 0."""
+    return lambda rng, length, thickness, height: (
+        objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=porosity),
+    )
+
+
+def _rail(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
+    beam = objects.block(FENCE, length, thickness, 0.35, bottom=height - 0.35)
+    return beam, objects.post(FENCE, 0.12, height)
 
 
 def _lattice(rng: np.random.Generator, length: float, thickness: float, height: float) -> Thing:
     """Low see-through fence on posts, with a bush behind some pieces."""
-    size, porosity = (length, thickness, height + 0.3), rng.uniform(0.4, 0.8)
-    parts = [
-        Part("box", FENCE, size, bottom=-0.3, porosity=porosity),
-        Part("box", FENCE, (0.15, 0.15, height + 0.1)),
-    ]
+    mesh = objects.block(FENCE, length, thickness, height + 0.3, bottom=-0.3, porosity=rng.uniform(0.4, 0.8))
+    parts = [mesh, objects.block(FENCE, 0.15, 0.15, height + 0.1)]
     if rng.random() < 0.3:
         x, y = rng.uniform(-0.4, 0.4) * length, rng.uniform(0.7, 1.5)
-        parts += [part._replace(x=part.x + x, y=part.y + y) for part in plants.bush(rng, 0.6)]
+        parts += [part._replace(x=part.x + x, y=part.y + y) for part in objects.bush(rng, 0.6)]
     return tuple(parts)
+
+
+_BORDERS = {
+    "hedge": Border(1.0, (0.9, 2.6), 0.9, lambda rng, *size: objects.hedge(*size)),
+    "trimmed": Border(0.8, (0.9, 2.2), 0.9, objects.trimmed_hedge),
+    "hedgerow": Border(0.3, (1.2, 3.0), 0.95, objects.hedgerow),
+    "fence": Border(0.06, (0.9, 1.8), 0.85, _fence(0.45)),
+    "lattice": Border(0.08, (0.8, 1.5), 0.9, _lattice),
+    "wall": Border(0.25, (0.7, 2.2), 0.9, _fence(0.0)),
+    "screen": Border(0.2, (1.6, 3.5), 1.0, _fence(0.0)),
+    "rail": Border(0.15, (0.75, 0.8), 1.0, _rail),
+}
 
 
 def _in_pieces(
     rng: np.random.Generator, border: str, start: float, stop: float, d: float, zone: Zone
-) -> Iterator[Placed]:
+) -> Iterator[Beside]:
     """Border along the street, in short pieces that follow curves and slopes."""
-    thickness, heights, _ = _BORDERS[border]
-    height = rng.uniform(*heights)
+    kind = _BORDERS[border]
+    height = rng.uniform(*kind.height)
     count = int((stop - start) / 5) + 1
     edges = np.linspace(start, stop, count + 1).tolist()
     for low, high in itertools.pairwise(edges):
-        yield Placed(_piece(rng, border, high - low + 0.1, thickness, height), (low + high) / 2, d, zone=zone)
+        yield Beside(kind.make(rng, high - low + 0.1, kind.thickness, height), (low + high) / 2, d, zone=zone)
 
 
-def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+def _border(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Border between the plots and the sidewalk, with entrances."""
     if side.border == "none":
         return
-    thickness, _, closed = _BORDERS[side.border]
-    d = side.verge + 0.45 + thickness / 2
+    border = _BORDERS[side.border]
+    d = side.verge + 0.45 + border.thickness / 2
     s = start
     while s < stop - 1:
-        end = stop if side.border == "rail" else min(s + rng.uniform(*side.style.closed), stop)
-        if rng.random() < closed:
+        end = stop if side.border == "rail" else min(s + rng.uniform(*side.style.plots.closed), stop)
+        if rng.random() < border.closed:
             yield from _in_pieces(rng, side.border, s, end, d, "plot")
         s = end + rng.uniform(2, 4.5)
 
 
-def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
+def _plots(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
     """Row of houses. Gaps between houses may hold cars, a garage, a wall or a hedge."""
     style = side.style
-    s = start + max(rng.uniform(*style.gap), 0) / 2
+    s = start + max(rng.uniform(*style.plots.gap), 0) / 2
     while s < stop - 3.5:
         plan = side.row or draw_house(rng, style)
-        width, gap = min(plan.width, stop - s), rng.uniform(*style.gap)
-        if rng.random() < style.houses:
+        width, gap = min(plan.width, stop - s), rng.uniform(*style.plots.gap)
+        if rng.random() < style.plots.houses:
             near = rng.random() < (1.0 if side.row else 0.75)
-            set_back = side.set_back if near else rng.uniform(*style.set_back)
-            plan = buildings.House(width, plan.depth, plan.height, plan.glass)
-            thing = buildings.house(rng, plan, porch=set_back > 2)
-            yield Placed(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
+            set_back = side.set_back if near else rng.uniform(*style.plots.set_back)
+            plan = objects.House(width, plan.depth, plan.height, plan.glass)
+            thing = objects.house(rng, plan, porch=set_back > 2)
+            yield Beside(thing, s + width / 2, side.verge + 0.1 + set_back, rng.normal(0, 0.008))
         if gap > 2.5 and s + width + gap < stop:
             yield from _between_houses(rng, s + width, side, gap, clock)
         s += width + gap
 
 
-def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock) -> Iterator[Placed]:
+def _between_houses(rng: np.random.Generator, s: float, side: Side, gap: float, clock: Clock) -> Iterator[Beside]:
     what = rng.choice(["cars", "garage", "hedge", "wall", "nothing"], p=[0.4, 0.2, 0.15, 0.1, 0.15])
     middle, d = s + gap / 2, side.verge
     if what == "cars":
         for at in np.arange(s + 1.4, s + min(gap, 14) - 1.2, 2.6).tolist():
-            yield from _changing(rng, vehicles.parked, at, d + 4.5, np.pi / 2, "plot", clock, 0.6)
+            yield from _changing(rng, objects.parked, at, d + 4.5, np.pi / 2, "plot", clock, 0.6)
     elif what == "garage":
-        yield Placed(buildings.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
+        yield Beside(objects.garage(rng, min(gap, rng.uniform(3, 7))), middle, d + rng.uniform(3, 9))
     elif what == "hedge":
-        yield Placed(plants.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
+        yield Beside(objects.hedge(9.0, 0.8, rng.uniform(1, 2.2)), middle, d + 6, np.pi / 2)
     elif what == "wall":
-        yield Placed(_piece(rng, "wall", 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
+        yield Beside(_BORDERS["wall"].make(rng, 9.0, 0.25, rng.uniform(1.2, 2.2)), middle, d + 6, np.pi / 2)
 
 
-def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Placed]:
+def _greenery(rng: np.random.Generator, side: Side, start: float, stop: float, clock: Clock) -> Iterator[Beside]:
     """Trees and bushes on the plots, most of them near the street."""
-    for s in _poisson(rng, side.style.trees, start, stop):
+    for s in _poisson(rng, side.style.plants.trees, start, stop):
         d, kind = side.verge + 1.0 + 14 * rng.random() ** 2, rng.random()
         if kind < 0.28:
-            yield Placed(_tree(rng, side, (3.0, 7.0)), s, d)
+            yield Beside(_tree(rng, side, (3.0, 7.0)), s, d)
         elif kind < 0.35:
-            yield Placed(plants.conifer(rng), s, d)
+            yield Beside(objects.conifer(rng), s, d)
         elif rng.random() < CHANGING_BUSHES:
-            yield from _changing(rng, plants.bush, s, d, 0.0, "plot", clock, 0.5)
+            yield from _changing(rng, objects.bush, s, d, 0.0, "plot", clock, 0.5)
         else:
-            yield Placed(plants.bush(rng), s, d)
+            yield Beside(objects.bush(rng), s, d)
 
 
-def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+def _wood(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Edge of a wood, three rows deep."""
     edge = side.verge + rng.uniform(2.5, 6)
     for row in range(3):
         for s in _steps(rng, start, stop, (3.0 + row, 5.5 + 2 * row)):
-            yield Placed(plants.thicket(rng), s, edge + 4.5 * row + rng.uniform(0, 2), rng.uniform(0, 2 * np.pi))
+            yield Beside(objects.thicket(rng), s, edge + 4.5 * row + rng.uniform(0, 2), rng.uniform(0, 2 * np.pi))
 
 
-def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+def _banks(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Banks beside the road, with bushes on them."""
     for s in _steps(rng, start, stop, (9.0, 14.0)):
         length, width, height = rng.uniform((16, 9, 1.5), (30, 16, 4.0)).tolist()
         bank = Part("ellipsoid", TERRAIN, (length, width, 2 * height), bottom=-height, roughness=0.02)
         bushes = [
             part._replace(x=part.x + rng.uniform(-0.3, 0.3) * length, bottom=part.bottom + 0.85 * height)
-            for part in plants.bush(rng, 1.3)
+            for part in objects.bush(rng, 1.3)
         ]
-        yield Placed((bank, *bushes), s, side.verge + 1 + width / 2)
+        yield Beside((bank, *bushes), s, side.verge + 1 + width / 2)
 
 
-def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Placed]:
+def _slope(rng: np.random.Generator, side: Side, start: float, stop: float) -> Iterator[Beside]:
     """Foot of a hill: long, overlapping mounds that are mostly below the ground."""
     length, width, height, sunk = rng.uniform((20, 16, 3.0, 0.3), (35, 50, 8.0, 0.8)).tolist()
     for s in _steps(rng, start, stop, (5.0, 7.0)):
         across = width * rng.uniform(0.95, 1.05)
         size, bottom = (length, across, 2 * height), -(1 + sunk) * height
-        yield Placed((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
+        yield Beside((Part("ellipsoid", TERRAIN, size, bottom=bottom, roughness=0.05),), s, side.verge + 1 + across / 2)
 
 
 def bin_or_bench(rng: np.random.Generator) -> Thing:
     """Bin or bench, as a box of the class other-object."""
-    length, width, height = rng.uniform((0.5, 0.5, 0.8), (1.8, 0.8, 1.3)).tolist()
-    return (Part("box", OTHER_OBJECT, (length, width, height)),)
+    return (objects.block(OTHER_OBJECT, *rng.uniform((0.5, 0.5, 0.8), (1.8, 0.8, 1.3)).tolist()),)
 
 
 def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generator], Thing]]:
@@ -294,9 +292,9 @@ def bystanders(rng: np.random.Generator) -> Iterator[Callable[[np.random.Generat
 
     Each block of ten contains three people, three bicycles and one of each other kind.
     """
-    person, bicycle = vehicles.person, vehicles.bicycle
+    person, bicycle = objects.person, objects.bicycle
     kinds = [person, person, person, bicycle, bicycle, bicycle]
-    kinds += [vehicles.bicyclist, vehicles.motorcycle, vehicles.motorcyclist, bin_or_bench]
+    kinds += [objects.bicyclist, objects.motorcycle, objects.motorcyclist, bin_or_bench]
     while True:
         for i in rng.permutation(len(kinds)).tolist():
             yield kinds[i]

@@ -1,12 +1,22 @@
-"""Ground: smooth hills and a raster of semantic labels."""
+"""Ground: smooth hills, a raster of semantic labels, and the intersection of rays with both.
+
+Along a ray, a parabola approximates the ground, so the intersection is the solution of a quadratic equation. Two
+parabolas are used, both with the height and slope of the ground below the sensor. The first one also has the curvature
+there and gives the approximate distance. The second one passes through the true height at that distance. The error in
+height is at most 0.04 m at distances of 30 to 40 m in towns. In the outskirts, 6 % of the errors exceed 0.2 m there.
+Shapes stand on the true height.
+"""
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from sglpr_jax.sim.raw_ids import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
-from sglpr_jax.sim.scenery import TOWN, Scenery
+from sglpr_jax.sim.objects import LANE_MARKING, OTHER_GROUND, PARKING, ROAD
+from sglpr_jax.sim.shapes import AnyArray, Vectors
+from sglpr_jax.sim.styles import TOWN, Scenery
 
 CELL_M = 0.25
 """Size of a cell of the raster, in metres."""
@@ -16,6 +26,8 @@ ROAD_LEVEL = (ROAD, PARKING, OTHER_GROUND, LANE_MARKING)
 """Labels of ground at the level of the road."""
 
 _WAVES = 4
+_NEAR_M = 3.0
+"""Minimum distance of the fitted point, in metres. At smaller distances, hills bend by less than a millimetre."""
 
 
 class Relief(NamedTuple):
@@ -87,3 +99,89 @@ def is_raised(label: Int[np.ndarray, "*b"]) -> Bool[np.ndarray, "*b"]:
 def surface_height(ground: Ground, xy: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
     """Height of the ground at `xy` including kerbs, in metres."""
     return np.asarray(relief_height(ground.relief, xy) + KERB_M * is_raised(label_at(ground, xy)))
+
+
+class GroundView(NamedTuple):
+    """Ground around a sensor at x = y = 0. Array shapes are the same for every scan."""
+
+    label: AnyArray  # (rows, columns) uint8 raw ids of the cells
+    corner: AnyArray  # (2,) x and y of the raster's first corner, metres
+    relief: Relief  # with phases relative to the sensor's x and y
+    sensor_z: AnyArray  # () z of the sensor in the world frame, metres
+    height: AnyArray  # () height of the sensor above the road level below it, metres
+    gradient: AnyArray  # (2,) slope of this road level along x and y
+    curvature: AnyArray  # (2, 2) second derivatives of this road level, 1 / metres
+
+
+def ground_view(ground: Ground, sensor: Float[np.ndarray, "3"], *, reach_m: float) -> GroundView:
+    """Crops the ground to `reach_m` around a sensor at the world position `sensor`."""
+    xy, relief = sensor[:2], ground.relief
+    near = ground.around(xy, reach_m)
+    local = relief._replace(phase=(relief.wave @ xy + relief.phase) % (2 * np.pi))
+    numbers = (
+        near.origin - xy,
+        local,
+        sensor[2],
+        sensor[2] - relief_height(relief, xy),
+        relief_gradient(relief, xy),
+        relief_curvature(relief, xy),
+    )
+    return GroundView(near.label, *jax.tree.map(np.float32, numbers))
+
+
+def meet_ground(
+    rays: Vectors, ground: GroundView, *, reach_m: float
+) -> tuple[Float[Array, "*rays"], Int[Array, "*rays"], Float[Array, "*rays"]]:
+    """Returns distance, label and facing of the ground hit by each ray from the sensor.
+
+    `rays` are unit vectors in the world's axes. Facing is the cosine of the angle between ray and normal. A ray that
+    misses the ground has distance inf. Beyond `reach_m`, distances are rough. A ray that hits the vertical face of a
+    kerb gets the label of the ground behind the kerb, and the distance at which it would hit the road there.
+    """
+    slope = ground.gradient[0] * rays.x + ground.gradient[1] * rays.y
+    curvature, closing = ground.curvature, slope - rays.z
+    bend = 0.5 * (curvature[0, 0] * rays.x**2 + curvature[1, 1] * rays.y**2) + curvature[0, 1] * rays.x * rays.y
+
+    about = jnp.clip(_crossing(bend, closing, ground.height), _NEAR_M, reach_m)
+    rise = _height(ground.relief, about * rays.x, about * rays.y) - (ground.sensor_z - ground.height)
+    bend = (rise - slope * about) / about**2
+
+    at_kerb, at_road = _crossing(bend, closing, ground.height - KERB_M), _crossing(bend, closing, ground.height)
+    kerb_label, road_label = _label(rays, at_kerb, ground), _label(rays, at_road, ground)
+    raised = _is_raised(kerb_label) & jnp.isfinite(at_kerb)
+    distance = jnp.where(raised, at_kerb, at_road)
+    facing = jnp.clip(closing + 2 * bend * jnp.where(jnp.isfinite(distance), distance, 0), 0, 1)
+    return distance, jnp.where(raised, kerb_label, road_label), facing
+
+
+def _height(relief: Relief, x: Array, y: Array) -> Array:
+    """Height of the road level at x and y, in metres."""
+
+    def add_wave(height: Array, wave: Relief) -> tuple[Array, None]:
+        return height + wave.amplitude * jnp.sin(wave.wave[0] * x + wave.wave[1] * y + wave.phase), None
+
+    # A loop, because XLA would recompute a plain sum at each of its uses, and sines are slow.
+    return jax.lax.scan(add_wave, jnp.zeros_like(x), relief)[0]
+
+
+def _crossing(bend: Array, closing: Array, height: AnyArray) -> Array:
+    """Smallest t > 0 at which the ray enters the ground: bend t^2 + closing t = height; inf if it never does.
+
+    This form of the root also holds for bend = 0. `height` is positive.
+    """
+    discriminant = closing**2 + 4 * bend * height
+    slope = closing + jnp.sqrt(jnp.maximum(discriminant, 0))
+    meets = (discriminant >= 0) & (slope > 1e-6)
+    return jnp.where(meets, 2 * height / jnp.where(meets, slope, 1), jnp.inf)
+
+
+def _label(rays: Vectors, distance: Array, ground: GroundView) -> Int[Array, "*rays"]:
+    distance = jnp.where(jnp.isfinite(distance), distance, 0)
+    (rows, columns), corner = ground.label.shape, ground.corner
+    row = jnp.clip(jnp.floor((distance * rays.y - corner[1]) / CELL_M).astype(jnp.int32), 0, rows - 1)
+    column = jnp.clip(jnp.floor((distance * rays.x - corner[0]) / CELL_M).astype(jnp.int32), 0, columns - 1)
+    return jnp.asarray(ground.label)[row, column].astype(jnp.int32)
+
+
+def _is_raised(label: Int[Array, "*rays"]) -> Bool[Array, "*rays"]:
+    return jnp.all(jnp.stack([label != low for low in ROAD_LEVEL]), axis=0)

@@ -5,6 +5,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,9 +14,11 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.submap import submaps
-from sglpr_jax.sim.carriers import HANDHELD, VEHICLE, Carrier, Motion
-from sglpr_jax.sim.choices import RATE_HZ
+from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.drive import (
+    VEHICLE,
+    Carrier,
+    Motion,
     PlanarPath,
     TimedPoses,
     check_drawing,
@@ -28,8 +31,8 @@ from sglpr_jax.sim.drive import (
     read_path,
     speeds,
 )
-from sglpr_jax.sim.scenery import TOWN, Scenery
 from sglpr_jax.sim.sensor import HDL64E, Sensor, scan
+from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
 
 KEPT_SCANS = 8
@@ -49,6 +52,15 @@ class SimulatedRecording(Recording):
     """
 
 
+class PlannedRecording(NamedTuple):
+    """Recording of a dataset before it is simulated: its name, the names of its scans, and the function that simulates
+    it."""
+
+    name: str
+    ids: tuple[str, ...]
+    simulate: Callable[[], SimulatedRecording]
+
+
 def simulate_recording(
     name: str = "00",
     *,
@@ -59,11 +71,10 @@ def simulate_recording(
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
     carrier: Carrier = VEHICLE,
-    handheld: bool = False,
 ) -> SimulatedRecording:
     """Builds the town around a drive and returns the recording of the drive.
 
-    Building takes some seconds, and rendering a scan takes some hundredths of a second. `write_dataset` writes the same
+    Building takes some seconds, and rendering a scan takes some hundredths of a second. `simulate` writes the same
     scans for the same arguments.
 
     Arguments:
@@ -76,7 +87,6 @@ def simulate_recording(
       scenery: Scenery of the town.
       carrier: Carrier of the sensor. Only its height and sway are used: speed and rate are those of the route, and the
         carrier does not halt.
-      handheld: Whether the carrier is `HANDHELD`.
 
     Raises:
       ValueError: The route is unknown, `rate_hz` is not positive, `seed` is negative, or the pose file is malformed.
@@ -102,7 +112,7 @@ def simulate_recording(
         sensor=sensor,
         key=jax.random.fold_in(jax.random.key(seed), seeds[1]),
         rng=np.random.default_rng((*seeds, 2)),
-        carrier=HANDHELD if handheld else carrier,
+        carrier=carrier,
     )
 
 
@@ -118,10 +128,6 @@ def with_submaps(recording: SimulatedRecording, length_m: float) -> SimulatedRec
         return np.pad(record.points, ((0, 0), (0, 1))), record.labels  # submaps have no intensities
 
     return dataclasses.replace(recording, read=view.read, render=render, found=view.found)
-
-
-def _mounting(height_m: float) -> Mounting | None:
-    return None if height_m == MODEL_HEIGHT_M else Mounting(height_m)
 
 
 def drive_through(
@@ -156,6 +162,7 @@ def drive_through(
     in_world, of_lidar = _poses(world, path, rows, motion)
     poses = TimedPoses(of_lidar, times)
     speed = speeds(path)[rows]
+    height_m = sensor.height_m if carrier.height_m is None else carrier.height_m
     row_of = {scan_id: i for i, scan_id in enumerate(ids)}
 
     @functools.lru_cache(maxsize=KEPT_SCANS)
@@ -177,7 +184,7 @@ def drive_through(
         paths=names,
         label_paths=names,
         read=read,
-        mounting=_mounting(sensor.height_m if carrier.height_m is None else carrier.height_m),
+        mounting=None if height_m == MODEL_HEIGHT_M else Mounting(height_m),
         on_disk=False,
         poses=poses,
         render=render,

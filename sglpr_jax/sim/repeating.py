@@ -5,13 +5,11 @@ import dataclasses
 import jax
 import numpy as np
 
-from sglpr_jax.sim.carriers import VEHICLE, Carrier
-from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, timed
+from sglpr_jax.sim.drive import VEHICLE, Carrier, PlanarPath, check_drawing, drive_seed, timed
 from sglpr_jax.sim.recording import SimulatedRecording, drive_through
-from sglpr_jax.sim.routes import REVISITS, Revisit
+from sglpr_jax.sim.routes import REVISITS, Line, Revisit
 from sglpr_jax.sim.sceneries import REPEATING, Repeating
-from sglpr_jax.sim.sceneries.site import Site, build
-from sglpr_jax.sim.sceneries.ways import LAPS, Line, way
+from sglpr_jax.sim.sceneries.site import LAPS, Site, build, way
 from sglpr_jax.sim.sensor import HDL64E, Sensor
 from sglpr_jax.sim.world import World
 

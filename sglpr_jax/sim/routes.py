@@ -27,6 +27,8 @@ TRIES, TRIES_PER_LOOP = 100, 30
 
 Revisit = Literal["none", "same", "opposite"]
 REVISITS: tuple[Revisit, ...] = ("none", "same", "opposite")
+Line = Float[np.ndarray, "_ 2"]
+"""Points of a line in the plane, in metres."""
 Node = tuple[int, int]
 """Crossing of the lattice: column and row."""
 STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))

@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sglpr_jax.se3 import are_rotations
-from sglpr_jax.sim.ground_cast import GroundView, ground_view, meet_ground
-from sglpr_jax.sim.raycast import COLUMNS, Candidates, Chance, find_candidates, nearest_hit, sector_count
-from sglpr_jax.sim.returns import Surface, echo_returns, mix_edges, nearer, reflectivity, surface_of_shapes
-from sglpr_jax.sim.scattered import ScanPattern, outside_round, scattered
+from sglpr_jax.sim.ground import GroundView, ground_view, meet_ground
+from sglpr_jax.sim.raycast import (
+    COLUMNS,
+    Candidates,
+    Chance,
+    Surface,
+    echo_returns,
+    find_candidates,
+    mix_edges,
+    nearer,
+    nearest_hit,
+    reflectivity,
+    sector_count,
+    surface_of_shapes,
+)
 from sglpr_jax.sim.shapes import AnyArray, Vectors
 from sglpr_jax.sim.world import World
 
@@ -37,8 +49,14 @@ def _bands(first_deg: float, last_deg: float, count: int) -> tuple[float, ...]:
 
 
 TURN_S = 0.1
+"""Duration of a scan, in seconds."""
+STEPS = 0.6180339887498949, 0.7548776662466927, 0.5698402909980532
+"""Steps of the sequence from one azimuth, laser and scan to the next: irrational numbers without a common multiple."""
 LASERS_AT_A_TIME = 16
 """Maximum number of lasers in a block. The block size is its greatest common divisor with the number of lasers."""
+
+
+ScanPattern = Literal["rings", "scattered", "scattered-round"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +79,7 @@ class Sensor:
     dropout: float = 0.02
     """Fraction of the returns that are lost, whatever the surface."""
     faintest_echo: float = 6e-6
-    """Strength of an echo that is detected with a probability of 63 %, see `returns.echo_returns`."""
+    """Strength of an echo that is detected with a probability of 63 %, see `raycast.echo_returns`."""
     edge_share: float = 0.3
     """Fraction of the returns at an edge with a range between those of its two sides."""
     shadows_deg: tuple[tuple[float, float, float], ...] = ()
@@ -301,3 +319,31 @@ def _shadowed(sensor: Sensor) -> Bool[np.ndarray, "lasers azimuths"]:
     for first, last, below in sensor.shadows_deg:
         hidden |= ((azimuth - first) % 360 <= last - first) & (elevation < below)
     return hidden
+
+
+def scattered(elevations_deg: Sequence[float], azimuths: int, *, time: float) -> Float[np.ndarray, "lasers {azimuths}"]:
+    """Elevation of each ray of a scan that does not repeat its pattern, as those of Livox, in degrees.
+
+    Elevations follow a low-discrepancy sequence, which fills the field of view evenly in space and, scan after scan, in
+    time. They are not the curves of the prisms of a real sensor.
+
+    Arguments:
+      elevations_deg: Middle of the band of elevations of each laser. The bands have equal heights and do not overlap.
+      azimuths: Number of azimuths.
+      time: Time of the scan, in seconds.
+    """
+    middle = np.array(elevations_deg)
+    height = abs(middle[1] - middle[0])
+    azimuth, laser, scan = np.arange(azimuths), np.arange(len(middle))[:, None], time / TURN_S
+    part = (azimuth * STEPS[0] + laser * STEPS[1] + scan * STEPS[2]) % 1
+    return middle[:, None] + height * (part - 0.5)
+
+
+def outside_round(
+    elevations_deg: Sequence[float], azimuths_deg: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, "lasers n"]:
+    """Whether each ray is outside the ellipse of a round field of view."""
+    elevation = np.array(elevations_deg)[:, None]
+    middle = [(values.max() + values.min()) / 2 for values in (elevation, azimuths_deg)]
+    half = [(values.max() - values.min()) / 2 for values in (elevation, azimuths_deg)]
+    return ((elevation - middle[0]) / half[0]) ** 2 + ((azimuths_deg - middle[1]) / half[1]) ** 2 > 1

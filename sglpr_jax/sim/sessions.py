@@ -7,31 +7,22 @@ days, while temporary things have changed.
 import datetime
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from sglpr_jax.sim.choices import RATE_HZ
+from sglpr_jax.sim import RATE_HZ
 from sglpr_jax.sim.drive import PlanarPath, check_drawing, drive_seed, plan_path
 from sglpr_jax.sim.layouts import to_utime
-from sglpr_jax.sim.recording import SimulatedRecording, drive_through
-from sglpr_jax.sim.scenery import TOWN, Scenery
+from sglpr_jax.sim.recording import PlannedRecording, SimulatedRecording, drive_through
 from sglpr_jax.sim.sensor import SENSORS, Sensor
+from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.world import World, build_world
 
 PAUSE_S = 1800.0
 """Pause between two days in the town's time, in seconds. It is three times the mean stay of a parked car."""
 START_H = 12
 """Hour (UTC) at which each session starts."""
-
-
-class Session(NamedTuple):
-    """One day: names of its scans, and the function that simulates them."""
-
-    date: str
-    ids: tuple[str, ...]
-    simulate: Callable[[], SimulatedRecording]
 
 
 def plan_sessions(
@@ -43,7 +34,7 @@ def plan_sessions(
     seed: int = 0,
     rate_hz: float = RATE_HZ,
     scenery: Scenery = TOWN,
-) -> tuple[Session, ...]:
+) -> tuple[PlannedRecording, ...]:
     """Plans one session for each date. The town is built when the first session is simulated.
 
     The first session drives `route`. The others drive the same streets in another order, partly in the opposite
@@ -86,7 +77,7 @@ def _session(
     town: Callable[[], World],
     sensor: Sensor,
     seeds: tuple[int, int, int],
-) -> Session:
+) -> PlannedRecording:
     times = start_s + path.times[rows] - path.times[rows[0]]
     ids = tuple(str(to_utime(time)) for time in times.tolist())
 
@@ -95,7 +86,7 @@ def _session(
         rng = np.random.default_rng((*seeds, 2))
         return drive_through(town(), path, rows, name=date, ids=ids, times=times, sensor=sensor, key=key, rng=rng)
 
-    return Session(date, ids, simulate)
+    return PlannedRecording(date, ids, simulate)
 
 
 def _with_pauses(path: PlanarPath, days: int) -> PlanarPath:

@@ -8,12 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
-from sglpr_jax.sim import vehicles
-from sglpr_jax.sim.ground import Ground
-from sglpr_jax.sim.placing import CLEARANCE_M, Anchors, footprint_distance, join, place
-from sglpr_jax.sim.shapes import Shapes
+from sglpr_jax.sim import objects
+from sglpr_jax.sim.objects import Range, Thing
+from sglpr_jax.sim.placing import CLEARANCE_M, Spot, footprint_distance
 from sglpr_jax.sim.streets import MIDDLE_M, Network, Path
-from sglpr_jax.sim.things import Part, Range, Thing
 
 KEPT_M = 8.0
 """Minimum distance of traffic ahead of the vehicle or behind it, in metres."""
@@ -37,15 +35,15 @@ class Flow:
 
 _DRIVING, _RIDING, _WALKING = (5.0, 12.0), (3.0, 5.5), (0.9, 1.6)
 FLOWS = (
-    Flow(vehicles.car, 80.0, ("oncoming",), _DRIVING),
-    Flow(vehicles.van, 500.0, ("oncoming",), _DRIVING),
-    Flow(vehicles.truck, 300.0, ("oncoming",), _DRIVING),
-    Flow(vehicles.bus, 1200.0, ("oncoming",), _DRIVING),
-    Flow(vehicles.motorcyclist, 300.0, ("oncoming",), _DRIVING),
-    Flow(vehicles.car, 350.0, ("own",), _DRIVING),
-    Flow(vehicles.van, 1500.0, ("own",), _DRIVING),
-    Flow(vehicles.bicyclist, 200.0, ("left walk", "right walk"), _RIDING),
-    Flow(vehicles.person, 45.0, ("left walk", "right walk"), _WALKING),
+    Flow(objects.car, 80.0, ("oncoming",), _DRIVING),
+    Flow(objects.van, 500.0, ("oncoming",), _DRIVING),
+    Flow(objects.truck, 300.0, ("oncoming",), _DRIVING),
+    Flow(objects.bus, 1200.0, ("oncoming",), _DRIVING),
+    Flow(objects.motorcyclist, 300.0, ("oncoming",), _DRIVING),
+    Flow(objects.car, 350.0, ("own",), _DRIVING),
+    Flow(objects.van, 1500.0, ("own",), _DRIVING),
+    Flow(objects.bicyclist, 200.0, ("left walk", "right walk"), _RIDING),
+    Flow(objects.person, 45.0, ("left walk", "right walk"), _WALKING),
 )
 
 
@@ -91,20 +89,17 @@ class Pieces(NamedTuple):
     until: np.ndarray  # (k,)
 
 
-def traffic(rng: np.random.Generator, network: Network, path: Path, ground: Ground) -> tuple[Shapes, list[Part]]:
-    """Draws the traffic around the vehicle, clear of it. Returns the shapes, and the part of each row."""
+def traffic(rng: np.random.Generator, network: Network, path: Path) -> list[Spot]:
+    """Draws the traffic around the vehicle, clear of it."""
     lines = lanes(network, path)
-    pieces = [piece for flow in FLOWS for piece in _movers(rng, flow, lines, path)]
-    rows = [_rows(piece, path, ground) for piece in pieces]
-    tables = [shapes for shapes, _ in rows]
-    return join(*tables), [part for _, parts in rows for part in parts]
+    return [spot for flow in FLOWS for pieces in _movers(rng, flow, lines, path) for spot in _spots(pieces, path)]
 
 
 def _movers(rng: np.random.Generator, flow: Flow, lines: dict[LaneName, Lane], path: Path) -> Iterator[Pieces]:
     """Yields the movers of one flow. The vehicle meets each at another point of the path."""
     for block in np.arange(rng.uniform(-0.5, 0) * flow.every_m, len(path.xy), flow.every_m):
         met, name = block + rng.uniform(0, flow.every_m), flow.lanes[rng.integers(len(flow.lanes))]
-        thing, speed = vehicles.moving(flow.make(rng)), rng.uniform(*flow.speed)
+        thing, speed = objects.moving(flow.make(rng)), rng.uniform(*flow.speed)
         direction, follows = int(rng.choice((-1, 1))), rng.choice((-1, 1)) * rng.uniform(14, 35)
         if not 0 <= met < len(path.xy) or not lines[name].usable[int(met)]:
             continue
@@ -141,19 +136,12 @@ def _pieces(
     return Pieces(thing, *(leaf[inside] for leaf in (xy[:-1], xy[1:], heading, times[:-1], times[1:])))
 
 
-def _rows(pieces: Pieces, path: Path, ground: Ground) -> tuple[Shapes, list[Part]]:
-    """Shapes of the pieces that stay clear of the vehicle, and the part of each row."""
-    keep = _clear(pieces, path)
-    begin, end, heading, since, until = (leaf[keep] for leaf in pieces[1:])
-    count, size = len(heading), len(pieces.thing)
-    row = np.repeat(np.arange(count), size)
-    velocity, middle = (end - begin) / (until - since)[:, None], (since + until) / 2
-    anchors = Anchors((begin + end)[row] / 2, heading[row], np.ones(len(row)), since[row], until[row])
-    parts = [*pieces.thing] * count
-    shapes = place(parts, anchors, ground)
-    centre = shapes.centre.copy()
-    centre[:, :2] -= velocity[row] * middle[row, None]  # position at time 0
-    return shapes._replace(centre=centre, velocity=velocity[row]), parts
+def _spots(pieces: Pieces, path: Path) -> list[Spot]:
+    """Pieces that stay clear of the vehicle."""
+    begin, end, heading, since, until = (leaf[_clear(pieces, path)] for leaf in pieces[1:])
+    velocity = (end - begin) / (until - since)[:, None]
+    rows = np.column_stack([(begin + end) / 2, heading, velocity, since, until, (since + until) / 2]).tolist()
+    return [Spot(pieces.thing, x, y, turn, 1, (vx, vy), *when) for x, y, turn, vx, vy, *when in rows]
 
 
 def _clear(pieces: Pieces, path: Path) -> Bool[np.ndarray, " k"]:

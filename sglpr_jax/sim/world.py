@@ -1,22 +1,70 @@
-"""Town around a drive: streets, things along them, and traffic."""
+"""Town around a drive: streets, things along them, and traffic, clear of the vehicle. Storeys above one another."""
 
+import dataclasses
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sglpr_jax.sim.frontage import Clock, bystanders, frontage
 from sglpr_jax.sim.ground import Ground, draw_relief
-from sglpr_jax.sim.levels import Levels
-from sglpr_jax.sim.paving import paint_ground
-from sglpr_jax.sim.placing import furnish, join, plant_islands, select, to_scene
-from sglpr_jax.sim.plants import bush
-from sglpr_jax.sim.scenery import TOWN, Scenery
+from sglpr_jax.sim.objects import Beside, bush
+from sglpr_jax.sim.placing import CLEARANCE_M, HEAD_ROOM_M, Placed, Spot, distances, place, to_scene
+from sglpr_jax.sim.routes import Line
 from sglpr_jax.sim.shapes import Scene, Shapes
-from sglpr_jax.sim.streets import Network, Path, draw_streets, resample, roundabouts
+from sglpr_jax.sim.streets import Island, Network, Path, draw_streets, paint_ground, resample, roundabouts, runs
+from sglpr_jax.sim.styles import TOWN, Scenery
 from sglpr_jax.sim.traffic import traffic
 
 VIEW_M = 110.0
 """Maximum distance of things from the vehicle, in metres. Standing things that never come closer are omitted."""
+_TOLERANCE_M = 0.3
+"""Depth to which things may overlap the strips of a street, in metres."""
+
+
+class Unfolded(NamedTuple):
+    """Path through storeys."""
+
+    xy: np.ndarray  # (n, 2) positions in the world that holds the storeys side by side, metres
+    ground: np.ndarray  # (n,) true height of the ground, metres
+    slope: np.ndarray  # (n, 2) true slope of the ground along x and y
+
+
+@dataclasses.dataclass(frozen=True)
+class Levels:
+    """Equal storeys above one another, joined by ramps above one another that descend along x.
+
+    In the world, storey k is shifted by k * `pitch_m` along y. The world of each storey has a level copy of the ramp.
+    In the middle of the ramp, a path changes from one storey to the next. A scan on a ramp therefore shows a level ramp
+    that is parallel to the sensor. Its true pose follows the slope, whose change over 1 m is at most about 1.5 degrees.
+    """
+
+    rise_m: float
+    """Height of a storey, in metres."""
+    pitch_m: float
+    """Distance of two storeys along y in the world, in metres."""
+    ramp_y_m: float
+    """Minimum y of paths on the ramps, in metres. Paths with smaller y are on a storey."""
+    top_m: float
+    """x of the top of the ramps, in metres."""
+    foot_m: float
+    """x of the foot of the ramps, in metres, above `top_m`."""
+
+    def along(self, path: Line) -> Unfolded:
+        """Returns the unfolded path of a path that begins on the lowest storey.
+
+        The points of the path must be close enough to find each crossing of the middle of a ramp.
+        """
+        on, beyond = path[:, 1] > self.ramp_y_m, path[:, 0] < (self.top_m + self.foot_m) / 2
+        storey = np.concatenate([[0], np.cumsum(np.diff(beyond.astype(int)) * on[1:])])
+        run = self.foot_m - self.top_m
+        share = ((self.foot_m - path[:, 0]) / run).clip(0, 1)
+        climbed = np.where(on, share**2 * (3 - 2 * share) - beyond, 0)
+        steepness = np.where(on, 6 * share * (1 - share), 0) * self.rise_m / run
+        slope = np.stack([-steepness, np.zeros(len(path))], axis=1)
+        there = path + self.pitch_m * np.stack([np.zeros(len(path)), storey], axis=1)
+        return Unfolded(there, self.rise_m * (storey + climbed), slope)
 
 
 class World(NamedTuple):
@@ -55,14 +103,10 @@ def build_world(
     network, islands = Network(draw_streets(rng, path, scenery)), roundabouts(path)
     ground = paint_ground(network, islands, relief, path.xy)
     clock = (float(times[0]), float(times[-1]))
-    tables = [
-        furnish(rng, network, islands, ground, path.xy, clock),
-        plant_islands(rng, islands, ground, bush),
-        traffic(rng, network, path, ground),
-    ]
-    shapes, parts = join(*(shapes for shapes, _ in tables)), [part for _, some in tables for part in some]
-    keep = _in_view(shapes, path)
-    return World(to_scene(select(shapes, keep), [parts[i] for i in np.flatnonzero(keep)]), ground)
+    standing = furnish(rng, network, islands, ground, path.xy, clock)
+    bushes = [Spot(bush(rng), *island.centre.tolist()) for island in islands]
+    placed = place([*standing, *bushes, *traffic(rng, network, path)], ground)
+    return World(to_scene(placed, _in_view(placed.shapes, path)), ground)
 
 
 def _in_view(shapes: Shapes, path: Path) -> Bool[np.ndarray, " n"]:
@@ -72,3 +116,107 @@ def _in_view(shapes: Shapes, path: Path) -> Bool[np.ndarray, " n"]:
         near = np.sum((shapes.centre[:, :2] - path.xy[i]) ** 2, axis=1) < VIEW_M**2
         keep |= near & (shapes.since <= path.times[i] + 2) & (shapes.until > path.times[i] - 2)
     return keep
+
+
+def furnish(
+    rng: np.random.Generator,
+    network: Network,
+    islands: tuple[Island, ...],
+    ground: Ground,
+    path: Float[np.ndarray, "n 2"],
+    clock: Clock,
+) -> list[Spot]:
+    """Things along the streets of `network`, clear of the streets and of `path`."""
+    items, place_of = [], []
+    makers = bystanders(rng)
+    for stretch, side_index, first, start, stop in _spans(network):
+        side = (stretch.left, stretch.right)[side_index]
+        for item in frontage(rng, side, start, stop, clock, makers):
+            items.append(item)
+            along = first + np.clip(item.s, 0, stretch.stop - 0.01)
+            place_of.append((along, 1 - 2 * side_index, stretch.half_width + item.d))
+    along, side, across = np.array(place_of, dtype=np.float64).reshape(-1, 3).T
+    spots = _in_world(network, along, side, across, items)
+    placed = place(spots, ground)
+    street, zone = network.street[along.astype(int)], np.array([item.zone for item in items])
+    bad = _on_a_street(network, placed, street[placed.owner], zone[placed.owner])
+    bad |= _in_the_way(placed.shapes, path) | _on_an_island(placed.shapes, islands)
+    gone = set(placed.owner[bad].tolist())
+    return [spot for i, spot in enumerate(spots) if i not in gone]
+
+
+def _spans(network: Network) -> Iterator[tuple]:
+    """Yields stretch, side (0 left, 1 right), first point of the street, and the bounds in s of each free interval."""
+    free = _free(network)
+    first, index = 0, 0
+    for street in network.streets:
+        for stretch in street.stretches:
+            for side in (0, 1):
+                here = free[index : index + stretch.stop - stretch.start, side]
+                for low, high in runs(here, gap=1) if here.any() else ():
+                    if high - low > 3:
+                        yield stretch, side, first, float(stretch.start + low), float(stretch.start + high)
+            index += stretch.stop - stretch.start
+        first += len(street.middle)
+
+
+def _free(network: Network) -> Bool[np.ndarray, "n 2"]:
+    """Whether the edge of the plots beside each street point is clear of all other streets, left and right."""
+    left = np.stack([-np.sin(network.heading), np.cos(network.heading)], axis=1)
+    sides = []
+    for column, sign in ((0, 1), (1, -1)):
+        edge = network.middle + sign * (network.half_width + network.verge[:, column] + 0.5)[:, None] * left
+        sides.append(_margin(network, edge, whole_street=np.ones(len(edge), bool)) >= -0.1)
+    return np.stack(sides, axis=1)
+
+
+def _margin(network: Network, xy: np.ndarray, whole_street: np.ndarray) -> np.ndarray:
+    """Distance of each position outside the nearest road, or outside its strips where `whole_street` is true."""
+    nearest = network.nearest(xy)
+    offset = network.offset(xy, nearest)
+    verge = network.verge[nearest, (offset < 0).astype(int)]
+    return np.abs(offset) - network.half_width[nearest] - verge * whole_street
+
+
+def _in_world(
+    network: Network, along: np.ndarray, side: np.ndarray, across: np.ndarray, items: list[Beside]
+) -> list[Spot]:
+    """Converts things beside streets to spots, given their distances along all streets and from the middle."""
+    whole = along.astype(int).clip(0, len(network.middle) - 1)
+    rest, heading = along - whole, network.heading[whole]
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    xy = network.middle[whole] + rest[:, None] * ahead + (side * across)[:, None] * left
+    headings = heading + side * np.array([item.yaw for item in items])
+    return [
+        Spot(item.thing, *place, since=item.since, until=item.until)
+        for item, place in zip(items, zip(*xy.T.tolist(), headings.tolist(), side.tolist(), strict=True), strict=True)
+    ]
+
+
+def _on_a_street(network: Network, placed: Placed, street: np.ndarray, zone: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Whether each shape touches a road, or strips that it belongs behind. Cars must park on their own street."""
+    shapes, bad = placed.shapes, np.zeros(len(zone), bool)
+    cos, sin = np.cos(shapes.yaw), np.sin(shapes.yaw)
+    for u in np.linspace(-1, 1, 7):
+        for v in np.linspace(-1, 1, 5):
+            x, y = u * shapes.half[:, 0], v * shapes.half[:, 1]
+            xy = np.asarray(shapes.centre)[:, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+            bad |= _margin(network, xy, zone == "plot") < -_TOLERANCE_M
+            bad |= (zone == "bay") & (network.street[network.nearest(xy)] != street)
+    return bad & np.array([part.bottom < HEAD_ROOM_M for part in placed.parts], bool)
+
+
+def _in_the_way(shapes: Shapes, path: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, " n"]:
+    """Whether each shape is closer to the vehicle's path than CLEARANCE_M."""
+    dense = np.concatenate([path, (path[1:] + path[:-1]) / 2])
+    return distances(shapes, dense, reach_m=CLEARANCE_M) < CLEARANCE_M + 0.05
+
+
+def _on_an_island(shapes: Shapes, islands: tuple[Island, ...]) -> Bool[np.ndarray, " n"]:
+    """Whether each shape is inside a roundabout."""
+    bad = np.zeros(len(shapes.label), bool)
+    for island in islands:
+        away = np.linalg.norm(shapes.centre[:, :2] - island.centre, axis=1)
+        bad |= away < island.radius + 2 + np.hypot(shapes.half[:, 0], shapes.half[:, 1])
+    return bad

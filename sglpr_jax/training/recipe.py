@@ -16,9 +16,8 @@ from sglpr_jax.data.sampling.held_out import hold_out
 from sglpr_jax.data.sampling.tuples import TuplePool
 from sglpr_jax.models.params import Params
 from sglpr_jax.models.sglpr import init
-from sglpr_jax.models.weights import graft
+from sglpr_jax.models.weights import graft, unwhitened
 from sglpr_jax.models.weights_file import load, save
-from sglpr_jax.models.whitening import unwhitened
 from sglpr_jax.training.batches import TupleBatches, positions_of, tuple_pool
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import TrainConfig, without_untrained_head

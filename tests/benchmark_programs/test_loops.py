@@ -10,7 +10,7 @@ from recordings import of_scans
 import sglpr_jax
 from sglpr_jax.loops.detector import LoopDetector
 from sglpr_jax.loops.probability import ALL, default_model
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.drive import TimedPoses
 from sglpr_jax.sim.recording import SimulatedRecording
 from sglpr_jax.sim.repeating import simulate_repeating
@@ -29,7 +29,7 @@ def test_loops_are_scored_on_simulated_drives():
 
 
 def test_loops_are_scored_on_images(tmp_path):
-    write_dataset(tmp_path, names=("08",), scans=330, sensor=SENSOR, layout="images")
+    simulate(tmp_path, routes=("08",), scans=330, sensor=SENSOR, images=True)
     output = printed("quality.loops", "images", "--data", str(tmp_path), "--seqs", "08", "--odometry", *CHEAPER)
     assert "most probable of three: top-1 F1max" in output and "kept first: top-1 F1max" in output
 

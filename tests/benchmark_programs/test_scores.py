@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.retrieval.descriptor_file import DescriptorFile
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 
 from .programs import SENSOR, printed, table
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_baselines_are_scored_raw_and_rotated(tmp_path):
-    write_dataset(tmp_path, names=("00",), scans=60, sensor=SENSOR)
+    simulate(tmp_path, routes=("00",), scans=60, sensor=SENSOR)
     output = printed("quality.baselines", "--data", str(tmp_path), "--methods", "scan-context", "random")
     assert "60 scans" in output and "revisits" in output
     scores = {row[0]: [float(cell) for cell in row[4:8]] for row in table(output)}
@@ -44,7 +44,7 @@ def test_two_ways_of_training_are_compared_seed_by_seed(tmp_path):
 
 
 def test_the_movement_of_descriptors_under_rotations_is_measured(tmp_path):
-    write_dataset(tmp_path, names=("08",), scans=40, sensor=SENSOR, layout="images")
+    simulate(tmp_path, routes=("08",), scans=40, sensor=SENSOR, images=True)
     options = ("--scans", "2", "--step-deg", "120", "--among", "20")
     output = printed("quality.rotation", "--data", str(tmp_path), "--weights", "circular", *options)
     assert output.splitlines()[-1].startswith("circular: ")

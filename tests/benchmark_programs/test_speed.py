@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 
 from .programs import SENSOR, TINY, printed, table
 
@@ -61,7 +61,7 @@ def test_simulate_prints_its_rate_and_where_the_time_goes():
 
 
 def test_batches_of_packs_are_timed_against_files(tmp_path):
-    write_dataset(tmp_path / "town", names=("00",), scans=40, sensor=SENSOR)
+    simulate(tmp_path / "town", routes=("00",), scans=40, sensor=SENSOR)
     folders = ("--data", tmp_path / "town", "--cache", tmp_path / "cache")
     output = printed("speed.read_batches", *folders, "--preset", TINY, "--count", 1, "--repeats", 2, "--cold")
     assert "40 scans of" in output and "pack / files" in output
@@ -93,7 +93,7 @@ def test_segmented_steps_are_timed_against_one_without_labels(tmp_path):
 
 
 def test_all_pairs_are_timed_distance_by_distance(tmp_path):
-    write_dataset(tmp_path, names=("00",), scans=4, sensor=SENSOR)
+    simulate(tmp_path, routes=("00",), scans=4, sensor=SENSOR)
     options = ("--methods", "scan-context", "random", "--frames", 100, "--seconds", 0)
     rows = table(printed("speed.all_pairs", "--data", tmp_path, *options))
     assert [row[:3] for row in rows] == [["scan-context", "scan-context", "64"], ["random", "l2", "64"]]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
 SCANS = 40
@@ -66,7 +66,7 @@ def _own_cache(tmp_path_factory):
 @pytest.fixture(scope="session")
 def town(once) -> Path:
     """Recordings 00, 05 and 08 of 40 thin scans, with labels; 08 revisits places."""
-    return once("town", lambda root: write_dataset(root, scans=SCANS, sensor=SENSOR))
+    return once("town", lambda root: simulate(root, scans=SCANS, sensor=SENSOR))
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.models.config import CircularConfig, HeadConfig, SglprConfig
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 
 from .conftest import SENSOR, Ended, assert_one_line_error, run_command
 
@@ -38,7 +38,7 @@ SMALL_SGLPR = dataclasses.replace(
 def towns(tmp_path_factory) -> dict[int, Path]:
     """Recordings of fewer scans than other tests have."""
     root = tmp_path_factory.mktemp("data")
-    return {n: write_dataset(root / str(n), names=("08",), scans=n, sensor=SENSOR) for n in (FEW, SCANS)}
+    return {n: simulate(root / str(n), routes=("08",), scans=n, sensor=SENSOR).root for n in (FEW, SCANS)}
 
 
 @pytest.fixture(scope="module")

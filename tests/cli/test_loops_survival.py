@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sglpr_jax.cli.config_file import COMMAND_FILE
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
 from .conftest import run_command
@@ -41,7 +41,7 @@ def results(arguments: tuple[object, ...], out: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 def test_a_killed_run_continues_to_the_same_files(tmp_path):
-    write_dataset(tmp_path / "town", names=("08",), scans=90, sensor=SENSOR)
+    simulate(tmp_path / "town", routes=("08",), scans=90, sensor=SENSOR)
     arguments, out = (tmp_path / "town", "--min-probability", "0.5"), tmp_path / "killed"
     first = out / "unfinished" / "000000.safetensors"
     killed(arguments, out, at=first)

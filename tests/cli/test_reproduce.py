@@ -15,7 +15,7 @@ from sglpr_jax.reproduce.plan import make_plan
 from sglpr_jax.reproduce.runs import Runs
 from sglpr_jax.reproduce.scores import published_rows
 from sglpr_jax.reproduce.tables import OURS, PUBLISHED, PaperTable, Row
-from sglpr_jax.sim.dataset import write_sessions
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.training.metrics_log import read_metrics
 from sglpr_jax.training.presets import load_preset
 from sglpr_jax.training.recipe import TrainResult
@@ -29,7 +29,7 @@ OPTIONS = ("--seq", "08", "--method", "polar-fft", "ssc")
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
-    return write_sessions(tmp_path_factory.mktemp("data") / "days", dates=DAYS, scans=12, sensor=SENSOR)
+    return simulate(tmp_path_factory.mktemp("data") / "days", sessions=DAYS, scans=12, sensor=SENSOR).root
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +163,7 @@ def test_a_run_killed_before_its_settings_were_written_is_begun_anew(
 def test_sessions_are_looked_at_before_anything_is_trained(town, preset, tmp_path, command):
     options = ("--data", town, "--seq", "08", "--method", "polar-fft", "--preset", preset, "--out", tmp_path / "out")
     none, one = tmp_path / "none", tmp_path / "one"
-    write_sessions(one, dates=DAYS[:1], scans=2, sensor=SENSOR)
+    simulate(one, sessions=DAYS[:1], scans=2, sensor=SENSOR)
     assert_one_line_error(command("reproduce", "table3", "--nclt", none, *options), none)
     assert_one_line_error(command("reproduce", "figure8", "--nclt", one, *options), one, "two sessions", DAYS[0])
     assert not (tmp_path / "out").exists()

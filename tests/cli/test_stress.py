@@ -9,7 +9,7 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.corruption import CORRUPTIONS
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
 from .conftest import assert_one_line_error
@@ -21,7 +21,7 @@ load = sglpr_jax.DescriptorFile.load
 def rings(tmp_path_factory):
     """Recording 00 of 100 scans with 64 rings of 30 points."""
     root = tmp_path_factory.mktemp("data") / "rings"
-    return write_dataset(root, names=("00",), scans=100, sensor=Sensor(azimuth_steps=30))
+    return simulate(root, routes=("00",), scans=100, sensor=Sensor(azimuth_steps=30)).root
 
 
 @pytest.fixture

@@ -10,9 +10,8 @@ import pytest
 
 import sglpr_jax
 from sglpr_jax.data.readers import open_recording
-from sglpr_jax.models.weights import weights_hash
+from sglpr_jax.models.weights import weights_hash, whitened
 from sglpr_jax.models.weights_file import load
-from sglpr_jax.models.whitening import whitened
 from sglpr_jax.training.callbacks import Callback
 from sglpr_jax.training.config import OptimizerConfig
 from sglpr_jax.training.presets import load_preset

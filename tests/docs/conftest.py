@@ -8,7 +8,7 @@ import pytest
 import sglpr_jax
 from sglpr_jax.methods.registry import method_named
 from sglpr_jax.pose_graph.files import write_tum
-from sglpr_jax.sim.dataset import write_dataset
+from sglpr_jax.sim.dataset import simulate
 from sglpr_jax.sim.sensor import Sensor
 
 SENSOR = Sensor(elevations_deg=(2.0, -2.0, -6.0, -10.0, -14.0, -18.0, -21.0, -24.0), azimuth_steps=60)
@@ -22,7 +22,7 @@ def examples(once) -> Path:
 
 
 def write_examples(folder: Path) -> None:
-    write_dataset(folder / "KITTI", scans=105, sensor=SENSOR)
+    simulate(folder / "KITTI", scans=105, sensor=SENSOR)
     (folder / "my_scans").mkdir()
     for scan in sorted((folder / "KITTI/sequences/08/velodyne").glob("*.bin"))[:5]:
         shutil.copy(scan, folder / "my_scans")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models import sglpr
-from sglpr_jax.models.circular import CircularDecoder, CircularNet, block_means
+from sglpr_jax.models.circular import CircularNet, block_means
 from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, model_preset
-from sglpr_jax.models.place_head import Spectrum, amplitudes
+from sglpr_jax.models.place_head import amplitudes
 
 RINGS = CircularConfig(widths=(4, 6, 6), strides=(2, 1, 2), means=(1, 2, 1))
 HEAD = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
@@ -54,51 +54,12 @@ def test_means_of_blocks_are_numpys(radii, sectors):
     np.testing.assert_allclose(each, expected, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_the_decoder_returns_to_the_averaged_image_and_turns_with_it(random_variables):
-    image = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
-    net, decoder = CircularNet(RINGS), CircularDecoder(RINGS.widths)
-    variables = random_variables(net, image)
-    maps = net.apply(variables, image)
-    weights = random_variables(decoder, maps)
-    pixels = decoder.apply(weights, maps)
-    assert pixels.shape == (2, 8, 16, 4)
-    turned = decoder.apply(weights, net.apply(variables, jnp.roll(image, 8, axis=2)))
-    np.testing.assert_allclose(turned, jnp.roll(pixels, 4, axis=2), atol=1e-4)
-
-
-@pytest.mark.slow
-def test_fine_blocks_see_what_the_means_do_not(random_variables):
-    image = jax.random.normal(jax.random.key(0), (1, 16, 32, 2))
-    other = image.at[0, 4, 8].add(1.0).at[0, 5, 9].add(-1.0)  # in one square
-    plain, fine = CircularNet(RINGS), CircularNet(dataclasses.replace(RINGS, fine=(3,)))
-    for net, differs in ((plain, False), (fine, True)):
-        variables = random_variables(net, image)
-        change = jnp.abs(net.apply(variables, image)[-1] - net.apply(variables, other)[-1]).max()
-        assert (change > 1e-3) == differs
-
-
 def test_quarter_turns_leave_the_descriptor(params):
     straight = describe(params, BEV)
     assert jnp.abs(straight[0] - straight[1]).max() > 1e-3
     for quarters in (1, 2, 3):
         turned = describe(params, jnp.rot90(BEV, quarters, axes=(1, 2)))
         np.testing.assert_allclose(turned, straight, atol=1e-5)
-
-
-def test_descriptors_under_jit_vmap_and_grad(params):
-    whole = describe(params, BEV)
-    assert whole.shape == (3, 256)
-    np.testing.assert_allclose(jnp.linalg.norm(whole, axis=-1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(jax.vmap(lambda bev: describe(params, bev))(BEV), whole, atol=1e-5)
-    gradient = jax.grad(lambda bev: describe(params, bev)[..., 0].sum())(jnp.zeros_like(BEV))
-    assert jnp.isfinite(gradient).all()
-
-
-def test_the_logits_near_a_cell_depend_most_on_its_counts(params):
-    change = jnp.abs(segment(params, BEV[:1]) - segment(params, BEV[:1].at[0, 10, 20].add(9.0))).max(-1)[0]
-    row, column = np.unravel_index(change.argmax(), change.shape)
-    assert abs(row - 10) <= 2 and abs(column - 20) <= 2
 
 
 def test_amplitudes_are_numpys_and_stay_where_the_columns_are_shifted():
@@ -108,15 +69,6 @@ def test_amplitudes_are_numpys_and_stay_where_the_columns_are_shifted():
     np.testing.assert_allclose(found, expected, atol=2e-3)  # sqrt(FLOOR) where an amplitude is zero
     np.testing.assert_allclose(amplitudes(jnp.roll(columns, 5, axis=1), 7), found, atol=1e-5)
     assert jnp.isfinite(jax.grad(lambda c: amplitudes(c, 7).sum())(jnp.zeros((1, 12, 3)))).all()
-
-
-def test_the_spectrum_reads_every_radius(random_variables):
-    features = jax.random.normal(jax.random.key(0), (1, 2, 12, 3))
-    module = Spectrum(channels=4, frequencies=5, output=6)
-    variables = random_variables(module, features)
-    for radius in range(2):
-        changed = module.apply(variables, features.at[0, radius, 3, 1].add(1.0))
-        assert jnp.abs(changed - module.apply(variables, features)).max() > 1e-3
 
 
 def test_what_does_not_fit_is_an_error():

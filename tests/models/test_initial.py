@@ -10,7 +10,6 @@ from scipy import stats
 
 import sglpr_jax
 from sglpr_jax.models import initial
-from sglpr_jax.models.sglpr import SGLPR
 from tests.tiny import MODEL
 
 SHAPE = (5, 3, 40, 200)
@@ -36,12 +35,6 @@ def test_a_distribution_is_that_of_flax(name):
         np.testing.assert_allclose(np.abs(ours).max(), np.abs(flax).max(), rtol=0.02)
 
 
-def test_constants_and_identity():
-    key = jax.random.key(0)
-    assert not np.any(initial.zeros(key, (3,))) and np.all(initial.ones(key, (3,)) == 1)
-    np.testing.assert_array_equal(initial.identity(key, (3, 3)), np.eye(3))
-
-
 def test_weights_differ_by_key_and_by_name_and_not_by_shape_of_others():
     drawn = [sglpr_jax.init(jax.random.key(seed), config=MODEL).weights for seed in (0, 0, 1)]
     kernels = [
@@ -55,16 +48,6 @@ def test_weights_differ_by_key_and_by_name_and_not_by_shape_of_others():
     assert len(first) == len(random)
 
 
-@pytest.mark.slow
-def test_init_is_the_same_in_a_compiled_function_and_maps_over_keys():
-    keys = jax.random.split(jax.random.key(3), 2)
-    one = sglpr_jax.init(keys[0], config=MODEL).weights
-    compiled = jax.jit(lambda key: sglpr_jax.init(key, config=MODEL).weights)(keys[0])
-    mapped = jax.vmap(lambda key: sglpr_jax.init(key, config=MODEL).weights)(keys)
-    jax.tree.map(np.testing.assert_array_equal, one, compiled)
-    jax.tree.map(lambda leaf, of_both: np.testing.assert_array_equal(leaf, of_both[0]), one, mapped)
-
-
 def test_init_compiles_nothing(monkeypatch):
     def compiled(*_args, **_options):
         raise AssertionError("a program was compiled")
@@ -74,10 +57,3 @@ def test_init_compiles_nothing(monkeypatch):
     monkeypatch.setattr("jax._src.compiler.compile_or_get_cached", compiled)
     jax.clear_caches()
     sglpr_jax.init(key, config=MODEL)
-
-
-def test_flax_itself_creates_the_same_weights():
-    image = np.zeros((1, MODEL.grid.height, MODEL.grid.width, MODEL.channels), np.float32)
-    shapes = jax.eval_shape(SGLPR(MODEL).init, jax.random.key(0), image, None)["params"]
-    drawn = sglpr_jax.init(jax.random.key(0), config=MODEL).weights
-    assert jax.tree.map(lambda leaf: leaf.shape, drawn) == jax.tree.map(lambda leaf: leaf.shape, shapes)

@@ -36,21 +36,6 @@ def test_values_and_gradients_are_those_of_the_plain_formula(wrap):
     assert_close(found(ROWS[0], SCALE, BIAS), expected(ROWS[0], SCALE, BIAS))
 
 
-def test_forward_mode_is_that_of_the_plain_formula():
-    tangents = WEIGHTS[0], BIAS, SCALE
-    found, expected = (jax.jvp(norm, (ROWS[0], SCALE, BIAS), tangents) for norm in (ours, plain))
-    assert_close(found, expected)
-
-
-def test_gradients_under_vmap_are_those_of_each():
-    def gradient(x, weights):
-        return jax.grad(lambda *of: jnp.sum(ours(*of) * weights), (0, 1, 2))(x, SCALE, BIAS)
-
-    together = jax.vmap(gradient)(ROWS, WEIGHTS)
-    for i in range(len(ROWS)):
-        assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], together), gradient(ROWS[i], WEIGHTS[i]))
-
-
 def test_equal_channels_have_finite_gradients():
     flat = jnp.full((3, 6), 2.0)
     found = jax.grad(lambda x: jnp.sum(ours(x, SCALE, BIAS) * WEIGHTS[0, :3]))(flat)
@@ -87,9 +72,3 @@ def test_the_product_and_its_gradients_are_the_plain_ones(n, c, f):
     for matrices, wrap in ((matrix, jax.jit), (jnp.stack([matrix, 2 * matrix]), jax.vmap)):
         found, expected = (wrap(functools.partial(of, form))(matrices) for form in (product, jnp.matmul))
         assert_close(found, expected)
-
-
-@pytest.mark.parametrize("n, c, f", SIZES)
-def test_the_product_has_a_forward_mode(n, c, f):
-    of = rows_and_matrix(n, c, f)
-    assert_close(*(jax.jvp(form, of, (2 * of[0], of[1] + 1)) for form in (product, jnp.matmul)))

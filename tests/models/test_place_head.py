@@ -1,4 +1,4 @@
-"""The place head: shapes for every candidate, unit descriptors, and convolutions that border maps as PyTorch does."""
+"""The place head: CBAM and NetVLAD against PyTorch, and convolutions that border maps as PyTorch does."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,117 @@ import numpy as np
 import pytest
 
 from sglpr_jax.models.config import HeadConfig
-from sglpr_jax.models.place_head import PlaceHead
+from sglpr_jax.models.layers import l2_normalize
+from sglpr_jax.models.place_head import CBAM, ChannelGate, NetVLAD, PlaceHead, largest
+
+SPATIAL = "SpatialGate.spatial"
+LAYERS = {
+    "assignment": ("cluster_weights", "cluster_biases", "bn1"),
+    "hidden": ("hidden1_weights", None, "bn2"),
+    "gate": ("context_gating.gating_weights", "context_gating.gating_biases", "context_gating.bn1"),
+}
+"""Dense layers of NetVLAD, and PyTorch's weights, bias and batch norm of each."""
+
+
+def batch_norm(state, name):
+    """Factor and bias of a batch norm, which is folded into the layer before it."""
+    scale = state[f"{name}.weight"] / jnp.sqrt(state[f"{name}.running_var"] + 1e-5)
+    return scale, state[f"{name}.bias"] - state[f"{name}.running_mean"] * scale
+
+
+def cbam(state, image, *, reduction):
+    mlp = {ours: f"ChannelGate.mlp.{number}" for ours, number in (("mlp_in", 1), ("mlp_out", 3))}
+    channel = {ours: {"kernel": state[f"{t}.weight"].T, "bias": state[f"{t}.bias"]} for ours, t in mlp.items()}
+    if f"{SPATIAL}.conv.weight" not in state:
+        return ChannelGate(reduction).apply({"params": channel}, image.transpose(0, 2, 3, 1)).transpose(0, 3, 1, 2)
+    scale, bias = batch_norm(state, f"{SPATIAL}.bn")
+    kernel = state[f"{SPATIAL}.conv.weight"].transpose(2, 3, 1, 0) * scale[None, None, None]
+    params = {"channel": channel, "spatial": {"convolution": {"kernel": kernel, "bias": bias}}}
+    return CBAM(reduction).apply({"params": params}, image.transpose(0, 2, 3, 1)).transpose(0, 3, 1, 2)
+
+
+def netvlad(state, image):
+    params = {"centres": state["cluster_weights2"][0]}
+    for ours, (weights, biases, norm) in LAYERS.items():
+        if f"{norm}.weight" in state:
+            scale, bias = batch_norm(state, norm)
+            params[ours] = {"kernel": state[weights] * scale[None], "bias": bias}
+        elif weights in state:
+            params[ours] = {"kernel": state[weights], "bias": state.get(biases)}
+    features = image.transpose(0, 2, 3, 1).reshape(len(image), -1, image.shape[1])
+    return NetVLAD(clusters=8, output=16, gating="gate" in params).apply({"params": params}, features)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "tag", "options"),
+    [
+        ("cbam", "c32_r4", {"reduction": 4}),
+        ("cbam", "c32_r4_nospatial", {"reduction": 4}),
+        ("netvlad", "loupe_gating1_bn1", {}),
+        ("netvlad", "loupe_gating0_bn0", {}),
+    ],
+)
+def test_output_and_gradients_are_those_of_pytorch(file, tag, options, golden, assert_parity):
+    expected = {key.removeprefix(f"{tag}/"): x for key, x in golden(file).items() if key.startswith(f"{tag}/")}
+    state = {key.removeprefix("state/"): jnp.asarray(x) for key, x in expected.items() if key.startswith("state/")}
+    state = {name: x for name, x in state.items() if not name.endswith("num_batches_tracked")}
+    module = {"cbam": cbam, "netvlad": netvlad}[file]
+
+    @jax.jit
+    @jax.grad
+    def gradients(state_and_image):
+        out = module(*state_and_image, **options)
+        return jnp.sum(out * jnp.cos(jnp.arange(out.size, dtype=jnp.float32)).reshape(out.shape))
+
+    image = jnp.asarray(expected["input"])
+    assert_parity(module(state, image, **options), expected["eval"], "eval")
+    by_name, by_image = gradients((state, image))
+    assert_parity(by_image, expected["eval_input_grad"], "eval_input_grad")
+    names = [key.removeprefix("eval_gradnorm/") for key in expected if key.startswith("eval_gradnorm/")]
+    assert len(names) >= 4
+    for name in names:
+        assert_parity(jnp.linalg.norm(by_name[name]), expected[f"eval_gradnorm/{name}"], name)
+
+
+@pytest.mark.slow
+def test_the_gradient_of_the_maximum_survives_rounding():
+    """An entry that rounding keeps from being equal to the maximum still has its gradient; ties share it."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 5)), jnp.float32)
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(lambda x: jnp.square(largest(x, (1, 2))).sum())(x)
+        np.testing.assert_allclose(found, derivative(lambda x: jnp.square(x.max((1, 2))).sum())(x), rtol=1e-6)
+    tied = jnp.asarray([2.0, 1.0, np.nextafter(np.float32(2), np.float32(0)), 2.0], jnp.float32)
+    np.testing.assert_allclose(jax.grad(lambda x: largest(x, (0,)))(tied), [1 / 3, 0, 1 / 3, 1 / 3], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_circular_map_may_be_rolled_along_its_columns_and_no_other(random_variables):
+    image = jnp.asarray(np.random.default_rng(0).normal(size=(2, 8, 12, 6)), jnp.float32)
+    variables = random_variables(CBAM(reduction=3), image)
+    rolled = jnp.roll(image, 5, axis=2)
+    for circular in (True, False):
+        apply = jax.jit(CBAM(reduction=3, circular=circular).apply)
+        difference = apply(variables, rolled) - jnp.roll(apply(variables, image), 5, axis=2)
+        assert (jnp.abs(difference).max() < 1e-5) == circular
+
+
+def test_vmap_and_order_of_local_features_change_nothing(random_variables):
+    module, rng = NetVLAD(clusters=4, output=8), np.random.default_rng(0)
+    features = jnp.asarray(rng.normal(size=(3, 20, 6)), jnp.float32)
+    variables = random_variables(module, features)
+    expected = module.apply(variables, features)
+    one_by_one = jax.vmap(module.apply, (None, 0))(variables, features[:, None])[:, 0]
+    np.testing.assert_allclose(one_by_one, expected, atol=1e-6)
+    np.testing.assert_allclose(module.apply(variables, features[:, rng.permutation(20)]), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-8, 1e8])
+def test_l2_normalize_gives_unit_vectors_or_zero_and_finite_gradients(scale):
+    x = scale * jnp.asarray([[3.0, 4.0]])
+    expected = [[0.6, 0.8]] if scale > 1e-12 else [[0.0, 0.0]]
+    np.testing.assert_allclose(l2_normalize(x), expected, atol=1e-6)
+    assert np.isfinite(jax.grad(lambda x: l2_normalize(x)[0, 0])(x)).all()
 
 
 def head(kernels, strides):
@@ -16,29 +126,12 @@ def head(kernels, strides):
 @pytest.mark.parametrize(
     ("kernels", "strides", "sizes"),
     [((3, 3, 3), (2, 2, 2), [16, 8, 4]), ((4, 3, 3), (4, 2, 2), [8, 4, 2]), ((2, 2, 2), (2, 2, 2), [16, 8, 4])],
-    ids=["A: 3/2 3/2 3/2", "B: 4/4 3/2 3/2", "C: 2/2 2/2 2/2"],
 )
 def test_the_map_shrinks_by_each_stride(kernels, strides, sizes):
     run = head(kernels, strides).init_with_output
     (descriptors, seen), _ = jax.eval_shape(run, jax.random.key(0), jnp.zeros((3, 32, 32, 6)))
     assert descriptors.shape == (3, 32)
     assert [seen[f"head_convolution{i}"].shape[1] for i in range(3)] == sizes
-
-
-@pytest.mark.slow
-def test_descriptors_have_length_one_and_do_not_depend_on_their_batch(random_variables):
-    module = head((4, 3, 3), (4, 2, 2))
-    features = jnp.asarray(np.random.default_rng(0).normal(size=(3, 32, 32, 6)), jnp.float32)
-    variables = random_variables(module, features)
-
-    def describe(x):
-        return module.apply(variables, x)[0]
-
-    descriptors = describe(features)
-    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=-1), 1, atol=1e-6)
-    np.testing.assert_allclose(jax.jit(describe)(features[1:2]), descriptors[1:2], atol=2e-6)
-    one_by_one = jax.jit(jax.vmap(describe))(features[:, None])[:, 0]
-    np.testing.assert_allclose(one_by_one, descriptors, atol=2e-6)
 
 
 def test_a_stride_two_convolution_is_centred_on_every_second_pixel(random_variables):
@@ -54,11 +147,3 @@ def test_a_stride_two_convolution_is_centred_on_every_second_pixel(random_variab
     expected = (expected - expected.mean(-1, keepdims=True)) / np.sqrt(expected.var(-1, keepdims=True) + 1e-5)
     expected = expected * norm["scale"] + norm["bias"]
     np.testing.assert_allclose(seen["head_convolution0"][0], np.maximum(expected, 0), atol=2e-5)
-
-
-@pytest.mark.slow
-def test_an_empty_map_has_finite_gradients(random_variables):
-    module, features = head((4, 3, 3), (4, 2, 2)), jnp.zeros((2, 32, 32, 6))
-    variables = random_variables(module, features)
-    loss = jax.jit(jax.grad(lambda v, x: module.apply(v, x)[0].sum(), (0, 1)))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(loss(variables, features)))

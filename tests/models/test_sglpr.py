@@ -1,16 +1,19 @@
 """The public calls: what `describe` promises, and that it pays for nothing that training alone needs."""
 
 import dataclasses
+import functools
 
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.config import HeadConfig, SwinConfig, model_preset
-from sglpr_jax.models.input_image import field_of_view, prepare
+from sglpr_jax.models.config import HeadConfig, ModelConfig, SwinConfig, model_preset
+from sglpr_jax.models.input_image import field_of_view, prepare, to_polar
 from sglpr_jax.models.params import Params
+from sglpr_jax.models.place_head import PlaceHead
 from sglpr_jax.models.sglpr import describe, forward, init, segment
 
 # One stage instead of two, so that a program compiles in a second.
@@ -27,6 +30,8 @@ POLAR = dataclasses.replace(
 )
 SIZE = CONFIG.grid.height
 FAST_COMPILE = {"xla_backend_optimization_level": 0}
+EPSILON = 2.0**-8
+"""Of bfloat16."""
 
 fast_describe = jax.jit(describe, compiler_options=FAST_COMPILE)
 
@@ -63,19 +68,6 @@ def test_any_leading_axes_and_counts_of_any_type_give_the_same(params, images, d
     np.testing.assert_allclose(many.reshape(6, 256), descriptors, atol=1e-5)
 
 
-@pytest.mark.parametrize("leading", [(0,), (2, 0)])
-def test_no_images_have_no_descriptors(params, images, leading):
-    none = jnp.zeros((*leading, *images.shape[-2:]))
-    assert describe(params, none).shape == (*leading, params.config.head.descriptor_size)
-    with pytest.raises(ValueError, match="expected at least one image"):
-        segment(params, none)
-
-
-def test_vmap_agrees(params, images, descriptors):
-    mapped = jax.jit(jax.vmap(describe, in_axes=(None, 0)), compiler_options=FAST_COMPILE)
-    np.testing.assert_allclose(mapped(params, images), descriptors, atol=1e-5)
-
-
 @pytest.mark.slow
 def test_gradients_are_finite_and_reach_image_and_weights_even_from_an_empty_image(params, images):
     loss = jax.grad(lambda p, x: describe(p, x)[..., 0].sum(), (0, 1))
@@ -94,44 +86,6 @@ def test_images_of_the_wrong_size_are_refused(params, call, shape):
         call(params, jnp.zeros(shape))
 
 
-def operations(compiled) -> float:
-    return compiled.cost_analysis()["flops"]
-
-
-def compiled(call, params, images, **options):
-    return jax.jit(lambda p, x: call(p, x, **options), compiler_options=FAST_COMPILE).lower(params, images).compile()
-
-
-def test_describe_computes_nothing_of_the_segmentation_head(params, images):
-    backbone = {name: part for name, part in params.weights.items() if name != "segmentation_head"}
-    without_head = operations(compiled(describe, Params(backbone, CONFIG), images))
-    assert operations(compiled(describe, params, images)) == without_head
-    head = 2 * len(images) * SIZE**2 * CONFIG.backbone.width * CONFIG.classes
-    assert operations(compiled(forward, params, images)) >= without_head + head
-
-
-@pytest.mark.parametrize(("detail", "spared"), [(0, set()), (4, {"narrow", "detail"})])
-def test_a_head_that_taps_tokens_spares_describe_the_expansion_too(random_params, detail, spared):
-    config = dataclasses.replace(POLAR, detail=detail)
-    params, image = random_params(config), jnp.zeros((1, SIZE, SIZE))
-    needed = {name: part for name, part in params.weights.items() if name in ("backbone", "place_head")}
-    assert params.weights.keys() - needed.keys() == {"segmentation_head", "expand"} | spared
-    bare = Params(needed, config)
-    assert operations(compiled(describe, params, image)) == operations(compiled(describe, bare, image))
-
-
-def test_with_detail_the_logits_of_a_cell_depend_on_its_own_count(random_params, images):
-    """More than those of other cells; what lies beyond the circle still counts for nothing."""
-    corner = images.at[:, 2, 3].add(50)
-    config = dataclasses.replace(POLAR, detail=4)
-    params, segments = random_params(config), jax.jit(segment, compiler_options=FAST_COMPILE)
-    assert segments(params, images).shape == (len(images), SIZE, SIZE, 20)
-    np.testing.assert_array_equal(segments(params, corner), segments(params, images))
-    inside = images.at[:, 16, 20].add(50)
-    changed = np.abs(segments(params, inside) - segments(params, images)).max((0, 3))
-    assert changed[16, 20] > 3 * np.median(changed)
-
-
 def test_forward_gives_descriptors_logits_and_every_named_map(params, images, descriptors):
     outputs = jax.jit(forward, compiler_options=FAST_COMPILE)(params, images)
     np.testing.assert_allclose(outputs.descriptor, descriptors, atol=1e-5)
@@ -143,20 +97,6 @@ def test_forward_gives_descriptors_logits_and_every_named_map(params, images, de
     np.testing.assert_allclose(outputs.logits, outputs.intermediates["pixels"] @ kernel, atol=1e-4)
     sparse = jax.eval_shape(lambda p, x: forward(p, x, segment=3), params, images)
     assert sparse.logits.shape == (2, SIZE, SIZE, 20) and sparse.descriptor.shape == (6, 256)
-
-
-def test_segment_keeps_the_leading_axes(params, images):
-    shape = jax.eval_shape(segment, params, images.reshape(2, 3, SIZE, SIZE)).shape
-    assert shape == (2, 3, SIZE, SIZE, 20)
-
-
-def test_params_are_a_pytree_whose_static_part_is_the_configuration(params):
-    leaves, structure = jax.tree.flatten(params)
-    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
-    assert jax.tree.unflatten(structure, leaves).config is CONFIG
-    other = dataclasses.replace(params, config=dataclasses.replace(CONFIG, counts="raw"))
-    assert jax.tree.structure(other) != structure
-    assert hash(CONFIG) == hash(dataclasses.replace(CONFIG))
 
 
 def test_counts_are_rescaled_as_configured():
@@ -179,35 +119,6 @@ def test_the_circle_blanks_what_a_rotation_would_move_out_of_view():
     np.testing.assert_allclose(prepared[..., 0], np.broadcast_to(sees * np.log(2), (2, 32, 48)), rtol=1e-6)
 
 
-def test_the_vehicle_itself_is_not_seen():
-    grid = Grid(resolution_m=0.5, height=32, width=32)
-    sees = field_of_view(dataclasses.replace(CONFIG, grid=grid, field="square", blind_m=2.0))[0]
-    x = (np.arange(32) - 15.5) * 0.5
-    np.testing.assert_array_equal(sees, np.hypot(*np.meshgrid(x, x)) >= 2.0)
-    assert 40 < (~sees).sum() < 60
-
-
-def test_the_range_channel_tells_how_far_a_cell_is():
-    grid = Grid(resolution_m=0.5, height=32, width=48)
-    config, plain = (dataclasses.replace(CONFIG, grid=grid, range_channel=x) for x in (True, False))
-    x, y = (np.arange(48) - 23.5) * 0.5, (np.arange(32) - 15.5) * 0.5
-    expected = np.hypot(x, y[:, None]) / np.hypot(x[0], y[0])
-    prepared = prepare(jnp.ones((2, 32, 48)), config)
-    assert prepared.shape == (2, 32, 48, config.channels) == (2, 32, 48, 2)
-    np.testing.assert_allclose(prepared[1, ..., 1], expected, rtol=1e-6)
-    np.testing.assert_array_equal(prepared[..., :1], prepare(jnp.ones((2, 32, 48)), plain))
-
-
-def test_what_lies_outside_the_circle_does_not_reach_a_polar_descriptor(random_params, images):
-    params = random_params(POLAR)
-    outside = ~field_of_view(POLAR)[0]
-    changed = jnp.where(outside, 7, images)
-    assert (changed != images).any()
-    np.testing.assert_array_equal(fast_describe(params, changed), fast_describe(params, images))
-    shifted = jnp.roll(images, 3, axis=2)
-    assert np.abs(fast_describe(params, shifted) - fast_describe(params, images)).max() > 1e-3
-
-
 def test_init_makes_every_weight_of_its_preset_from_its_key(random_params):
     config = dataclasses.replace(CONFIG, backbone=dataclasses.replace(CONFIG.backbone, drop_path=0.0))
     params = init(jax.random.key(0), config=config)
@@ -224,3 +135,168 @@ def test_a_list_of_images_is_one_clear_error(as_installed, random_params):
     params = random_params(model_preset("tiny"))
     with pytest.raises(TypeError, match="expected images as an array of numpy or JAX, found a list; use"):
         describe(params, [[0.0, 1.0], [2.0, 3.0]])
+
+
+@pytest.mark.parametrize("leading", [(0,), (2, 0)])
+def test_no_images_have_no_descriptors(params, images, leading):
+    none = jnp.zeros((*leading, *images.shape[-2:]))
+    assert describe(params, none).shape == (*leading, params.config.head.descriptor_size)
+    with pytest.raises(ValueError, match="expected at least one image"):
+        segment(params, none)
+
+
+def with_head(config: ModelConfig, *, categories: int = 20, **changes) -> ModelConfig:
+    return dataclasses.replace(config, categories=categories, head=dataclasses.replace(config.head, **changes))
+
+
+def weights_of(config: ModelConfig) -> set[str]:
+    shapes = jax.eval_shape(lambda: init(jax.random.key(0), config=config)).weights
+    return set(flax.traverse_util.flatten_dict(shapes, sep="/"))
+
+
+def parts(names: set[str]) -> set[str]:
+    return {name.split("/")[0] for name in names}
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Four images of counts and their maps of classes, of which none is like another."""
+    rng = np.random.default_rng(0)
+    images = rng.poisson(rng.uniform(0, 4, (4, 1, 1)), (4, SIZE, SIZE))
+    return jnp.asarray(images, jnp.int32), jnp.asarray(rng.integers(0, 20, images.shape), jnp.int32)
+
+
+def test_without_cbam_and_netvlad_their_weights_are_not_there():
+    whole, bare = weights_of(CONFIG), weights_of(with_head(CONFIG, cbam=False, pooling="mean"))
+    gone = {name for name in whole if name.startswith(("place_head/cbam/", "place_head/netvlad/"))}
+    assert gone and bare == whole - gone | {
+        "place_head/mean_pooling/linear/kernel",
+        "place_head/mean_pooling/linear/bias",
+    }
+    assert weights_of(with_head(CONFIG, cbam=False)) == {name for name in whole if "cbam" not in name}
+
+
+@pytest.mark.parametrize(("config", "spared"), [(CONFIG, set()), (POLAR, {"expand"})], ids=["pixels", "tokens"])
+def test_without_categories_there_is_no_segmentation_head(config, spared):
+    assert parts(weights_of(config)) - parts(weights_of(with_head(config, categories=0))) == {
+        "segmentation_head",
+        *spared,
+    }
+
+
+@pytest.mark.parametrize("what", ["counts", "labels", "counts+labels"])
+def test_without_features_there_is_no_backbone(what):
+    assert parts(weights_of(with_head(CONFIG, input=what))) == {"place_head"}
+    assert parts(weights_of(with_head(POLAR, input=what))) == {"place_head", "patch_embed"}
+    assert not with_head(CONFIG, input=what).segments
+
+
+def test_mean_pooling_is_numpys(random_variables):
+    module = PlaceHead(dataclasses.replace(CONFIG.head, cbam=False, pooling="mean"))
+    features = jnp.asarray(np.random.default_rng(0).normal(size=(3, 16, 16, 6)), jnp.float32)
+    variables = random_variables(module, features)
+    found, seen = jax.jit(module.apply, compiler_options=FAST_COMPILE)(variables, features)
+    assert set(seen) == {"head_convolution0", "head_convolution1"}
+    layer = variables["params"]["mean_pooling"]["linear"]
+    expected = np.asarray(seen["head_convolution1"], np.float64).mean((1, 2)) @ layer["kernel"] + layer["bias"]
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_polar_head_for_tokens_reads_patches_of_each_class_s_share(random_params, views):
+    config = with_head(POLAR, input="labels")
+    params, (images, labels) = random_params(config), views
+    planes = np.eye(20, dtype=np.float32)[np.where(field_of_view(config), labels, 0)]
+    polar = np.asarray(to_polar(jnp.asarray(planes), config.grid, *config.polar), np.float64)
+    patches = polar.reshape(4, 4, 4, 8, 4, 20).transpose(0, 1, 3, 2, 4, 5).reshape(4, 4, 8, -1)
+    weights = jax.tree.map(np.asarray, params.weights)
+    layer, norm = (weights["patch_embed"][name] for name in ("projection", "norm"))
+    tokens = patches @ layer["kernel"].reshape(-1, config.backbone.width) + layer["bias"]
+    tokens = (tokens - tokens.mean(-1, keepdims=True)) / np.sqrt(tokens.var(-1, keepdims=True) + 1e-5)
+    tokens = jnp.asarray(tokens * norm["scale"] + norm["bias"], jnp.float32)
+    expected, _ = PlaceHead(config.head, circular=True).apply({"params": weights["place_head"]}, tokens)
+    np.testing.assert_allclose(fast_describe(params, images, labels), expected, atol=1e-5)
+    np.testing.assert_array_equal(fast_describe(params, images + 1, labels), fast_describe(params, images, labels))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["counts+labels", "counts"])
+def test_the_gradient_reaches_every_weight(random_params, views, what):
+    config = with_head(POLAR, input=what, pooling="mean")
+    params, (images, labels) = random_params(config), views
+    target = jax.random.normal(jax.random.key(0), (len(images), config.head.descriptor_size))
+
+    @jax.jit
+    def gradient(params):
+        read = labels if config.head.reads_labels else None
+        return jax.grad(lambda p: (describe(p, images, read) * target).sum())(params)
+
+    for path, leaf in jax.tree.leaves_with_path(gradient(params).weights):
+        assert np.isfinite(leaf).all() and np.abs(leaf).max() > 0, path
+
+
+@pytest.mark.parametrize("call", [describe, forward])
+def test_labels_must_be_there_exactly_where_they_are_read(views, call):
+    images, labels = views
+    reads = Params({}, with_head(CONFIG, input="labels"))
+    with pytest.raises(ValueError, match=r"reads labels: expected class maps of shape \(4, 32, 32\), .* found none"):
+        call(reads, images)
+    with pytest.raises(ValueError, match=r"found shape \(2, 32, 32\)"):
+        call(reads, images, labels[:2])
+    with pytest.raises(ValueError, match="reads features: expected no labels, found shape"):
+        call(Params({}, CONFIG), images, labels)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(
+        ValueError, match=r"expected categories of labels for a head that reads counts\+labels, found 0"
+    ):
+        with_head(CONFIG, categories=0, input="counts+labels")
+    with pytest.raises(ValueError, match="expected a model with a segmentation head, found one without"):
+        segment(Params({}, with_head(CONFIG, categories=0)), jnp.zeros((SIZE, SIZE)))
+
+
+@functools.partial(jax.jit, compiler_options=FAST_COMPILE)
+def fast_forward(params: Params, images: jax.Array):
+    """Descriptors and logits."""
+    return forward(params, images)[:2]
+
+
+def in_bfloat16(params: Params) -> Params:
+    return Params(params.weights, dataclasses.replace(params.config, compute="bfloat16"))
+
+
+def test_descriptors_and_logits_of_bfloat16_agree_and_are_float32(random_params, images):
+    params = random_params(POLAR)
+    (exact, logits), (rounded, rounded_logits) = (fast_forward(p, images) for p in (params, in_bfloat16(params)))
+    assert rounded.dtype == jnp.float32
+    np.testing.assert_allclose(np.linalg.norm(rounded, axis=-1), 1, rtol=1e-6)
+    exact, rounded = np.asarray(exact), np.asarray(rounded)
+    off = np.linalg.norm(rounded - exact, axis=-1)
+    apart = np.linalg.norm(exact[:, None] - exact[None], axis=-1)
+    assert 0 < off.max() < 4 * EPSILON
+    assert off.max() < 0.5 * apart[~np.eye(len(exact), dtype=bool)].min()  # it does not mix places up
+    if logits is not None:
+        assert rounded_logits.dtype == jnp.float32
+        error = np.asarray(rounded_logits - logits)
+        assert np.sqrt(np.square(error).mean()) < 4 * EPSILON * np.sqrt(np.square(logits).mean())
+        assert np.abs(error).max() < 16 * EPSILON * np.abs(logits).max()
+
+
+@pytest.mark.slow
+def test_gradients_of_bfloat16_are_float32_finite_and_nearly_those_of_float32(random_params, images):
+    params = random_params(POLAR)
+
+    def loss(weights, config):
+        descriptors, logits, _ = forward(Params(weights, config), images)
+        alike = (descriptors[:1] * descriptors[1:]).sum()
+        return alike if logits is None else alike + jnp.square(logits).mean()
+
+    gradient = jax.jit(jax.grad(loss), static_argnums=1, compiler_options=FAST_COMPILE)
+    exact = gradient(params.weights, params.config)
+    rounded = gradient(params.weights, in_bfloat16(params).config)
+    assert all(leaf.dtype == jnp.float32 and np.isfinite(leaf).all() for leaf in jax.tree.leaves(rounded))
+    flat = [np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)]) for tree in (exact, rounded)]
+    cosine = flat[0] @ flat[1] / np.linalg.norm(flat[0]) / np.linalg.norm(flat[1])
+    assert 0.98 < cosine < 1 - 1e-9

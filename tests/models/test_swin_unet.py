@@ -1,16 +1,23 @@
 """What the Swin-Unet promises beyond its numbers: purity, stochastic depth, transformations, clear errors."""
 
+import dataclasses
+
+import flax.linen as nn
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.extend.core import jaxprs_in_params
 
+from sglpr_jax import losses
+from sglpr_jax.models import sglpr
+from sglpr_jax.models.config import CircularConfig, HeadConfig, ModelConfig, SglprConfig, SwinConfig, model_preset
 from sglpr_jax.models.layers import LayerNorm
-from sglpr_jax.models.swin import DropPath, PatchEmbed, SwinBlock, WindowAttention
-from sglpr_jax.models.swin_unet import SwinUnet, drop_path_rates
+from sglpr_jax.models.swin import PatchExpand, SwinBlock, WindowAttention
+from sglpr_jax.models.swin_unet import CircularSwin, SwinUnet, drop_path_rates
+from sglpr_jax.models.torch_import import from_torch_names, torch_name
 
-MODEL = SwinUnet(embed_dim=8, depths=(2, 2), heads=(1, 2), window=4, drop_path=0.5)
+MODEL = SwinUnet(SwinConfig(embed_dim=8, depths=(2, 2), heads=(1, 2), window=4, drop_path=0.5))
 
 
 @pytest.fixture(scope="module")
@@ -35,20 +42,6 @@ def test_jit_vmap_and_single_images_agree_with_the_batch(variables, images, toke
     assert tokens.shape == (3, 8, 8, 8)
     np.testing.assert_allclose(jax.jit(jax.vmap(apply))(images[:, None])[:, 0], tokens, atol=2e-5)
     np.testing.assert_allclose(jax.jit(apply)(images[1:2]), tokens[1:2], atol=2e-5)
-
-
-def test_no_array_of_the_model_has_a_rank_above_five(variables, images):
-    ranks = []
-    for equation in all_equations(jax.make_jaxpr(jax.grad(lambda v: MODEL.apply(v, images)[0].sum()))(variables).jaxpr):
-        ranks += [value.aval.ndim for value in equation.outvars]
-    assert max(ranks) <= 5
-
-
-def all_equations(jaxpr):
-    for equation in jaxpr.eqns:
-        yield equation
-        for inner in jaxprs_in_params(equation.params):
-            yield from all_equations(inner)
 
 
 def test_stochastic_depth_follows_its_key_and_is_off_outside_training(variables, images, tokens):
@@ -91,52 +84,132 @@ def block_mlp(params, x):
     return np.asarray(hidden) @ params["mlp_out"]["kernel"] + params["mlp_out"]["bias"][None, None]
 
 
-def test_without_the_option_a_map_that_a_window_spans_is_not_shifted(random_variables):
-    x = jnp.asarray(np.random.default_rng(0).normal(size=(1, 4, 12, 8)), jnp.float32)
-    options = {"heads": 2, "window": 4, "circular": True}
-    variables = random_variables(SwinBlock(shifted=True, **options), x)
-    shifted, straight = (SwinBlock(shifted=shifted, **options).apply(variables, x) for shifted in (True, False))
-    np.testing.assert_array_equal(shifted, straight)
-
-
-def test_both_branches_of_a_block_are_dropped_per_sample_and_independently(random_variables):
-    block = SwinBlock(heads=1, window=4, shifted=False, drop_path=0.5)
-    image = jnp.broadcast_to(jnp.asarray(np.random.default_rng(0).normal(size=(4, 4, 8)), jnp.float32), (64, 4, 4, 8))
-    variables = random_variables(block, image)
-    out = block.apply(variables, image, train=True, rngs={"drop_path": jax.random.key(1)})
-    kinds = np.unique(np.round(np.asarray(out - image).reshape(64, -1), 4), axis=0)
-    assert len(kinds) == 4  # neither branch, only the first, only the second, both
-
-
-def test_kept_branches_are_scaled_so_that_the_mean_stays():
-    branch = jnp.ones((4096, 1, 1, 1))
-    out = DropPath(0.25).apply({}, branch, train=True, rngs={"drop_path": jax.random.key(0)})
-    np.testing.assert_allclose(np.unique(out), [0, 1 / 0.75], rtol=1e-6)
-    assert abs(float(out.mean()) - 1) < 0.05
-
-
 def test_drop_path_rates_rise_to_the_last_encoder_block(golden):
     rates = np.concatenate(drop_path_rates((2, 2, 2, 2), 0.2))
     np.testing.assert_allclose(rates, golden("tables_masks")["drop_path_full"], atol=1e-7)
 
 
-@pytest.mark.slow
-def test_an_empty_image_has_finite_gradients(variables, images):
-    gradients = jax.jit(jax.grad(lambda v: MODEL.apply(v, jnp.zeros_like(images))[0].var()))(variables)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
-
-
-@pytest.mark.slow
-def test_initial_weights_are_the_references(images):
-    block = SwinBlock(heads=2, window=4, shifted=True).init(jax.random.key(0), jnp.zeros((1, 8, 8, 16)))["params"]
-    kernel = PatchEmbed(channels=8).init(jax.random.key(0), images)["params"]["projection"]["kernel"]
-    np.testing.assert_allclose(np.std(block["mlp_in"]["kernel"]), 0.02, rtol=0.1)
-    np.testing.assert_allclose(np.std(block["attention"]["position_bias"]), 0.02, rtol=0.3)
-    np.testing.assert_array_equal(block["attention"]["qkv"]["bias"], 0)
-    np.testing.assert_array_equal(block["mlp_norm"]["scale"], 1)
-    assert 0.2 < np.abs(kernel).max() <= 0.25  # uniform within 1 / sqrt(16 inputs)
-
-
 def test_windows_that_do_not_tile_the_map_are_refused():
     with pytest.raises(ValueError, match=r"windows of 4 x 4 tokens must tile the map, found 6 x 6 tokens"):
         MODEL.init(jax.random.key(0), jnp.zeros((1, 24, 24, 1)))
+
+
+def run(weights: dict, image: jax.Array, labels: jax.Array, config: ModelConfig):
+    """The joint segmentation loss, with every named map and both of its terms."""
+    swin = config.backbone
+    backbone = SwinUnet(swin)
+    tokens, seen = backbone.apply({"params": weights["backbone"]}, image)
+    pixels = PatchExpand(swin.patch, swin.embed_dim).apply({"params": weights["expand"]}, tokens)
+    logits = nn.Dense(config.classes, use_bias=False).apply({"params": weights["segmentation_head"]}, pixels)
+    ce, dice = losses.cross_entropy(logits, labels).mean(), losses.dice(logits, labels)
+    return 0.4 * ce + 0.6 * dice, {**seen, "up_x4": pixels, "logits": logits, "ce": ce, "dice": dice}
+
+
+@pytest.mark.slow
+def test_every_stage_loss_and_gradient_agrees(golden, assert_parity, model_config):
+    expected = golden("swinunet_w4_img64_odd_depths")
+    config, channels = model_config(expected)
+    state = {name.removeprefix("param/"): value for name, value in expected.items() if name.startswith("param/")}
+    weights = from_torch_names(state, config, input_channels=channels)
+    image = jnp.asarray(expected["input"].transpose(0, 2, 3, 1))
+    labels = jnp.asarray(expected["labels"], jnp.int32)
+    differentiate = jax.jit(jax.value_and_grad(run, (0, 1), has_aux=True), static_argnums=3)
+    (loss, seen), (weight_gradients, image_gradient) = differentiate(weights, image, labels, config)
+
+    for name in ("ce", "dice"):
+        assert_parity(seen.pop(name), expected[name], name)
+    assert_parity(loss, expected["loss"], "loss")
+    check_maps(seen, expected, assert_parity)
+    assert_parity(np.linalg.norm(image_gradient), expected["gradnorm_input"], "gradnorm_input")
+    check_gradients(weight_gradients, expected, assert_parity)
+
+
+def check_maps(seen, expected, assert_parity):
+    """Every map has its statistics in the file, and most are there in full (the last two with a stride)."""
+    stages = {key.removeprefix("stats/") for key in expected if key.startswith("stats/")}
+    assert stages == set(seen)
+    for name, found in seen.items():
+        found = np.asarray(found)
+        if name == "logits":
+            found = found.transpose(0, 3, 1, 2)
+        mean, std, largest, projection = expected[f"stats/{name}"]
+        flat = found.astype(np.float64).reshape(-1)
+        statistics = [flat.mean(), flat.std(ddof=1), np.abs(flat).max()]
+        assert_parity([*statistics, largest], [mean, std, largest, largest], f"stats/{name}")
+        # Errors of the sum's terms are independent: they grow with the root of its length.
+        change = flat @ np.cos(0.1 * np.arange(flat.size)) - projection
+        assert abs(change) <= 1e-4 * largest * flat.size**0.5, name
+        if f"out/{name}" in expected:
+            assert_parity(as_stored(found, name, int(expected["stride"])), expected[f"out/{name}"], f"out/{name}")
+
+
+def as_stored(found, name, stride):
+    """A map in the file's layout: (b, h * w, c), the last two as images with a stride."""
+    if name == "logits":
+        return found[:, :, ::stride, ::stride]
+    if name == "up_x4":
+        return found[:, ::stride, ::stride]
+    return found.reshape(len(found), -1, found.shape[-1])
+
+
+def check_gradients(gradients, expected, assert_parity):
+    """The norm for every weight, and the whole gradient where the file has it."""
+    flat = flax.traverse_util.flatten_dict(gradients, sep="/")
+    found = {torch_name(name): np.asarray(gradient) for name, gradient in flat.items()}
+    assert set(found) == set(expected["gradnorm_names"])
+    for name, norm in zip(expected["gradnorm_names"], expected["gradnorm"], strict=True):
+        assert_parity(np.linalg.norm(found[name]), norm, f"gradnorm/{name}")
+    for key in expected:
+        if key.startswith("grad/"):
+            gradient = found[key.removeprefix("grad/")]
+            whole = expected[key]
+            is_table = key.endswith("bias_table")
+            moved = whole if is_table else whole.transpose(*range(2, whole.ndim), *reversed(range(min(2, whole.ndim))))
+            assert_parity(gradient, moved.reshape(gradient.shape), key)
+
+
+STEM = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 1))
+BACKBONE = SglprConfig(stem=STEM, embed_dim=8, depths=(2, 2), heads=(1, 2), window=2)
+AROUND = HeadConfig(
+    tap="tokens", channels=(8, 8), kernels=(3, 3), strides=(2, 1), means=(1, 2), cbam_reduction=4, clusters=4
+)
+CONFIG = dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=BACKBONE, head=AROUND)
+BEV = jax.random.poisson(jax.random.key(1), 0.7, (3, 32, 32)).astype(jnp.float32)
+POLAR = jax.random.normal(jax.random.key(0), (2, 16, 32, 2))
+
+describe, segment = jax.jit(sglpr.describe), jax.jit(sglpr.segment)
+
+
+@pytest.fixture(scope="module")
+def params(random_params):
+    return random_params(CONFIG)
+
+
+def test_a_turn_by_windows_of_the_coarsest_map_shifts_the_tokens(random_variables):
+    """Such a window is two coarse tokens wide: four tokens, eight sectors of the image."""
+    net = CircularSwin(BACKBONE)
+    variables = random_variables(net, POLAR)
+    apply = jax.jit(net.apply)
+    straight, turned = (apply(variables, image)[0] for image in (POLAR, jnp.roll(POLAR, 8, axis=2)))
+    np.testing.assert_allclose(turned, jnp.roll(straight, 4, axis=2), atol=1e-4)
+    assert jnp.abs(straight - jnp.roll(straight, 4, axis=2)).max() > 1e-2
+
+
+def test_quarter_turns_leave_the_descriptor(params):
+    straight = describe(params, BEV)
+    assert jnp.abs(straight[0] - straight[1]).max() > 1e-3
+    for quarters in (1, 2, 3):
+        np.testing.assert_allclose(describe(params, jnp.rot90(BEV, quarters, axes=(1, 2))), straight, atol=2e-5)
+
+
+def test_what_does_not_fit_is_an_error():
+    with pytest.raises(ValueError, match="polar"):
+        ModelConfig(backbone=BACKBONE)
+    with pytest.raises(ValueError, match=r"head\.means requires a polar image"):
+        ModelConfig(head=HeadConfig(means=(1, 1, 1)))
+    with pytest.raises(ValueError, match="a number of heads for each"):
+        SglprConfig(depths=(2,))
+    with pytest.raises(ValueError, match=r"multiple of \(8, 4\) cells"):
+        dataclasses.replace(CONFIG, polar=(20, 32))
+    with pytest.raises(ValueError, match="3 x 3 kernels"):
+        HeadConfig(channels=(8,), kernels=(4,), strides=(1,), means=(1,))

@@ -6,10 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import NOTHING, in_world, local, pose, random_scene, reference, shapes
+from scenes import NOTHING, pose, random_scene, reference, shapes
 
-from sglpr_jax.sim.raycast import COLUMNS, Chance, find_candidates, nearest_hit, sector_count
-from sglpr_jax.sim.shapes import Scene, Vectors
+from sglpr_jax.sim.objects import BUILDING, ROAD, TERRAIN
+from sglpr_jax.sim.raycast import (
+    COLUMNS,
+    Chance,
+    Surface,
+    echo_returns,
+    find_candidates,
+    mix_edges,
+    nearest_hit,
+    sector_count,
+    surface_of_shapes,
+)
+from sglpr_jax.sim.shapes import Scene, Shapes, Vectors
 
 COUNT, STEPS, REACH_M = 12, 160, 90.0
 jitted_nearest_hit = jax.jit(nearest_hit)
@@ -83,40 +94,6 @@ def test_the_nearest_of_all_shapes_wins_from_any_pose(seed, world_from_lidar):
     assert missed.sum() > 100 and np.all(found[missed] == -1)
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.integers(0, 10_000), poses)
-def test_lists_per_sector_leave_nothing_out(seed, world_from_lidar):
-    scene = numbered(random_scene(seed, COUNT))
-    distance, slot, candidates = cast(scene, world_from_lidar)
-    everything = candidates_of(scene, world_from_lidar)
-    for kind, shapes_of_kind in zip(everything, scene, strict=True):
-        assert np.isfinite(kind.nearest).sum(axis=0).max() <= len(shapes_of_kind.label)
-    # One sector that is wider than the turn lists all shapes.
-    one = find_candidates(scene, world_from_lidar, time=0.0, azimuth_steps=COLUMNS - 1, reach_m=REACH_M)
-    everywhere = jax.tree.map(lambda values: np.repeat(values, slot.shape[1] // COLUMNS, axis=1), one)
-    rays = directions(world_from_lidar)
-    limit = np.full(rays.shape[:2], REACH_M, np.float32)
-    all_distance, all_slot = jitted_nearest_hit(as_vectors(rays), everywhere, limit, no_chance(rays))
-    np.testing.assert_array_equal(labels_of(slot, candidates), labels_of(np.asarray(all_slot), everywhere))
-    np.testing.assert_array_equal(distance, all_distance)
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10_000), poses)
-def test_hits_lie_on_the_surface_of_their_shape(seed, world_from_lidar):
-    scene = numbered(random_scene(seed, COUNT))
-    distance, slot, candidates = cast(scene, world_from_lidar)
-    found = labels_of(slot, candidates)
-    points = directions(world_from_lidar) * distance[..., None] + world_from_lidar[:3, 3]
-    assert (found >= 0).sum() > 20
-    for index, point in zip(found[found >= 0], points[found >= 0], strict=True):
-        kind, i = divmod(int(index), COUNT)
-        x, y, z = local(point - scene[kind].centre[i], scene[kind], i)
-        level = (max(abs(x), abs(y), abs(z)), max(np.hypot(x, y), abs(z)), np.hypot(np.hypot(x, y), z))[kind]
-        # Where a ray grazes a round shape, float32 loses half its digits: up to some millimetres.
-        assert abs(level - 1) * scene[kind].half[i].min() < 1e-2
-
-
 def test_of_too_many_shapes_in_a_sector_the_nearest_are_kept():
     row = shapes(*((5.0 + 2 * i, 0, 0, 0.2, 0.2, 2, 0, i) for i in range(10)))
     (poles, *_) = candidates_of(Scene(row, NOTHING, NOTHING), pose(), slots=(4, 4, 4))
@@ -131,18 +108,6 @@ def test_a_shape_around_the_sensor_is_not_seen_and_one_above_is(kind):
         dome = shapes((0, 0, z, 30, 30, 1, 0, 7))
         _, slot, _ = cast(Scene(*(dome if k == kind else NOTHING for k in range(3))), pose(0.5))
         assert np.any(slot >= 0) == seen
-
-
-def test_nothing_beyond_the_limit_is_hit():
-    scene, where = random_scene(1, COUNT), pose()
-    rays = directions(where)
-    near = np.full(rays.shape[:2], 15.0, np.float32)
-    distance, slot = map(
-        np.asarray, jitted_nearest_hit(as_vectors(rays), candidates_of(scene, where), near, no_chance(rays))
-    )
-    far_distance, _, _ = cast(scene, where)
-    np.testing.assert_array_equal(distance, np.minimum(far_distance, 15))
-    assert np.all((slot < 0) == (distance == 15)) and np.any(slot >= 0)
 
 
 def test_a_share_of_the_rays_passes_through_pores_to_what_is_behind():
@@ -172,26 +137,104 @@ def test_rough_shapes_return_from_within_and_let_long_shots_through():
     assert np.all(through_slot[ahead] == -1) and np.all(through[ahead] == REACH_M)
 
 
-@pytest.mark.slow
-def test_jit_and_vmap_change_nothing():
-    where = [pose(), pose(1, -2, 0.3, yaw=0.5, pitch=0.1)]
-    rays = [as_vectors(directions(w)) for w in where]
-    candidates = [candidates_of(random_scene(i, COUNT), w) for i, w in enumerate(where)]
-    chance, limit = no_chance(directions(where[0])), jnp.full(rays[0].x.shape, REACH_M)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *zip(rays, candidates, strict=True))
-    distances, slots = jax.jit(jax.vmap(lambda one: nearest_hit(*one, limit, chance)))(stacked)
-    for i in range(2):
-        distance, slot = jitted_nearest_hit(rays[i], candidates[i], limit, chance)
-        np.testing.assert_array_equal(slots[i], slot)
-        np.testing.assert_allclose(distances[i], distance, rtol=1e-5)
+LASERS, AZIMUTHS = 64, 3 * COLUMNS
+SPREAD = 0.5
+"""Slope to the side and up of the outermost rays ahead."""
 
 
-def test_turning_scene_and_sensor_together_changes_nothing():
-    scene, where = numbered(random_scene(5, COUNT)), pose(1, 2, 0.5, yaw=0.4, pitch=0.1, roll=-0.05)
-    turn = pose(40, -30, 7, yaw=1.1)
-    turned = Scene(*(kind._replace(centre=in_world(kind.centre, turn), yaw=kind.yaw + 1.1) for kind in scene))
-    distance, slot, candidates = cast(scene, where)
-    turned_distance, turned_slot, turned_candidates = cast(turned, turn @ where)
-    same = labels_of(slot, candidates) == labels_of(turned_slot, turned_candidates)
-    assert same.mean() > 0.998
-    np.testing.assert_allclose(distance[same], turned_distance[same], rtol=1e-4, atol=5e-3)
+def rays_ahead() -> np.ndarray:
+    """Unit vectors (LASERS, AZIMUTHS, 3) about the x axis."""
+    side, up = np.linspace(-SPREAD, SPREAD, AZIMUTHS)[None, :], np.linspace(-SPREAD, SPREAD, LASERS)[:, None]
+    rays = np.stack(np.broadcast_arrays(np.ones((1, 1)), side, up), axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+@jax.jit
+def surface_ahead(rays: Vectors, candidates) -> Surface:
+    zeros = jnp.zeros((LASERS, AZIMUTHS))
+    distance, slot = nearest_hit(rays, candidates, zeros + 100, Chance(zeros, zeros.astype(jnp.uint32)))
+    return surface_of_shapes(rays, distance, slot, candidates)
+
+
+def look_at(kind: int, shape: Shapes) -> tuple[Surface, np.ndarray]:
+    """The surface that rays ahead meet, and where (rays, 3); rays that meet nothing have distance 100."""
+    scene = Scene(*(shape if k == kind else NOTHING for k in range(3)))
+    # All sectors list everything.
+    one = find_candidates(scene, pose(), time=0.0, azimuth_steps=COLUMNS - 1, reach_m=90.0)
+    candidates = jax.tree.map(lambda values: np.repeat(values, 3, axis=1), one)
+    directions = rays_ahead()
+    surface = surface_ahead(Vectors(*np.moveaxis(directions, -1, 0).astype(np.float32)), candidates)
+    return surface, directions * np.asarray(surface.distance)[..., None]
+
+
+def test_facing_of_boxes_cylinders_and_balls_is_the_cosine_to_their_normal():
+    directions = rays_ahead()
+    wall, _ = look_at(0, shapes((11, 0, 0, 1, 40, 40, 0, BUILDING)))
+    np.testing.assert_allclose(wall.facing, directions[..., 0], atol=1e-5)
+    turned, _ = look_at(0, shapes((20, 0, 0, 1, 60, 60, 0.3, BUILDING)))
+    expected = directions @ [np.cos(0.3), np.sin(0.3), 0]
+    np.testing.assert_allclose(turned.facing, expected, atol=1e-5)
+    rod, points = look_at(1, shapes((12, 0, 0, 4, 4, 30, 0, BUILDING)))
+    hit = np.asarray(rod.distance) < 90
+    normal = (points - [12, 0, 0]) / 4 * [1, 1, 0]
+    np.testing.assert_allclose(np.asarray(rod.facing)[hit], -np.sum(normal * directions, -1)[hit], atol=3e-3)
+    egg, points = look_at(2, shapes((12, 0, 0, 3, 5, 2, 0, BUILDING)))
+    hit = np.asarray(egg.distance) < 90
+    normal = (points - [12, 0, 0]) / np.array([3, 5, 2]) ** 2
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    assert hit.sum() > 500
+    np.testing.assert_allclose(np.asarray(egg.facing)[hit], -np.sum(normal * directions, -1)[hit], atol=5e-3)
+
+
+def test_windows_cover_the_share_of_glass_in_a_lattice():
+    facade = shapes((30, 0, 0, 1, 60, 60, 0, BUILDING), glass=0.36)
+    surface, points = look_at(0, facade)
+    window = np.asarray(surface.window)
+    assert abs(window.mean() - 0.36) < 0.03
+    bay, storey = (points[..., 1] / 2.5) % 1, ((points[..., 2] + 60) / 3) % 1
+    inside = (np.abs(bay - 0.5) < 0.29) & (np.abs(storey - 0.5) < 0.29)
+    outside = (np.abs(bay - 0.5) > 0.31) | (np.abs(storey - 0.5) > 0.31)
+    assert window[inside].all() and not window[outside].any()
+    assert not np.any(look_at(0, facade._replace(glass=np.zeros(1)))[0].window)
+
+
+def flat_surface(distance: float, facing: float, label: int, window: bool = False) -> Surface:
+    shape = (50, 400)
+    return Surface(
+        *(
+            jnp.full(shape, value, dtype)
+            for value, dtype in ((distance, float), (label, int), (facing, float), (window, bool))
+        )
+    )
+
+
+def share(surface: Surface, **options) -> float:
+    chance = jax.random.uniform(jax.random.key(0), surface.distance.shape)
+    return float(jnp.mean(echo_returns(chance, surface, **{"faintest_echo": 6e-6, "dropout": 0.0} | options)))
+
+
+def test_road_thins_out_with_distance_and_walls_do_not():
+    road = [share(flat_surface(d, 1.73 / d, ROAD)) for d in (5, 15, 25, 35, 45, 55, 75)]
+    assert min(road[:3]) > 0.99 and road[3] > 0.85 and 0.3 < road[4] < 0.7 and road[5] < 0.3 and road[6] < 0.05
+    assert share(flat_surface(75, 0.7, BUILDING)) > 0.99
+    assert share(flat_surface(45, 1.73 / 45, TERRAIN)) > road[4]
+
+
+def test_dropout_and_windows_take_their_shares():
+    assert abs(share(flat_surface(10, 0.9, BUILDING), dropout=0.2) - 0.8) < 0.02
+    assert abs(share(flat_surface(10, 0.9, BUILDING, window=True)) - 0.1) < 0.02
+
+
+def test_edges_are_mixed_between_their_two_sides_only():
+    reach = jnp.tile(jnp.array([10.0, 10, 11.5, 11.5, 30, 30]), (500, 1))
+    chance = jax.random.uniform(jax.random.key(1), reach.shape)
+    returned = jnp.ones(reach.shape, bool)
+    mixed = np.asarray(jax.jit(mix_edges, static_argnames="share")(chance, reach, returned, share=0.3))
+    changed = mixed != np.asarray(reach)
+    assert not changed[:, [0, 2, 3, 4, 5]].any()  # no jump, or one too long; the last azimuth's next is the first
+    assert abs(changed[:, 1].mean() - 0.3) < 0.06
+    between = mixed[changed[:, 1], 1]
+    assert between.min() >= 10 and between.max() <= 11.5 and between.std() > 0.3
+    lost = returned.at[:, 2].set(False)
+    np.testing.assert_array_equal(mix_edges(chance, reach, lost, share=0.3)[:, 1], 10)
+    np.testing.assert_array_equal(mix_edges(chance, reach, returned, share=0.0), reach)

@@ -1,24 +1,22 @@
 """Sceneries where places repeat: drives, revisits, and the space around the vehicle."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
 from sglpr_jax.sim.drive import drive_seed, speeds
 from sglpr_jax.sim.ground import relief_height
-from sglpr_jax.sim.placing import footprint_distance
-from sglpr_jax.sim.raw_ids import BUILDING, FENCE, NO_RETURN, POLE
-from sglpr_jax.sim.repeating import driven_line, mounted, plan_drive, simulate_repeating
-from sglpr_jax.sim.routes import REVISITS
+from sglpr_jax.sim.objects import BUILDING, FENCE, NO_RETURN, POLE
+from sglpr_jax.sim.placing import HEAD_ROOM_M, distances, footprint_distance
+from sglpr_jax.sim.recording import SimulatedRecording
+from sglpr_jax.sim.repeating import driven_line, plan_drive, simulate_repeating
+from sglpr_jax.sim.routes import REVISITS, Revisit
 from sglpr_jax.sim.sceneries import REPEATING
-from sglpr_jax.sim.sceneries.site import HEAD_ROOM_M, build, distances, striped_ground
+from sglpr_jax.sim.sceneries.parking import HALF_M, RAMP_M, TURN_M, WIDE_M
+from sglpr_jax.sim.sceneries.site import STEP_M, build, painted_ground, rows
 from sglpr_jax.sim.sceneries.site import Strip as GroundStrip
-from sglpr_jax.sim.sceneries.solar import solar
-from sglpr_jax.sim.sceneries.terminal import HIGH_M, terminal
-from sglpr_jax.sim.sceneries.ways import STEP_M, ring, road, rows
 from sglpr_jax.sim.sensor import Sensor
 from sglpr_jax.sim.shapes import Shapes
+from sglpr_jax.sim.world import Levels
 
 SENSOR = Sensor(elevations_deg=(10.0, 2.0, -2.0, -8.0), azimuth_steps=64, min_range_m=0.5)
 SCANS = 60
@@ -56,15 +54,7 @@ def test_a_scan_shows_the_scenery(name):
 
 
 @names
-def test_the_same_seed_gives_the_same_scan_and_another_seed_another_way(name):
-    first, again, other = drive(name), drive(name), drive(name, seed=4)
-    np.testing.assert_array_equal(first.render(7)[0], again.render(7)[0])
-    np.testing.assert_array_equal(first.poses.world_from_lidar, again.poses.world_from_lidar)
-    assert not np.allclose(first.positions, other.positions)
-
-
-@names
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_without_revisits_no_frame_returns_to_a_place(name, seed):
     assert nearest_older(drive(name, seed=seed)).min() > REPEATING[name].other_m
 
@@ -98,7 +88,7 @@ def test_the_vehicle_keeps_clear_of_what_stands(name, revisit):
     scenery = REPEATING[name]
     world, path = plan_drive(scenery, drive_seed(1, name), scans=SCANS, revisit=revisit, rate_hz=scenery.rate_hz)
     driven = path.xy if world.levels is None else world.levels.along(path.xy).xy
-    assert distances(low_shapes(world), driven).min() > 0.9 * scenery.clearance_m
+    assert distances(low_shapes(world), driven, reach_m=3.0).min() > 0.9 * scenery.clearance_m
     assert speeds(path).max() < 2 * scenery.speed_mps[1]
 
 
@@ -128,54 +118,6 @@ def test_traffic_on_the_highway_keeps_to_other_lanes():
         assert footprint_distance(away, boxes.yaw[there], boxes.half[there]).min() > scenery.clearance_m
 
 
-def test_a_small_robot_carries_its_sensor_low_and_sees_near_walls():
-    low = mounted(Sensor(), REPEATING["corridor"])
-    assert low.height_m == 0.5 and low.min_range_m == 0.5
-    assert mounted(Sensor(), REPEATING["walls"]) == Sensor()
-    assert drive("corridor").mounting.height_m == 0.5
-
-
-def test_the_tunnel_has_a_ceiling():
-    points, _ = drive("tunnel").render(3)
-    assert points[:, 2].max() > 2
-
-
-def test_a_scan_in_a_yard_shows_all_of_it():
-    scenery = REPEATING["yard"]
-    world, _ = plan_drive(scenery, drive_seed(1, "yard"), scans=SCANS, revisit="same", rate_hz=2.0)
-    walls = np.array(world.scene.boxes.label) == BUILDING
-    width = 2 * world.scene.boxes.half[walls].max(axis=0)[:2]
-    assert np.all(width > 15) and np.all(width < 24.5)
-    points, labels = drive("yard", "same").render(10)
-    bearings = np.degrees(np.arctan2(points[:, 1], points[:, 0]))[labels == BUILDING]
-    assert np.histogram(bearings, bins=8, range=(-180, 180))[0].min() > 0
-    assert np.linalg.norm(points[:, :2], axis=1).max() < 36
-
-
-@pytest.mark.parametrize("revisit", ("same", "opposite"))
-@pytest.mark.parametrize("name", ("yard", "hall"))
-def test_a_closed_way_in_a_yard_or_hall_crosses_itself(name, revisit):
-    xy = drive(name, revisit).positions[:, :2]
-    extent = np.ptp(xy, axis=0)
-    assert extent.min() > 6 and extent.max() < 60
-    assert np.linalg.norm(np.diff(xy, axis=0), axis=1).sum() > 2 * extent.max()
-
-
-def test_stacks_in_a_terminal_have_one_to_five_containers():
-    site = terminal(np.random.default_rng(0), 300.0, False)
-    heights = [spot.thing[0].size[2] / HIGH_M for spot in site.spots if spot.thing[0].kind == "box"]
-    np.testing.assert_allclose(np.unique(np.round(heights, 6)), [1, 2, 3, 4, 5])
-
-
-def test_panels_of_a_solar_farm_rise_along_y():
-    thing = solar(np.random.default_rng(0), 300.0, False).spots[0].thing
-    slats = [part for part in thing if part.kind == "box"]
-    rise = np.degrees(np.arctan2(slats[-1].bottom - slats[0].bottom, slats[-1].y - slats[0].y))
-    assert 15 < rise < 30
-    for low, high in pairwise(slats):
-        assert low.bottom + low.size[2] >= high.bottom  # no gap between two slats
-
-
 def test_rays_beyond_the_deck_of_a_bridge_do_not_return():
     recording = drive("bridge")
     for i in (10, 30):
@@ -186,26 +128,15 @@ def test_rays_beyond_the_deck_of_a_bridge_do_not_return():
     assert np.linalg.norm(np.diff(recording.positions, axis=0), axis=1).sum() > 500
 
 
-def test_a_ring_closes():
-    line = ring(200.0, straight=0.4)
-    assert np.linalg.norm(line[0] - line[-1]) < 2 * STEP_M
-    assert np.isclose(len(line) * STEP_M, 200.0, atol=0.5)
-
-
 def test_a_closed_way_through_rows_has_the_length_asked_for():
     plan = rows(400.0, run_m=60.0, pitch_m=20.0, closed=True, back_m=7.0, corner_m=2.0)
     assert plan.count % 2 == 0
     assert np.isclose(len(plan.line) * STEP_M, 400.0, rtol=0.1)
 
 
-def test_a_road_goes_on_before_and_after_the_drive():
-    whole, driven = road(np.random.default_rng(0), 100.0, False)
-    assert len(whole) - len(driven) == 1800
-
-
 def test_strips_are_painted_left_of_the_line_and_dashes_with_gaps():
     line = np.stack([np.arange(0, 20, STEP_M), np.zeros(200)], axis=1)
-    ground = striped_ground(1, [GroundStrip(line, 0.0, 2.0, POLE), GroundStrip(line, -2.0, -1.0, 7, 4.0)])
+    ground = painted_ground(1, [GroundStrip(line, 0.0, 2.0, POLE), GroundStrip(line, -2.0, -1.0, 7, 4.0)])
     assert np.isclose((ground.label == POLE).sum() / 16, 40, atol=4)
     assert np.isclose((ground.label == 7).sum() / 16, 12, atol=3)
 
@@ -213,3 +144,78 @@ def test_strips_are_painted_left_of_the_line_and_dashes_with_gaps():
 def test_an_unknown_name_is_an_error():
     with pytest.raises(ValueError, match=r"scenery among walls, .* found 'moon'"):
         simulate_repeating("moon")
+
+
+DENSE = Sensor(elevations_deg=(10.0, 2.0, -2.0, -12.0), azimuth_steps=320, min_range_m=0.5, range_noise_m=0.0)
+LEVELS = Levels(rise_m=3.0, pitch_m=50.0, ramp_y_m=10.0, top_m=0.0, foot_m=20.0)
+
+
+def up(revisit: Revisit = "none", scans: int = 150) -> SimulatedRecording:
+    return simulate_repeating("storeys", scans=scans, seed=3, sensor=DENSE, revisit=revisit)
+
+
+def xyz(recording: SimulatedRecording) -> np.ndarray:
+    return recording.poses.world_from_lidar[:, :3, 3]
+
+
+def on_ramp(recording: SimulatedRecording) -> np.ndarray:
+    return xyz(recording)[:, 1] > WIDE_M + HALF_M - 1
+
+
+def heights(recording: SimulatedRecording) -> np.ndarray:
+    """Height of the storey of each scan that is on no ramp, in metres."""
+    return np.round(xyz(recording)[~on_ramp(recording), 2] - DENSE.height_m, 2)
+
+
+def test_a_path_up_and_down_a_ramp():
+    x = np.concatenate([np.full(12, 22.0), np.arange(22, -2, -0.5), np.arange(-2, 22, 0.5), np.full(12, 22.0)])
+    y = np.concatenate([np.arange(12.0), np.full(96, 12.0), np.arange(12.0)[::-1]])
+    there, ground, slope = LEVELS.along(np.stack([x, y], axis=1))
+    assert ground[0] == ground[-1] == 0 and ground.max() == 3
+    assert np.abs(np.diff(ground)).max() < 0.15
+    assert set(np.round(there[:, 1] - y)) == {0, 50}
+    np.testing.assert_array_equal(there[:, 0], x)
+    measured = np.gradient(ground[12:60], x[12:60])
+    np.testing.assert_allclose(slope[13:59, 0], measured[1:-1], atol=0.01)
+
+
+def test_up_through_all_storeys():
+    recording = up()
+    storey = np.unique(heights(recording))
+    rise = np.diff(storey)
+    assert 3 <= len(storey) <= 6 and storey[0] == 0
+    np.testing.assert_allclose(rise, rise[0], atol=0.02)
+    assert 3.0 <= rise[0] <= 3.6
+    assert np.all(np.diff(heights(recording)) >= 0)
+    lowest, highest = (xyz(recording)[~on_ramp(recording)][heights(recording) == z, :2] for z in storey[[0, -1]])
+    apart = np.linalg.norm(lowest[:, None] - highest, axis=2).min(axis=1)
+    assert np.median(apart) < 2  # each storey is driven along the same way
+
+
+@pytest.mark.parametrize("revisit", ("none", "opposite"))
+def test_a_car_climbs_and_tilts_on_ramps_without_jumps(revisit):
+    recording = up(revisit, scans=1500)
+    poses = recording.poses.world_from_lidar
+    step = np.diff(poses[:, :3, 3], axis=0)
+    assert np.linalg.norm(step, axis=1).max() < 2 and np.abs(step[:, 2]).max() < 0.25
+    ahead = (poses[1:, :3, 0] + poses[:-1, :3, 0]) / 2
+    climbs = np.abs(step[:, 2]) > 0.02
+    assert climbs.sum() > 20
+    climb = np.degrees(np.arcsin(step[climbs, 2] / np.linalg.norm(step[climbs], axis=1)))
+    assert np.abs(climb - np.degrees(np.arcsin(ahead[climbs, 2]))).max() < 3
+    assert 4 < np.abs(climb).max() < 16
+
+
+@pytest.mark.slow
+def test_scans_of_all_storeys_show_the_same_walls_at_the_height_of_their_storey():
+    recording = up()
+    size = np.array([np.ptp(xyz(recording)[:, 0]) + 2 * TURN_M, HALF_M + WIDE_M + RAMP_M + 3.0])
+    rows = np.flatnonzero(~on_ramp(recording))
+    for i in rows[:: len(rows) // 3]:
+        points, _ = recording.render(int(i))
+        pose = recording.poses.world_from_lidar[i]
+        there = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+        assert np.all(np.ptp(there[:, :2], axis=0) < size + 2)
+        assert there[:, 0].min() > -TURN_M - 0.5 and there[:, 1].min() > -HALF_M - 0.5
+        above = there[:, 2] - (pose[2, 3] - DENSE.height_m)
+        assert -0.2 < above.min() < 0.2 and above.max() < 3.5

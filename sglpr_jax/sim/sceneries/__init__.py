@@ -6,31 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sglpr_jax.sim.objects import Range
 from sglpr_jax.sim.routes import Revisit
-from sglpr_jax.sim.sceneries.bridge import bridge
-from sglpr_jax.sim.sceneries.campus import campus
-from sglpr_jax.sim.sceneries.car_park import car_park
-from sglpr_jax.sim.sceneries.corridor import corridor
-from sglpr_jax.sim.sceneries.field import field
-from sglpr_jax.sim.sceneries.forest import forest
-from sglpr_jax.sim.sceneries.garage import garage
-from sglpr_jax.sim.sceneries.hall import hall
-from sglpr_jax.sim.sceneries.highway import LANE_M, highway
-from sglpr_jax.sim.sceneries.indoor import indoor
-from sglpr_jax.sim.sceneries.orchard import orchard
-from sglpr_jax.sim.sceneries.rooms import rooms, rooms_equal
-from sglpr_jax.sim.sceneries.row_houses import row_houses
+from sglpr_jax.sim.sceneries.estates import campus, row_houses, slabs
+from sglpr_jax.sim.sceneries.indoor import corridor, indoor, rooms
+from sglpr_jax.sim.sceneries.nature import field, forest
+from sglpr_jax.sim.sceneries.parking import car_park, garage, storeys
+from sglpr_jax.sim.sceneries.roads import LANE_M, bridge, highway, tunnel, walls
+from sglpr_jax.sim.sceneries.rows import orchard, solar, terminal, vineyard, warehouse
 from sglpr_jax.sim.sceneries.site import Site
-from sglpr_jax.sim.sceneries.slabs import slabs
-from sglpr_jax.sim.sceneries.solar import solar
-from sglpr_jax.sim.sceneries.storeys import storeys
-from sglpr_jax.sim.sceneries.terminal import terminal
-from sglpr_jax.sim.sceneries.tunnel import tunnel
-from sglpr_jax.sim.sceneries.vineyard import vineyard
-from sglpr_jax.sim.sceneries.walls import walls
-from sglpr_jax.sim.sceneries.warehouse import warehouse
-from sglpr_jax.sim.sceneries.yard import yard
-from sglpr_jax.sim.things import Range
+from sglpr_jax.sim.sceneries.walled import hall, yard
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +53,7 @@ _walked = functools.partial(
     Repeating, rate_hz=2.0, clearance_m=0.5, right_m=0.1, sway_m=0.2, height_m=1.5, crosses=True
 )
 _robot = functools.partial(Repeating, rate_hz=2.0, clearance_m=0.4, right_m=0.2, sway_m=0.15, height_m=0.5)
+_rooms = functools.partial(_robot, speed_mps=(0.45, 0.7), other_m=4.0, right_m=0.0, sway_m=0.05)
 REPEATING = {
     "walls": Repeating(walls, (8.0, 12.0)),
     "highway": Repeating(highway, (15.0, 20.0), right_m=LANE_M / 2),
@@ -75,8 +61,8 @@ REPEATING = {
     "car_park": Repeating(car_park, (4.0, 7.0)),
     "garage": Repeating(garage, (3.0, 5.0), other_m=9.0),
     "corridor": _robot(corridor, (0.5, 1.0), other_m=5.0),
-    "rooms_equal": _robot(rooms_equal, (0.45, 0.7), other_m=4.0, right_m=0.0, sway_m=0.05),
-    "rooms": _robot(rooms, (0.45, 0.7), other_m=4.0, right_m=0.0, sway_m=0.05),
+    "rooms_equal": _rooms(functools.partial(rooms, equal=True)),
+    "rooms": _rooms(functools.partial(rooms, equal=False)),
     "indoor": _robot(indoor, (0.8, 1.2), other_m=5.0, right_m=0.1, sway_m=0.1),
     "warehouse": _robot(warehouse, (1.0, 1.6), other_m=4.0, height_m=1.0),
     "orchard": Repeating(orchard, (3.5, 6.0), clearance_m=0.5, right_m=0.2, sway_m=0.15),

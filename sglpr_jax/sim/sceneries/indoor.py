@@ -1,24 +1,35 @@
-"""Floor of an office or a hospital: parallel wings with rooms on both sides, joined by cross corridors."""
+"""Inside of buildings: a corridor with doors, equal rooms along a corridor, and a floor of an office or a hospital."""
 
 import dataclasses
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
-from sglpr_jax.sim.raw_ids import BUILDING, OTHER_GROUND, OTHER_OBJECT
-from sglpr_jax.sim.sceneries.site import Site, Spot, block, even_ground
-from sglpr_jax.sim.sceneries.ways import STEP_M, Line, rounded
-from sglpr_jax.sim.things import Part, Thing
+from sglpr_jax.sim.objects import BUILDING, OTHER_GROUND, OTHER_OBJECT, Part, Thing, block
+from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.routes import Line
+from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded
 
-THICK_M = 0.2
-DOOR_M = 1.6
-SIDE_M = 0.15
-"""Distance from the middle of a door to the paths into the room and out of it, in metres."""
+DOOR_M = 1.0
+BEYOND_M = 40.0
+"""Length of the corridor before the first and after the last scan, in metres."""
+CORRIDOR_WALL_M = 0.6
+WALL_M = 0.2
+"""Thickness of the walls between rooms, in metres."""
+ROOMS_HALF_M = 1.0
+"""Half width of the corridor beside equal rooms, in metres. Rooms begin WALL_M farther out."""
+ROOMS_DOOR_M, ROOMS_SIDE_M = 1.4, 0.25
+"""Width of a door, and distance from its middle to the paths into the room and out of it, in metres."""
+ROOMS_MORE = 2
+"""Number of equal rooms before the first and after the last visited room."""
+FLOOR_DOOR_M, FLOOR_SIDE_M = 1.6, 0.15
+"""Width of a door of a floor, and distance from its middle to the paths into the room and out of it, in metres."""
 INSIDE_M = 2.5
-"""Distance that the path goes into a room, in metres."""
+"""Distance that the path goes into a room of a floor, in metres."""
 VISITED = 0
 """Number of the room of each wing that the path visits. It is on the left."""
-MORE = 1
+WINGS_MORE = 1
 """Number of wings before the first and after the last driven wing."""
 ALIKE = 0.6
 """Probability that a wing has the rooms of the first wing, and that such a room has the same furniture."""
@@ -26,6 +37,118 @@ Front = Literal["closed", "open", "glass", "hall"]
 """Front of a room: a closed door, an open door, glass with an open door, or only two pillars."""
 FRONTS: dict[Front, float] = {"closed": 0.4, "open": 0.25, "glass": 0.2, "hall": 0.15}
 """Probability of each front."""
+
+Place = Float[np.ndarray, "2"]
+
+
+def corridor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """One straight corridor, or four corridors at right angles around a core, with a door every 5 to 7 m."""
+    half, height, pitch, recess = rng.uniform(1.0, 1.4), rng.uniform(2.4, 3.0), rng.uniform(5, 7), rng.uniform(0.1, 0.3)
+    line, corners = _around(rng, length_m) if closed else _straight(length_m)
+    starts = corners if closed else corners[:1]
+    spots = []
+    for start, stop in zip(starts, np.roll(corners, -1, axis=0), strict=False):
+        spots += _corridor_walls(start, stop, half, height, pitch, recess, closed)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    (long, wide), (x, y) = (high - low + 4).tolist(), ((low + high) / 2).tolist()
+    ceiling = Spot((block(BUILDING, long, wide, 0.3, bottom=height),), x, y)
+    return Site(line, [*spots, ceiling], painted_ground(OTHER_GROUND))
+
+
+def _straight(length_m: float) -> tuple[Line, Line]:
+    """Straight path, and the ends of its corridor."""
+    x = np.arange(0, length_m, STEP_M)
+    return np.stack([x, np.zeros(len(x))], axis=1), np.array([(-BEYOND_M, 0.0), (length_m + BEYOND_M, 0.0)])
+
+
+def _around(rng: np.random.Generator, length_m: float) -> tuple[Line, Line]:
+    """Closed path around a rectangular core, and the corners of its corridors."""
+    long = (0.5 + rng.uniform(0, 0.15)) * length_m / 2
+    wide = length_m / 2 - long
+    corners = np.array([(0.0, 0.0), (long, 0.0), (long, wide), (0.0, wide)])
+    return rounded(corners, corner_m=0.5, closed=True), corners
+
+
+def _corridor_walls(
+    start: Place, stop: Place, half: float, height: float, pitch: float, recess: float, closed: bool
+) -> list[Spot]:
+    """Walls along one straight corridor. If `closed`, the left wall belongs to the core and is shorter."""
+    length, ahead = float(np.linalg.norm(stop - start)), (stop - start) / np.linalg.norm(stop - start)
+    heading = float(np.arctan2(ahead[1], ahead[0]))
+    spots = []
+    for side in (1, -1):
+        first = (half if side > 0 else -half) if closed else 0.0
+        pieces = max(1, round((length - 2 * first) / pitch))
+        each = (length - 2 * first) / pieces
+        thing = _with_door(each, half, height, recess, side)
+        for k in range(pieces):
+            x, y = (start + (first + k * each) * ahead).tolist()
+            spots.append(Spot(thing, x, y, heading))
+    return spots
+
+
+def _with_door(each: float, half: float, height: float, recess: float, side: int) -> Thing:
+    """Piece of wall of length `each`, with a door in its middle."""
+    away, part = half + CORRIDOR_WALL_M / 2, (each - DOOR_M) / 2
+    return (
+        block(BUILDING, part, CORRIDOR_WALL_M, height, part / 2, side * away),
+        block(BUILDING, DOOR_M, CORRIDOR_WALL_M, height, each / 2, side * (away + recess)),
+        block(BUILDING, part, CORRIDOR_WALL_M, height, each - part / 2, side * away),
+    )
+
+
+def _visit(x: float, side_m: float, deep_m: float, ahead: int = 1) -> list[tuple[float, float]]:
+    """Corners of a path along x into a room with its door at `x`, and out of it."""
+    return [(x + ahead * dx, y) for dx, y in ((-side_m, 0.0), (-side_m, deep_m), (side_m, deep_m), (side_m, 0.0))]
+
+
+def rooms(rng: np.random.Generator, length_m: float, closed: bool, *, equal: bool) -> Site:
+    """Rooms of one size along a corridor, with `equal` or with different furniture."""
+    pitch, size, deep, height = rng.uniform(7.5, 8.5), *rng.uniform(4.7, 5.3, 2), rng.uniform(2.4, 3.0)
+    into = ROOMS_HALF_M + 0.6 * deep
+    each = pitch + 2 * into + (pitch if closed else 0.0)  # a closed path returns through the corridor
+    count = max(2, round(length_m / each) if closed else int(np.ceil(length_m / each)))
+    corners = [(-pitch / 2, 0.0)]
+    for k in range(count):
+        corners += _visit(k * pitch, ROOMS_SIDE_M, into)
+    if closed:  # back on the other side of the corridor
+        corners += [(corners[-1][0] + 1.0, 0.0), (corners[-1][0] + 1.0, -0.4), (-pitch / 2, -0.4)]
+    line = rounded(np.array(corners), corner_m=0.15, closed=closed)
+    middles = pitch * np.arange(-ROOMS_MORE, count + ROOMS_MORE)
+    same = _room_furniture(rng, size, deep)
+    inside = grid(middles, (ROOMS_HALF_M + WALL_M,), lambda: same if equal else _room_furniture(rng, size, deep))
+    shell = grid(middles, (0.0,), lambda: _room_walls(pitch, size, deep, height))
+    middle, length = float(middles.mean()), pitch * len(middles)
+    ends = tuple(block(BUILDING, 0.3, 2 * ROOMS_HALF_M, height, x) for x in (-length / 2, length / 2))
+    wall = block(BUILDING, length, 0.3, height, y=-ROOMS_HALF_M - 0.15)
+    ceiling = block(BUILDING, length, 2 * ROOMS_HALF_M + 2 * deep + 2, 0.3, bottom=height)
+    spots = [*inside, *shell, Spot((*ends, wall, ceiling), middle, 0.0)]
+    return Site(line if closed else line[: round(length_m / STEP_M)], spots, painted_ground(OTHER_GROUND))
+
+
+def _room_walls(pitch: float, size: float, deep: float, height: float) -> Thing:
+    """Walls of a room with its door at x = 0, and the block between it and the next room."""
+    front, between, jamb = ROOMS_HALF_M + WALL_M / 2, pitch - size, (size - ROOMS_DOOR_M) / 2
+    outer = (ROOMS_DOOR_M + jamb) / 2
+    return (
+        *(block(BUILDING, jamb, WALL_M, height, x, front) for x in (-outer, outer)),
+        block(BUILDING, between, deep + WALL_M, height, pitch / 2, ROOMS_HALF_M + (deep + WALL_M) / 2),
+        block(BUILDING, pitch, 0.3, height, y=ROOMS_HALF_M + WALL_M + deep + 0.15),
+    )
+
+
+def _room_furniture(rng: np.random.Generator, size: float, deep: float) -> Thing:
+    """Cupboards, desks and shelves along the walls of a room: two on each side and two at the back."""
+    parts = []
+    for low in (0.1, 0.5):
+        for side in (-1, 1):
+            wide, thick, high = rng.uniform((0.5, 0.35, 0.6), (1.8, 0.8, 2.1)).tolist()
+            y = low * deep + wide / 2 + rng.uniform(0, 0.1) * deep
+            parts.append(block(OTHER_OBJECT, thick, wide, high, side * (size - thick) / 2, y))
+        wide, thick, high = rng.uniform((0.5, 0.35, 0.6), (1.6, 0.7, 2.1)).tolist()
+        x = (low - 0.3) * 2 * (size / 2 - 0.9) + rng.uniform(-0.4, 0.4)
+        parts.append(block(OTHER_OBJECT, wide, thick, high, x, deep - thick / 2))
+    return tuple(parts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +165,7 @@ class Floor:
     @property
     def pitch_m(self) -> float:
         """Distance between two wings."""
-        return 2 * (self.half_m + THICK_M + self.deep_m + THICK_M)
+        return 2 * (self.half_m + WALL_M + self.deep_m + WALL_M)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,18 +187,17 @@ def indoor(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
     """
     floor = Floor(*rng.uniform((22, 1.0, 4.2, 2.5), (30, 1.4, 6.0, 3.2)).tolist())
     count = 2 if closed else int(np.ceil(length_m / (floor.run_m + floor.pitch_m))) + 1
-    first = _rooms(rng, floor)
-    wings = [_like(rng, first, floor) if rng.random() < ALIKE else _rooms(rng, floor) for _ in range(count + 2 * MORE)]
-    line = _tour(floor, [rooms[VISITED] for rooms in wings[MORE : MORE + count]], closed)
-    spots = [spot for k, rooms in enumerate(wings, -MORE) for room in rooms for spot in _spots(floor, room, k)]
-    return Site(
-        line if closed else line[: round(length_m / STEP_M)], [*spots, *_shell(floor, count)], even_ground(OTHER_GROUND)
-    )
+    first, more = _wing(rng, floor), range(count + 2 * WINGS_MORE)
+    wings = [_like(rng, first, floor) if rng.random() < ALIKE else _wing(rng, floor) for _ in more]
+    line = _tour(floor, [wing[VISITED] for wing in wings[WINGS_MORE : WINGS_MORE + count]], closed)
+    spots = [spot for k, wing in enumerate(wings, -WINGS_MORE) for room in wing for spot in _spots(floor, room, k)]
+    spots += _shell(floor, count)
+    return Site(line if closed else line[: round(length_m / STEP_M)], spots, painted_ground(OTHER_GROUND))
 
 
-def _rooms(rng: np.random.Generator, floor: Floor) -> list[Room]:
+def _wing(rng: np.random.Generator, floor: Floor) -> list[Room]:
     """Rooms of one wing, on both sides of the branch in its middle. The visited room has an open door."""
-    rooms = []
+    wing = []
     for side in (1, -1):
         for start in (floor.half_m, floor.run_m / 2 + floor.half_m):
             length = floor.run_m / 2 - 2 * floor.half_m
@@ -83,18 +205,18 @@ def _rooms(rng: np.random.Generator, floor: Floor) -> list[Room]:
             widths *= length / widths.sum()
             for x, wide in zip(start + np.cumsum(widths) - widths / 2, widths.tolist(), strict=True):
                 front = list(FRONTS)[rng.choice(len(FRONTS), p=list(FRONTS.values()))]
-                rooms.append(Room(float(x), wide, side, front, _furniture(rng, wide, floor.deep_m)))
-    rooms[VISITED] = dataclasses.replace(rooms[VISITED], front="open")
-    return rooms
+                wing.append(Room(float(x), wide, side, front, _furniture(rng, wide, floor.deep_m)))
+    wing[VISITED] = dataclasses.replace(wing[VISITED], front="open")
+    return wing
 
 
-def _like(rng: np.random.Generator, rooms: list[Room], floor: Floor) -> list[Room]:
+def _like(rng: np.random.Generator, wing: list[Room], floor: Floor) -> list[Room]:
     """The same rooms, partly with other furniture."""
     return [
         room
         if rng.random() < ALIKE
         else dataclasses.replace(room, furniture=_furniture(rng, room.wide_m, floor.deep_m))
-        for room in rooms
+        for room in wing
     ]
 
 
@@ -122,45 +244,44 @@ def _tour(floor: Floor, visited: list[Room], closed: bool) -> Line:
     """Path back and forth through the wings, into one room of each, and back along the cross corridor if closed."""
     corners = []
     for k, room in enumerate(visited):
-        ahead, deep = (1, -1)[k % 2], floor.half_m + INSIDE_M
-        visit = [(-SIDE_M, 0.0), (-SIDE_M, deep), (SIDE_M, deep), (SIDE_M, 0.0)]
-        way = [(room.x_m + ahead * x, y) for x, y in visit]
+        ahead = (1, -1)[k % 2]
         ends = [(0.0, 0.0), (floor.run_m, 0.0)][::ahead]
+        way = _visit(room.x_m, FLOOR_SIDE_M, floor.half_m + INSIDE_M, ahead)
         corners += [(x, y + k * floor.pitch_m) for x, y in (ends[0], *way, ends[1])]
     return rounded(np.array(corners), corner_m=0.15, closed=closed)
 
 
 def _spots(floor: Floor, room: Room, wing: int) -> list[Spot]:
     """Walls and furniture of a room. Each piece of furniture is left out by itself if the path passes there."""
-    x, y, begin = room.x_m, wing * floor.pitch_m, floor.half_m + THICK_M
+    x, y, begin = room.x_m, wing * floor.pitch_m, floor.half_m + WALL_M
     inside = [(part._replace(y=part.y + begin),) for part in room.furniture]
     return [Spot(thing, x, y, side=room.side) for thing in (_walls(floor, room), *inside)]
 
 
 def _walls(floor: Floor, room: Room) -> Thing:
     """Front, back and side walls of a room."""
-    wide, high, front, begin = room.wide_m, floor.height_m, floor.half_m + THICK_M / 2, floor.half_m + THICK_M
-    middle, aside = begin + floor.deep_m / 2, wide / 2 - THICK_M / 4
-    walls = [block(BUILDING, THICK_M / 2, floor.deep_m, high, side * aside, middle) for side in (-1, 1)]
-    walls.append(block(BUILDING, wide, THICK_M, high, y=begin + floor.deep_m + THICK_M / 2))
+    wide, high, front, begin = room.wide_m, floor.height_m, floor.half_m + WALL_M / 2, floor.half_m + WALL_M
+    middle, aside = begin + floor.deep_m / 2, wide / 2 - WALL_M / 4
+    walls = [block(BUILDING, WALL_M / 2, floor.deep_m, high, side * aside, middle) for side in (-1, 1)]
+    walls.append(block(BUILDING, wide, WALL_M, high, y=begin + floor.deep_m + WALL_M / 2))
     if room.front == "hall":
         return *walls, *(block(BUILDING, 0.4, 0.4, high, side * wide / 3, front + 0.2) for side in (-1, 1))
-    jamb, glass = (wide - DOOR_M) / 2, 0.7 if room.front == "glass" else 0.0
-    walls += [block(BUILDING, jamb, THICK_M, high, side * (wide - jamb) / 2, front, glass=glass) for side in (-1, 1)]
+    jamb, glass = (wide - FLOOR_DOOR_M) / 2, 0.7 if room.front == "glass" else 0.0
+    walls += [block(BUILDING, jamb, WALL_M, high, side * (wide - jamb) / 2, front, glass=glass) for side in (-1, 1)]
     if room.front == "closed":
-        walls.append(block(BUILDING, DOOR_M, 0.05, high, y=front + 0.08))
+        walls.append(block(BUILDING, FLOOR_DOOR_M, 0.05, high, y=front + 0.08))
     return tuple(walls)
 
 
 def _shell(floor: Floor, count: int) -> list[Spot]:
     """Outer walls and ceiling of the floor. The wall at x = 0 is partly glass."""
-    low, high = -(MORE + 0.5) * floor.pitch_m, (count + MORE - 0.5) * floor.pitch_m
+    low, high = -(WINGS_MORE + 0.5) * floor.pitch_m, (count + WINGS_MORE - 0.5) * floor.pitch_m
     x, y, wide, half = floor.run_m / 2, (low + high) / 2, high - low, floor.half_m
-    long, away = floor.run_m + 2 * half, floor.run_m / 2 + half + THICK_M / 2
+    long, away = floor.run_m + 2 * half, floor.run_m / 2 + half + WALL_M / 2
     walls = [
-        block(BUILDING, THICK_M, wide, floor.height_m, -away, glass=0.6),
-        block(BUILDING, THICK_M, wide, floor.height_m, away),
-        *(block(BUILDING, long, THICK_M, floor.height_m, y=side * wide / 2) for side in (-1, 1)),
+        block(BUILDING, WALL_M, wide, floor.height_m, -away, glass=0.6),
+        block(BUILDING, WALL_M, wide, floor.height_m, away),
+        *(block(BUILDING, long, WALL_M, floor.height_m, y=side * wide / 2) for side in (-1, 1)),
     ]
     ceiling = block(BUILDING, long, wide, 0.3, bottom=floor.height_m)
     return [Spot((part,), x, y) for part in (*walls, ceiling)]

@@ -1,4 +1,4 @@
-"""Elements of a scenery, functions that place things in rows and along lines, and construction of the world."""
+"""Elements of a scenery: lines, things along them and in rows, walls and ground, and construction of the world."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
@@ -6,37 +6,28 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
+from scipy.ndimage import gaussian_filter1d
 
+from sglpr_jax.sim.drive import shifted, waves
 from sglpr_jax.sim.ground import CELL_M, Ground, Relief, draw_relief
-from sglpr_jax.sim.levels import Levels
-from sglpr_jax.sim.placing import Anchors, footprint_distance, place, select, to_scene
-from sglpr_jax.sim.sceneries.ways import STEP_M, Line, shifted
-from sglpr_jax.sim.scenery import TOWN
-from sglpr_jax.sim.shapes import Shapes
-from sglpr_jax.sim.things import Part, Thing
-from sglpr_jax.sim.world import World
+from sglpr_jax.sim.objects import BUILDING, OTHER_GROUND, TERRAIN, Part, Thing, block
+from sglpr_jax.sim.placing import HEAD_ROOM_M, Spot, distances, place, to_scene
+from sglpr_jax.sim.routes import Line, Revisit, resampled, travelled
+from sglpr_jax.sim.styles import TOWN
+from sglpr_jax.sim.world import Levels, World
 
-HEAD_ROOM_M = 2.0
-"""Minimum height of parts that may be above the vehicle, in metres."""
+STEP_M = 0.1
+"""Distance between two points of a line, in metres."""
+MARGIN_M = 90.0
+"""Length of a road before the first and after the last scan, in metres. It hides the ends of the road."""
+LAPS = 1.5
+"""Number of laps along a closed line for revisits in the same direction."""
+SWAY_WAVELENGTH_M = (15.0, 60.0)
 FLAT = Relief(np.zeros(4), np.full((4, 2), 0.01), np.zeros(4))
 _ROLLING = dataclasses.replace(TOWN, steepest=0.015)
-OVERLAP = 1.25
-"""Length of a piece of wall divided by the spacing. In curves, the outer wall is longer than the road."""
+WALL_M = 0.3
+"""Thickness of walls, in metres."""
 _AROUND_M = 30.0
-
-
-class Spot(NamedTuple):
-    """Thing and its pose in the world. If `side` is -1, its y axis is mirrored."""
-
-    thing: Thing
-    x: float  # metres, at time 0
-    y: float
-    heading: float = 0.0  # radians
-    side: int = 1
-    velocity: tuple[float, float] = (0.0, 0.0)  # m/s
-    since: float = -np.inf  # seconds
-    until: float = np.inf  # seconds
 
 
 class Site(NamedTuple):
@@ -62,16 +53,6 @@ class Strip(NamedTuple):
     high_m: float
     label: int
     dash_m: float | None = None
-
-
-def block(label: int, length: float, width: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
-    """Box with its centre at x and y. `more` holds fields of Part."""
-    return Part("box", label, (length, width, height), x, y, **more)
-
-
-def post(label: int, thick: float, height: float, x: float = 0.0, y: float = 0.0, **more) -> Part:
-    """Cylinder with its axis at x and y. `more` holds fields of Part."""
-    return Part("cylinder", label, (thick, thick, height), x, y, **more)
 
 
 def along(line: Line, make: Callable[[], Thing], every_m: float, *, first_m: float = 0.0) -> list[Spot]:
@@ -109,13 +90,10 @@ def rolling(rng: np.random.Generator) -> Relief:
     return draw_relief(rng, _ROLLING)
 
 
-def even_ground(label: int, relief: Relief = FLAT) -> Ground:
-    """Ground with one label everywhere."""
-    return Ground(np.full((1, 1), label, np.uint8), np.zeros(2), relief)
-
-
-def striped_ground(base: int, strips: Sequence[Strip], relief: Relief = FLAT) -> Ground:
+def painted_ground(base: int, strips: Sequence[Strip] = (), relief: Relief = FLAT) -> Ground:
     """Ground of label `base` with painted strips. Later strips cover earlier strips."""
+    if not strips:
+        return Ground(np.full((1, 1), base, np.uint8), np.zeros(2), relief)
     points = np.concatenate([strip.line for strip in strips])
     origin, size = points.min(axis=0) - _AROUND_M, np.ptp(points, axis=0) + 2 * _AROUND_M
     label = np.full(np.ceil(size / CELL_M).astype(int)[::-1] + 1, base, np.uint8)
@@ -129,28 +107,112 @@ def striped_ground(base: int, strips: Sequence[Strip], relief: Relief = FLAT) ->
     return Ground(label, origin, relief)
 
 
+def track(line: Line, half_m: float, relief: Relief) -> Ground:
+    """Terrain with an unpaved track of half width `half_m` along a line."""
+    return painted_ground(TERRAIN, [Strip(line, -half_m, half_m, OTHER_GROUND)], relief)
+
+
+def wall(start: tuple[float, float], stop: tuple[float, float], height_m: float) -> Part:
+    """Wall of a building along x or y."""
+    long, wide = (abs(b - a) + WALL_M for a, b in zip(start, stop, strict=True))
+    return block(BUILDING, long, wide, height_m, (start[0] + stop[0]) / 2, (start[1] + stop[1]) / 2, roughness=0.02)
+
+
+def closed_box(left: float, right: float, low: float, high: float, height_m: float) -> Thing:
+    """Four outer walls of a building and its ceiling."""
+    corners = [(left, low), (right, low), (right, high), (left, high)]
+    x, y = (left + right) / 2, (low + high) / 2
+    ceiling = block(BUILDING, right - left, high - low, 0.3, x, y, bottom=height_m, roughness=0.02)
+    return *(wall(corners[i - 1], corners[i], height_m) for i in range(4)), ceiling
+
+
 def build(site: Site, driven: Line, *, clearance_m: float) -> World:
     """Builds the world of a site without standing things closer than `clearance_m` to the driven line."""
-    parts = [part for spot in site.spots for part in spot.thing]
-    owner = np.repeat(np.arange(len(site.spots)), [len(spot.thing) for spot in site.spots])
-    x, y, heading, side, vx, vy, since, until = np.array(
-        [(*spot[1:5], *spot.velocity, spot.since, spot.until) for spot in site.spots]
-    )[owner].T
-    shapes = place(parts, Anchors(np.stack([x, y], axis=1), heading, side, since, until), site.ground)
-    shapes = shapes._replace(velocity=np.stack([vx, vy], axis=1))
+    placed = place(site.spots, site.ground)
     driven = driven if site.levels is None else site.levels.along(driven).xy
-    low = np.array([part.bottom < HEAD_ROOM_M for part in parts]) & (vx == 0) & (vy == 0)
-    bad = low & (distances(shapes, driven) < clearance_m)
-    keep = ~np.isin(owner, owner[bad])
-    return World(to_scene(select(shapes, keep), [parts[i] for i in np.flatnonzero(keep)]), site.ground, site.levels)
+    low = np.array([part.bottom < HEAD_ROOM_M for part in placed.parts]) & ~placed.shapes.velocity.any(axis=1)
+    bad = low & (distances(placed.shapes, driven, reach_m=clearance_m) < clearance_m)
+    scene = to_scene(placed, ~np.isin(placed.owner, placed.owner[bad]))
+    return World(scene, site.ground, site.levels)
 
 
-def distances(shapes: Shapes, line: Line, *, reach_m: float = 3.0) -> Float[np.ndarray, " n"]:
-    """Horizontal distance of each shape from a line, in metres. Beyond `reach_m` it is inf."""
-    reach = np.hypot(shapes.half[:, 0], shapes.half[:, 1]) + reach_m
-    near = KDTree(line).query_ball_point(np.asarray(shapes.centre)[:, :2], reach)
-    row = np.repeat(np.arange(len(near)), [len(indices) for indices in near])
-    away = line[np.concatenate([np.zeros(0), *near]).astype(int)] - shapes.centre[row, :2]
-    distance = np.full(len(near), np.inf)
-    np.minimum.at(distance, row, footprint_distance(away, np.asarray(shapes.yaw)[row], np.asarray(shapes.half)[row]))
-    return np.where(distance < reach_m, distance, np.inf)
+class Rows(NamedTuple):
+    """Path through parallel rows along x. Row k is at y = k * pitch, from x = 0 to `run_m`."""
+
+    line: Line
+    count: int
+    run_m: float
+
+
+def road(rng: np.random.Generator, length_m: float, closed: bool) -> tuple[Line, Line]:
+    """Road and its driven part: a straight line or an arc with MARGIN_M at both ends, or a closed ring."""
+    if closed:
+        line = ring(length_m, straight=rng.uniform(0, 0.5))
+        return line, line
+    turn = rng.choice((0.0, rng.uniform(-2.5, 2.5)))
+    line = _integrated(np.full(round((length_m + 2 * MARGIN_M) / STEP_M), turn / length_m))
+    margin = round(MARGIN_M / STEP_M)
+    return line, line[margin:-margin]
+
+
+def ring(length_m: float, *, straight: float) -> Line:
+    """Closed line of two straight parts and two half circles.
+
+    The straight parts together are the fraction `straight` of the length.
+    """
+    count = round(length_m * straight / 2 / STEP_M), round(length_m * (1 - straight) / 2 / STEP_M)
+    half = np.repeat([0.0, np.pi / (count[1] * STEP_M)], count)
+    return _integrated(np.tile(half, 2))
+
+
+def _integrated(curvature: Float[np.ndarray, " n"]) -> Line:
+    """Line that starts at the origin along x, with the given curvature (1 / metres) at each point."""
+    heading = np.cumsum(curvature) * STEP_M
+    return np.cumsum(STEP_M * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+
+
+def rounded(corners: Line, *, corner_m: float, closed: bool = False) -> Line:
+    """Polygon through `corners`, rounded by a Gaussian with standard deviation `corner_m`."""
+    polygon = resampled(np.concatenate([corners, corners[:1]]) if closed else corners, STEP_M)
+    polygon = polygon[:-1] if closed else polygon
+    line = gaussian_filter1d(polygon, corner_m / STEP_M, axis=0, mode="wrap" if closed else "nearest")
+    return resampled(line, STEP_M)
+
+
+def rows(length_m: float, *, run_m: float, pitch_m: float, closed: bool, back_m: float, corner_m: float) -> Rows:
+    """Path of about `length_m` metres back and forth through rows of about `run_m` metres.
+
+    A closed path returns from the last row to the first at x = -`back_m`.
+    """
+    if closed:
+        count = 2 * max(1, round((length_m - 2 * back_m) / (run_m + 2 * pitch_m) / 2))
+        run_m = (length_m - 2 * back_m - 2 * (count - 1) * pitch_m) / count
+    else:
+        count = int(np.ceil(length_m / (run_m + pitch_m))) + 1
+    ends = [(x, k * pitch_m) for k in range(count) for x in ((0.0, run_m), (run_m, 0.0))[k % 2]]
+    if closed:
+        line = rounded(np.array([*ends, (-back_m, ends[-1][1]), (-back_m, 0.0)]), corner_m=corner_m, closed=True)
+        return Rows(line, count, run_m)
+    return Rows(rounded(np.array(ends), corner_m=corner_m)[: round(length_m / STEP_M)], count, run_m)
+
+
+def way(rng: np.random.Generator, line: Line, revisit: Revisit, *, right_m: float, sway_m: float) -> Line:
+    """Path of a vehicle `right_m` metres to the right of `line`, with a sway of up to `sway_m` metres.
+
+    With revisit "opposite", the vehicle turns at the end and returns. With "same", it drives LAPS laps, and `line`
+    must be closed.
+    """
+    if revisit == "same":
+        line = np.concatenate([line, line[: round((LAPS - 1) * len(line))]])
+    out = shifted(line, -right_m)
+    if revisit == "opposite":
+        out = np.concatenate([out, _turn(line, right_m), shifted(line[::-1], -right_m)])
+    out = resampled(out, STEP_M)
+    return resampled(shifted(out, sway_m * waves(rng, travelled(out), SWAY_WAVELENGTH_M)), STEP_M)
+
+
+def _turn(line: Line, radius_m: float) -> Line:
+    """Half circle to the left around the end of `line`."""
+    ahead = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 2 + round(np.pi * radius_m / STEP_M))[1:-1, None]
+    return line[-1] + radius_m * (np.cos(angle) * ahead + np.sin(angle) * np.array([-ahead[1], ahead[0]]))

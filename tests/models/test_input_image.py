@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from sglpr_jax.bev import rotate_image
 from sglpr_jax.grid import Grid
-from sglpr_jax.models.polar import from_polar, to_polar
+from sglpr_jax.models.input_image import from_polar, to_polar
 
 GRID = Grid(resolution_m=1.0, height=32, width=40)
 RADIUS = 16
@@ -66,22 +66,6 @@ def test_a_rotation_of_the_image_is_a_shift_of_its_polar_form(images, sectors_tu
     assert difference.max() < 0.2 * np.abs(shifted - to_polar(images, GRID, RINGS, SECTORS)).max()
 
 
-def test_there_and_back_keeps_what_lies_inside_the_circle(images):
-    back = from_polar(to_polar(images, GRID, 2 * RINGS, 2 * SECTORS), GRID)
-    inside = radius_of_cells() < RADIUS - 1
-    difference = np.abs(back - images)[:, inside]
-    assert difference.max() < 0.05
-    assert np.abs(images[:, inside]).max() > 0.5
-
-
-def test_a_constant_stays_constant_within_the_circle():
-    ones = jnp.ones((1, GRID.height, GRID.width, 1))
-    polar = to_polar(ones, GRID, RINGS, SECTORS)
-    np.testing.assert_allclose(polar, 1, atol=1e-6)
-    inside = radius_of_cells() < RADIUS
-    np.testing.assert_allclose(from_polar(polar, GRID)[0, ..., 0], inside, atol=1e-6)
-
-
 def there(image):
     return to_polar(image, GRID, RINGS, SECTORS)
 
@@ -103,20 +87,3 @@ def test_jit_vmap_and_the_gradient_agree(resample, images):
     np.testing.assert_allclose((resample(x) * y).sum(), (x * gradient(y)).sum(), rtol=1e-4, atol=1e-3)
     each = jax.vmap(lambda i, y: jax.vjp(resample, i)[1](y)[0])(image[:, None], y[:, None])
     np.testing.assert_allclose(each[:, 0], gradient(y), atol=1e-5)
-
-
-def test_the_gradient_of_the_way_back_is_the_one_jax_finds(images):
-    polar = there(images)
-    y = jax.random.normal(jax.random.key(2), images.shape)
-    up = (GRID.height - 1) / 2 - np.mgrid[: GRID.height, : GRID.width][0]
-    right = np.mgrid[: GRID.height, : GRID.width][1] - (GRID.width - 1) / 2
-    ring = np.clip(np.hypot(up, right) * RINGS / RADIUS - 0.5, 0, RINGS - 1)
-    sector = (np.arctan2(up, right) % (2 * np.pi)) * SECTORS / (2 * np.pi) - 0.5
-
-    def scattering(plane):
-        read = jax.scipy.ndimage.map_coordinates(jnp.pad(plane, ((0, 0), (1, 1)), mode="wrap"), [ring, sector + 1], 1)
-        return jnp.where(radius_of_cells() < RADIUS, read, 0.0)
-
-    (expected,) = jax.vjp(scattering, polar[0, ..., 0])[1](y[0, ..., 0])
-    (found,) = jax.vjp(and_back, polar)[1](y)
-    np.testing.assert_allclose(found[0, ..., 0], expected, atol=1e-5)

@@ -1,0 +1,217 @@
+"""Estates of buildings that repeat: row houses, slabs along parallel streets, and a campus with paths."""
+
+import itertools
+
+import numpy as np
+
+from sglpr_jax.sim.drive import shifted
+from sglpr_jax.sim.ground import Ground, Relief
+from sglpr_jax.sim.objects import (
+    BUILDING,
+    FENCE,
+    OTHER_OBJECT,
+    POLE,
+    ROAD,
+    SIDEWALK,
+    TERRAIN,
+    TRUNK,
+    VEGETATION,
+    House,
+    Part,
+    Thing,
+    ball,
+    bicycle,
+    block,
+    bush,
+    hedge,
+    house,
+    parked,
+    post,
+    tree,
+)
+from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.routes import Line
+from sglpr_jax.sim.sceneries.site import (
+    STEP_M,
+    Site,
+    Strip,
+    along,
+    grid,
+    jittered,
+    painted_ground,
+    rolling,
+    rounded,
+    rows,
+)
+
+ROAD_M = 3.8
+"""Half width of the carriageway, in metres."""
+HOUSES_WALK_M, SLABS_WALK_M = 5.6, 5.8
+"""Half width of the street with its sidewalks, between row houses and between slabs, in metres."""
+HOUSES_FREE_M, SLABS_FREE_M = 12.0, 10.0
+"""Length of a crossing at both ends of a street, in metres."""
+TREE_M = 14.0
+"""Mean distance between two trees along one side of a street of slabs, in metres."""
+CAMPUS_ROW = 2
+"""Number of buildings along a path of the campus before it turns."""
+CAMPUS_MORE = 1
+"""Number of buildings beyond the driven paths, on each side."""
+TWINS = {(0, 0), (1, 0)}
+"""Column and row of the two equal buildings of the campus. Both are on the left of the first path."""
+LAWN_M = 6.0
+"""Minimum distance of a building of the campus from the middle of a path, in metres."""
+
+
+def _street(line: Line, walk_m: float, relief: Relief) -> Ground:
+    """Ground of a street with sidewalks along a line."""
+    return painted_ground(TERRAIN, [Strip(line, -walk_m, walk_m, SIDEWALK), Strip(line, -ROAD_M, ROAD_M, ROAD)], relief)
+
+
+def row_houses(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Streets of one house that repeats, 46 to 56 m apart. Different cars are parked in front of the houses."""
+    pitch, wide = rng.uniform(46, 56), rng.uniform(5.5, 9)
+    plan = rows(length_m, run_m=rng.uniform(110, 160), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
+    streets = pitch * np.arange(-1, plan.count + 1)
+    module, xs = _module(rng, wide), np.arange(HOUSES_FREE_M + wide / 2, plan.run_m - HOUSES_FREE_M, wide)
+    houses = [spot for side in (1, -1) for spot in grid(xs, streets, lambda: module, side=side)]
+    bays = [spot for side in (1, -1) for spot in grid(xs, streets + side * (ROAD_M - 0.9), lambda: parked(rng))]
+    lamps = grid(xs[:: max(1, round(30 / wide))] + wide / 2, streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 6.0),))
+    ground = _street(plan.line, HOUSES_WALK_M, rolling(rng))
+    return Site(plan.line, [*houses, *jittered(rng, bays, 0.2, keep=rng.uniform(0.2, 0.5)), *lamps], ground)
+
+
+def _module(rng: np.random.Generator, wide: float) -> Thing:
+    """House with wing, porch, shed, and a front garden with fences and a tree.
+
+    The y axis points from the middle of the street to the house.
+    """
+    garden, deep, high, recess = rng.uniform((3, 8, 5.5, 0.5), (7, 11, 9, 2.5)).tolist()
+    front, main = HOUSES_WALK_M + garden, rng.choice((1.0, 0.7)) * wide
+    body = block(BUILDING, main, deep, high + 1, 0.0, front + deep / 2, bottom=-1.0, roughness=0.06, glass=0.2)
+    wing = block(BUILDING, wide, deep - recess, 3.5, 0.0, front + recess + (deep - recess) / 2, bottom=-0.5)
+    porch = block(BUILDING, 1.4, 1.2, 2.6, rng.uniform(-0.25, 0.25) * wide, front - 0.6)
+    shed = block(BUILDING, 2.4, 2.0, 2.3, 0.3 * wide, front + deep + rng.uniform(3, 5))
+    gate = rng.uniform(1.0, 2.5)
+    border = _border(rng, wide - gate)._replace(x=-gate / 2, y=HOUSES_WALK_M + 0.4)
+    between = block(FENCE, 0.1, garden - 0.6, 1.0, wide / 2, HOUSES_WALK_M + garden / 2, porosity=0.3)
+    plant = _small_tree(rng, rng.uniform(-0.3, 0.3) * wide, front - garden / 2)
+    return body, wing, porch, shed, border, between, *plant
+
+
+def _border(rng: np.random.Generator, length: float) -> Part:
+    """Hedge or fence of this length."""
+    if rng.random() < 0.5:
+        return hedge(length, rng.uniform(0.4, 0.9), rng.uniform(0.9, 1.6))[0]
+    return block(FENCE, length, 0.1, rng.uniform(0.8, 1.2), porosity=0.4)
+
+
+def _small_tree(rng: np.random.Generator, x: float, y: float) -> Thing:
+    """Tree in a front garden."""
+    crown = rng.uniform(1.5, 2.5)
+    leaves = ball(VEGETATION, crown, crown, x, y, bottom=1.3, roughness=0.6, porosity=0.5)
+    return post(TRUNK, 0.15, 2.0, x, y), leaves
+
+
+def slabs(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Streets 44 to 56 m apart with random trees and cars. Between each two of them, equal slabs stand in a row."""
+    pitch, long, deep, high, gap = rng.uniform((44, 40, 11, 14, 12), (56, 60, 13, 26, 22)).tolist()
+    plan = rows(length_m, run_m=2 * (long + gap), pitch_m=pitch, closed=closed, back_m=12.0, corner_m=4.0)
+    streets = pitch * np.arange(-1, plan.count + 1)
+    slab, middles = _slab(long, deep, high), np.arange(gap / 2 + long / 2, plan.run_m, long + gap)
+    buildings = grid(middles, streets + pitch / 2, lambda: slab)
+    xs, aside = np.arange(SLABS_FREE_M, plan.run_m - SLABS_FREE_M, 6.0), ROAD_M - 0.9
+    bays = grid(xs, np.concatenate([streets - aside, streets + aside]), lambda: parked(rng))
+    lamps = grid(xs[::5], streets + ROAD_M + 0.5, lambda: (post(POLE, 0.18, 7.0),))
+    spots = [*buildings, *jittered(rng, bays, 0.2, keep=rng.uniform(0.3, 0.6)), *lamps]
+    spots += _street_trees(rng, plan.run_m, streets, (pitch - deep) / 2)
+    return Site(plan.line, spots, _street(plan.line, SLABS_WALK_M, rolling(rng)))
+
+
+def _street_trees(rng: np.random.Generator, run: float, streets: np.ndarray, edge: float) -> list[Spot]:
+    """Trees and bushes at random between the sidewalks and the slabs, `edge` metres from the middle of the street."""
+    spots = []
+    for street, side in itertools.product(streets.tolist(), (-1, 1)):
+        for _ in range(round(run / TREE_M)):
+            x, away = rng.uniform((0, SLABS_WALK_M + 1.0), (run, edge - 2.0)).tolist()
+            plant = _plant(rng, 5.0)
+            spots.append(Spot(plant, x, street + side * away, rng.uniform(0, 2 * np.pi)))
+    return spots
+
+
+def _plant(rng: np.random.Generator, widest: float) -> Thing:
+    """Tree with a crown of 2.5 to `widest` metres or, with probability 0.3, a bush."""
+    return tree(rng, (2.5, widest)) if rng.random() < 0.7 else bush(rng)
+
+
+def _slab(long: float, deep: float, high: float) -> Thing:
+    """Building along x with windows, and porches and balconies at equal distances."""
+    body = block(BUILDING, long, deep, high + 1, bottom=-1.0, roughness=0.05, glass=0.25)
+    entrances = np.arange(-long / 2 + 5, long / 2 - 4, 10.0).tolist()
+    porches = [block(BUILDING, 3.0, 1.4, 2.8, x, -(deep + 1.4) / 2) for x in entrances]
+    balconies = [block(BUILDING, 3.5, 1.2, high - 3.0, x, (deep + 1.2) / 2, bottom=2.5) for x in entrances]
+    return body, *porches, *balconies
+
+
+def campus(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Large separate buildings on lawns, 42 to 52 m apart, with trees and bicycle stands. Two buildings are equal.
+
+    There is a path between each two buildings. A closed path leads around one building.
+    """
+    pitch = rng.uniform(42, 52)
+    if closed:
+        line, count = rounded(pitch * np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), corner_m=1.5, closed=True), 2
+    else:
+        plan = rows(length_m, run_m=CAMPUS_ROW * pitch, pitch_m=pitch, closed=False, back_m=0.0, corner_m=1.5)
+        line, count = plan.line, plan.count
+    columns = np.arange(-CAMPUS_MORE, CAMPUS_ROW + CAMPUS_MORE)
+    lines = np.arange(-CAMPUS_MORE - 1, count + CAMPUS_MORE)
+    twin, spots = _building(rng, pitch), []
+    for column, row in itertools.product(columns.tolist(), lines.tolist()):
+        building = twin if (column, row) in TWINS else _building(rng, pitch)
+        x, y = (column + 0.5) * pitch, (row + 0.5) * pitch
+        spots += [Spot(building, x, y), *_trees_around(rng, x, y, pitch)]
+    spots += along(shifted(line, 2.5), lambda: (post(POLE, 0.15, 4.5),), rng.uniform(18, 26))
+    spots += along(shifted(line, -2.6), lambda: (block(OTHER_OBJECT, 1.8, 0.5, 0.8),), rng.uniform(25, 40))
+    ends = pitch * np.array([columns[0], columns[-1] + 1, lines[0], lines[-1] + 1])
+    paths = [Strip(each, -1.8, 1.8, SIDEWALK) for each in _paths(pitch, ends)]
+    return Site(line, spots, painted_ground(TERRAIN, paths, rolling(rng)))
+
+
+def _paths(pitch: float, ends: np.ndarray) -> list[Line]:
+    """Middles of all paths between the buildings, along x and along y."""
+    left, right, low, high = ends.tolist()
+    along_x, along_y = np.arange(left, right, STEP_M), np.arange(low, high, STEP_M)
+    return [
+        *(np.stack([along_x, np.full(len(along_x), y)], axis=1) for y in np.arange(low, high + 1, pitch)),
+        *(np.stack([np.full(len(along_y), x), along_y], axis=1) for x in np.arange(left, right + 1, pitch)),
+    ]
+
+
+def _building(rng: np.random.Generator, pitch: float) -> Thing:
+    """Building around the origin, six of ten with a wing at the back, and a bicycle stand in front of it."""
+    room = pitch - 2 * LAWN_M
+    wide, deep, high, glass = (rng.uniform((0.55, 0.3, 7, 0.2), (0.95, 0.55, 18, 0.5)) * (room, room, 1, 1)).tolist()
+    front = room * rng.uniform(-0.5, -0.35)
+    parts = [part._replace(y=part.y + front) for part in house(rng, House(wide, deep, high, glass), porch=True)]
+    if rng.random() < 0.6:
+        long, thick = rng.uniform(0.6, 0.95) * (room / 2 - front - deep), rng.uniform(0.2, 0.35) * room
+        x, y = rng.choice((-1, 1)) * (wide - thick) / 2, front + deep + long / 2
+        parts.append(block(BUILDING, thick, long, high, float(x), y, roughness=0.06, glass=glass))
+    return *parts, *_bicycles(rng, rng.uniform(-0.3, 0.3) * wide, front - 2.6)
+
+
+def _bicycles(rng: np.random.Generator, x: float, y: float) -> list[Part]:
+    """Row of 6 to 16 bicycles along x."""
+    count, every = int(rng.integers(6, 17)), rng.uniform(0.5, 0.8)
+    places = x + every * (np.arange(count) - count / 2)
+    return [bicycle(rng)[0]._replace(x=float(place), y=y, yaw=np.pi / 2) for place in places]
+
+
+def _trees_around(rng: np.random.Generator, x: float, y: float, pitch: float) -> list[Spot]:
+    """Four to ten trees and bushes on the lawn around a building."""
+    spots = []
+    for _ in range(int(rng.integers(4, 11))):
+        along_path, away = rng.uniform(-0.5, 0.5) * pitch, rng.choice((-1, 1)) * (pitch / 2 - rng.uniform(2.5, LAWN_M))
+        dx, dy = ((along_path, away), (away, along_path))[rng.integers(2)]
+        spots.append(Spot(_plant(rng, 6.0), x + dx, y + dy, rng.uniform(0, 2 * np.pi)))
+    return spots

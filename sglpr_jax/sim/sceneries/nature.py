@@ -1,0 +1,93 @@
+"""Open land and woods: a field with few things, and a forest."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from sglpr_jax.sim import objects
+from sglpr_jax.sim.drive import shifted
+from sglpr_jax.sim.ground import draw_relief
+from sglpr_jax.sim.objects import POLE, TRUNK, VEGETATION, Range, Thing, ball, bush, post, tree
+from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.routes import Line
+from sglpr_jax.sim.sceneries.site import STEP_M, Site, along, road, rolling, rounded, track
+from sglpr_jax.sim.styles import TOWN
+
+WIDE_M = 38.0
+"""Half width of the forest on both sides of the path, in metres."""
+BEND_M = 25.0
+"""Distance between two bends of the path through the forest, in metres."""
+_HILLS = dataclasses.replace(TOWN, steepest=0.12, wavelength_m=(40.0, 200.0))
+
+
+def field(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Track through fields, with posts or poles along it, some bushes, and single trees and sheds far away."""
+    whole, driven = road(rng, length_m, closed)
+    (every, thick, high), beside = ((4.0, 0.12, 1.2), (35.0, 0.3, 8.0))[rng.integers(2)], rng.choice((-1, 1)) * 5.0
+    posts = along(shifted(whole, beside), lambda: (post(POLE, thick, high),), every)
+    bushes = _beside(rng, whole, rng.uniform(20, 50), (6.0, 25.0), lambda: bush(rng))
+    far = _beside(rng, whole, rng.uniform(30, 80), (30.0, 75.0), lambda: _far(rng))
+    ground = track(whole, 1.5, rolling(rng))
+    return Site(driven, [*posts, *bushes, *far], ground)
+
+
+def _beside(
+    rng: np.random.Generator, line: Line, every_m: float, away_m: Range, make: Callable[[], Thing]
+) -> Iterator[Spot]:
+    """Yields things at random positions beside a line, on average one per `every_m` metres."""
+    for _ in range(round(len(line) * STEP_M / every_m)):
+        away = np.array([rng.uniform(*away_m) * rng.choice((-1, 1))])
+        row = int(rng.integers(1, len(line) - 1))
+        x, y = shifted(line[row - 1 : row + 2], away)[1].tolist()
+        yield Spot(make(), x, y, rng.uniform(0, 2 * np.pi))
+
+
+def _far(rng: np.random.Generator) -> Thing:
+    """Tree or, with probability 0.25, a shed."""
+    return objects.garage(rng, rng.uniform(5, 12)) if rng.random() < 0.25 else tree(rng, (3.0, 7.0))
+
+
+def forest(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Trees of one stand on slopes: 250 to 900 trunks a hectare, 0.1 to 0.6 m thick.
+
+    There is a bush for every 3 to 30 trunks. All positions are random.
+    """
+    line = _path(rng, length_m, closed)
+    density, thick = rng.uniform(0.025, 0.09), rng.uniform(0.15, 0.35)
+    branches, shrubs = rng.uniform(3.0, 7.0), 1 / rng.uniform(3, 30)
+    spots = [Spot(_tree(rng, thick, branches), x, y) for x, y in _scattered(rng, line, density)]
+    for x, y in _scattered(rng, line, shrubs * density):
+        spots.append(Spot(bush(rng), x, y, rng.uniform(0, 2 * np.pi)))
+    return Site(line, spots, track(line, 0.6, draw_relief(rng, _HILLS)))
+
+
+def _path(rng: np.random.Generator, length_m: float, closed: bool) -> Line:
+    """Path with a bend of up to 50 degrees every 25 m, or a closed one that winds around a circle."""
+    if closed:
+        angles = np.linspace(0, 2 * np.pi, max(round(length_m / BEND_M), 6), endpoint=False)
+        radius = length_m / (2 * np.pi) * rng.uniform(0.75, 1.25, len(angles))
+        corners = radius[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    else:
+        bends = rng.uniform(-50, 50, round(length_m / BEND_M) + 1)
+        heading = np.radians(np.cumsum(bends - bends.mean()))
+        corners = BEND_M * np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    return rounded(corners, corner_m=4.0, closed=closed)
+
+
+def _scattered(rng: np.random.Generator, line: Line, density: float) -> list[tuple[float, float]]:
+    """Random positions within `WIDE_M` of a line, `density` per square metre."""
+    low, high = line.min(axis=0) - WIDE_M, line.max(axis=0) + WIDE_M
+    points = rng.uniform(low, high, (round(density * np.prod(high - low)), 2))
+    coarse = line[:: round(1 / STEP_M)]
+    near = [np.linalg.norm(coarse - point, axis=1).min() < WIDE_M for point in points]
+    return [(float(x), float(y)) for x, y in points[near]]
+
+
+def _tree(rng: np.random.Generator, thick: float, branches: float) -> Thing:
+    """Trunk, and a crown that begins at about `branches` metres. The thickness has a log-normal distribution."""
+    thick = float(thick * np.exp(rng.normal(scale=0.35)))
+    wide, bottom = 10 * thick * rng.uniform(0.7, 1.3), branches * rng.uniform(0.7, 1.3)
+    high = wide * rng.uniform(1.2, 2.0)
+    leaves = ball(VEGETATION, wide, high, bottom=bottom, roughness=0.8, porosity=0.6)
+    return post(TRUNK, thick, bottom + 0.4 * high), leaves

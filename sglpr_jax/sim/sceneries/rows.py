@@ -1,0 +1,139 @@
+"""Parallel rows: orchard, vineyard, solar farm, warehouse and container terminal."""
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.sim.objects import (
+    BUILDING,
+    OTHER_GROUND,
+    OTHER_OBJECT,
+    PARKING,
+    POLE,
+    TRUNK,
+    VEGETATION,
+    Thing,
+    ball,
+    block,
+    post,
+)
+from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.sceneries.site import Rows, Site, grid, jittered, painted_ground, rolling, rows, track
+
+APART_M = 22.0
+"""Minimum distance between passes in open land, in metres. The vehicle skips rows to keep this distance."""
+FREE_M = 5.0
+"""Free length at both ends of a row in open land, in metres."""
+SLATS = 8
+"""Number of level slats along the slope of a panel. Shapes have no tilt, so the slats imitate it."""
+SHELF_FREE_M, LEVEL_M = 2.5, 1.7
+"""Free length at both ends of an aisle of a warehouse, and height of a level of its shelves, in metres."""
+CONTAINER_M = 2.44, 2.59
+"""Width and height of a container, in metres."""
+GAP_M, LANE_M, BLOCK_M = 0.35, 9.0, 55.0
+"""Gap between two stacks, width of the lanes between blocks, and approximate length of a block, in metres."""
+MORE = 1
+"""Number of aisles or blocks before the first and after the last driven one."""
+
+
+def _open_land(
+    length_m: float, closed: bool, *, pitch_m: float, run_m: float
+) -> tuple[Rows, Float[np.ndarray, " rows"]]:
+    """Path that skips rows, and y of all rows, which are `pitch_m` apart."""
+    skip = int(np.ceil(APART_M / pitch_m))
+    plan = rows(length_m, run_m=run_m, pitch_m=skip * pitch_m, closed=closed, back_m=6.0, corner_m=2.0)
+    return plan, pitch_m * (np.arange(-2 * skip, (plan.count + 1) * skip) + 0.5)
+
+
+def orchard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Rows of trees of one kind and age, 5 to 6.5 m apart, with a tree every 3 to 4.5 m."""
+    pitch, spacing, crown = rng.uniform(5, 6.5), rng.uniform(3, 4.5), rng.uniform(2.0, 2.7)
+    plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
+    trees = grid(np.arange(FREE_M, plan.run_m - FREE_M, spacing), across, lambda: _fruit_tree(rng, crown))
+    ground = track(plan.line, 1.5, rolling(rng))
+    return Site(plan.line, jittered(rng, trees, 0.12, keep=0.97), ground)
+
+
+def _fruit_tree(rng: np.random.Generator, crown: float) -> Thing:
+    """Trunk, and a crown whose width differs by up to 10 % from `crown`."""
+    wide, high = crown * rng.uniform(0.9, 1.1), crown * rng.uniform(1.0, 1.3)
+    leaves = ball(VEGETATION, wide, high, bottom=0.8, roughness=0.5, porosity=0.5)
+    return post(TRUNK, rng.uniform(0.12, 0.2), 1.8), leaves
+
+
+def vineyard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Rows of vines 2.8 to 3.4 m apart, with a post every 4 to 6 m."""
+    pitch, every, high, thick = rng.uniform((2.8, 4, 1.6, 0.35), (3.4, 6, 2.2, 0.6)).tolist()
+    plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(70, 110))
+    middles = np.arange(FREE_M, plan.run_m - FREE_M - every, every) + every / 2
+    vines = grid(middles, across, lambda: _vines(rng, every, high, thick))
+    return Site(plan.line, vines, track(plan.line, 1.2, rolling(rng)))
+
+
+def _vines(rng: np.random.Generator, every: float, high: float, thick: float) -> Thing:
+    """Leaves between two posts, with random size and density, and the first post."""
+    top, wide = high * rng.uniform(0.9, 1.05), thick * rng.uniform(0.8, 1.2)
+    leaves = block(VEGETATION, every, wide, top - 0.6, bottom=0.6, roughness=0.2, porosity=rng.uniform(0.3, 0.6))
+    return leaves, post(POLE, 0.1, high + 0.15, -every / 2)
+
+
+def solar(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Rows of equal panels 7 to 10 m apart. The panels are 8 to 16 m long and tilted by 15 to 30 degrees."""
+    pitch, long, deep, tilt, low = rng.uniform((7, 8, 2.2, 15, 0.6), (10, 16, 3.8, 30, 1.0)).tolist()
+    plan, across = _open_land(length_m, closed, pitch_m=pitch, run_m=rng.uniform(80, 130))
+    panel = _panel(long, deep, np.radians(tilt), low)
+    panels = grid(np.arange(FREE_M + long / 2, plan.run_m - FREE_M - long / 2, long + 0.4), across, lambda: panel)
+    return Site(plan.line, panels, track(plan.line, 1.5, rolling(rng)))
+
+
+def _panel(long: float, deep: float, tilt: float, low: float) -> Thing:
+    """Table of panels along x that rises along y from `low` metres, on two rows of posts."""
+    wide, step = np.cos(tilt) * deep / SLATS, np.sin(tilt) * deep / SLATS
+    places = ((np.arange(SLATS) - (SLATS - 1) / 2) * wide).tolist()
+    slats = [block(OTHER_OBJECT, long, wide, step + 0.02, y=y, bottom=low + k * step) for k, y in enumerate(places)]
+    xs = np.linspace(-long / 2 + 1, long / 2 - 1, 4).tolist()
+    posts = [post(POLE, 0.12, low + k * step, x, places[k]) for k in (1, SLATS - 2) for x in xs]
+    return *slats, *posts
+
+
+def warehouse(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Aisles 5 to 6 m apart, between shelves with three levels that are 85 to 95 % full."""
+    pitch, aisle, bay, full = rng.uniform(5, 6), rng.uniform(2.6, 3.0), rng.uniform(2.4, 3.0), rng.uniform(0.85, 0.95)
+    plan = rows(length_m, run_m=rng.uniform(25, 40), pitch_m=pitch, closed=closed, back_m=2.5, corner_m=0.6)
+    lanes = pitch * np.arange(-MORE, plan.count + MORE + 1)
+    bays = np.arange(SHELF_FREE_M, plan.run_m - SHELF_FREE_M - bay, bay) + bay / 2
+    spots = grid(bays, lanes - pitch / 2, lambda: _shelf(rng, bay, pitch - aisle, full))
+    low, high, height = lanes[0] - pitch / 2, lanes[-1] - pitch / 2, rng.uniform(6, 9)
+    x, y, long, wide = plan.run_m / 2, (low + high) / 2, plan.run_m + 14.0, high - low + 6.0
+    walls = [block(BUILDING, long, 0.4, height, y=side * wide / 2) for side in (-1, 1)]
+    walls += [block(BUILDING, 0.4, wide, height, x=side * long / 2) for side in (-1, 1)]
+    ceiling = block(BUILDING, long, wide, 0.4, bottom=height)
+    return Site(plan.line, [*spots, Spot((*walls, ceiling), x, y)], painted_ground(OTHER_GROUND))
+
+
+def _shelf(rng: np.random.Generator, bay: float, deep: float, full: float) -> Thing:
+    """One bay of a double shelf: a frame, two boards, and pallets on three levels on both sides."""
+    parts = [block(POLE, 0.12, 0.12, 3.4 * LEVEL_M, -bay / 2, side * (deep / 2 - 0.06)) for side in (-1, 1)]
+    parts += [block(OTHER_OBJECT, bay, deep, 0.14, bottom=level * LEVEL_M) for level in (1, 2)]
+    for level in range(3):
+        for side in (-1, 1):
+            wide, thick, high = rng.uniform((0.75 * bay, 0.38 * deep, 0.8), (0.92 * bay, 0.46 * deep, 1.45)).tolist()
+            if rng.random() < full:
+                y = side * (deep / 2 - thick / 2 - rng.uniform(0, 0.1))
+                parts.append(block(OTHER_OBJECT, wide, thick, high, y=y, bottom=level * LEVEL_M + 0.14))
+    return tuple(parts)
+
+
+def terminal(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Blocks five or six containers wide, with stacks of one to five containers, between lanes along x and along y."""
+    wide, long, run = int(rng.integers(5, 7)), float(rng.choice((6.06, 12.19))), rng.uniform(95, 125)
+    across, high = CONTAINER_M
+    pitch, bay = wide * (across + GAP_M) + LANE_M, long + GAP_M
+    plan = rows(length_m, run_m=run, pitch_m=pitch, closed=closed, back_m=LANE_M / 2, corner_m=2.5)
+    lanes = pitch * np.arange(-MORE - 1, plan.count + MORE)
+    first, each = np.linspace(0, plan.run_m, 1 + max(1, round(plan.run_m / BLOCK_M)), retstep=True)
+    middles = (np.arange((each - LANE_M) // bay) + 0.5) * bay
+    xs = (first[:-1, None] + LANE_M / 2 + middles).ravel()
+    ys = (lanes[:, None] + LANE_M / 2 + (np.arange(wide) + 0.5) * (across + GAP_M)).ravel()
+    stacks = grid(xs, ys, lambda: (block(OTHER_OBJECT, long, across, high * int(rng.integers(1, 6))),))
+    masts = grid(first[:-1] + LANE_M / 2 - 1.0, lanes + LANE_M / 2 + 0.5, lambda: (post(POLE, 0.5, 20.0),))
+    return Site(plan.line, [*jittered(rng, stacks, 0.04), *masts], painted_ground(PARKING))

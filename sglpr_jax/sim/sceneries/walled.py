@@ -1,0 +1,183 @@
+"""Walled places of equal size in a row: yards and halls. A scan shows all of a place.
+
+The path leads from one place to the next, or criss-cross through a single one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sglpr_jax.sim.objects import (
+    BUILDING,
+    OTHER_GROUND,
+    OTHER_OBJECT,
+    PARKING,
+    POLE,
+    Thing,
+    bicycle,
+    block,
+    bush,
+    car,
+    post,
+    tree,
+)
+from sglpr_jax.sim.placing import Spot
+from sglpr_jax.sim.routes import Line
+from sglpr_jax.sim.sceneries.site import STEP_M, Site, grid, painted_ground, rounded, wall
+
+GATE_M = 3.2
+"""Width of the gate between two places, in metres."""
+MARGIN_M = 2.5
+"""Minimum distance of the corners of a path from the walls, in metres."""
+BEND = 0.15
+"""Maximum distance of gates and bends from the middle of a place, as a fraction of its width."""
+CORNER_M = 0.6
+STRAIGHT_M = 1.5
+"""Length of the straight path on each side of a gate, in metres."""
+YARD_M2, HALL_M2 = 22.0, 40.0
+"""Area for each thing in a yard and in a hall, in square metres."""
+
+
+class Places(NamedTuple):
+    """Places along x, each `long_m` long and `wide_m` wide. Place k is around ((k + 0.5) * long_m, 0)."""
+
+    line: Line
+    walls: Thing  # of all places, in the frame of the world
+    count: int
+    long_m: float
+    wide_m: float
+
+    def anywhere(
+        self, rng: np.random.Generator, area_m2: float, *, away_m: float = 1.0
+    ) -> list[tuple[float, float, float]]:
+        """Random x, y and heading of things in a place, about one for `area_m2`, `away_m` or more from its walls."""
+        count = round(self.long_m * self.wide_m / area_m2 * rng.uniform(0.7, 1.3))
+        half = self.wide_m / 2
+        low, high = (away_m, away_m - half, 0), (self.long_m - away_m, half - away_m, 2 * np.pi)
+        return [(x, y, heading) for x, y, heading in rng.uniform(low, high, (count, 3)).tolist()]
+
+
+def _places(
+    rng: np.random.Generator, length_m: float, closed: bool, *, long_m: float, wide_m: float, height_m: float
+) -> Places:
+    """Draws a path of about `length_m` metres through one place after another, joined by gates.
+
+    A closed path stays in a single place, and crosses itself.
+    """
+    if closed:
+        line, gates = _criss_cross(rng, length_m, long_m, wide_m), []
+    else:
+        count = int(np.ceil(length_m / long_m)) + 1
+        gates = (wide_m * rng.uniform(-BEND, BEND, count - 1)).tolist()
+        line = _onward(rng, gates, long_m, wide_m)[: round(length_m / STEP_M)]
+    ends, half = (len(gates) + 1) * long_m, wide_m / 2
+    walls = [wall((0.0, side * half), (ends, side * half), height_m) for side in (-1, 1)]
+    walls += [wall((x, -half), (x, half), height_m) for x in (0.0, ends)]
+    for k, y in enumerate(gates, 1):
+        walls.append(wall((k * long_m, -half), (k * long_m, y - GATE_M / 2), height_m))
+        walls.append(wall((k * long_m, y + GATE_M / 2), (k * long_m, half), height_m))
+    return Places(line, tuple(walls), len(gates) + 1, long_m, wide_m)
+
+
+def _onward(rng: np.random.Generator, gates: list[float], long_m: float, wide_m: float) -> Line:
+    """Path along x through all gates, with a bend in the middle of each place."""
+    bends = (wide_m * rng.uniform(-BEND, BEND, len(gates) + 1)).tolist()
+    corners = [(MARGIN_M, bends[0])]
+    for k, gate in enumerate(gates):
+        x = (k + 1) * long_m
+        corners += [((k + 0.5) * long_m, bends[k]), (x - STRAIGHT_M, gate), (x + STRAIGHT_M, gate)]
+    corners.append(((len(gates) + 1) * long_m - MARGIN_M, bends[-1]))
+    return rounded(np.array(corners), corner_m=CORNER_M)
+
+
+def _criss_cross(rng: np.random.Generator, length_m: float, long_m: float, wide_m: float) -> Line:
+    """Closed path between random corners, each at least half the width of the place from the corner before."""
+    low, high = np.array((MARGIN_M, MARGIN_M - wide_m / 2)), np.array((long_m - MARGIN_M, wide_m / 2 - MARGIN_M))
+    corners = [rng.uniform(low, high)]
+    while len(corners) < 3 or _around(np.array(corners)) < length_m:
+        corner = rng.uniform(low, high)
+        if np.linalg.norm(corner - corners[-1]) > min(long_m, wide_m) / 2:
+            corners.append(corner)
+    return rounded(np.array(corners), corner_m=CORNER_M, closed=True)
+
+
+def _around(corners: Float[np.ndarray, "n 2"]) -> float:
+    """Length of a closed polygon, in metres."""
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum())
+
+
+def yard(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Yards of 15 to 24 m with equal walls and different things, joined by gates. A closed path stays in one yard."""
+    long, wide, height = rng.uniform((15, 15, 3), (24, 24, 8)).tolist()
+    plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    spots = [Spot(plan.walls, 0.0, 0.0)]
+    for k in range(plan.count):
+        spots += [Spot(_lumber(rng), x + k * long, y, heading) for x, y, heading in plan.anywhere(rng, YARD_M2)]
+        spots += _annexes(rng, k * long, long, wide)
+    return Site(plan.line, spots, painted_ground(PARKING))
+
+
+def _lumber(rng: np.random.Generator) -> Thing:
+    """Crate, bin, barrel, pole, plant or vehicle."""
+    long, wide, high = rng.uniform((0.4, 0.4, 0.6), (1.8, 1.4, 2.6)).tolist()
+    match rng.choice(6, p=[0.45, 0.15, 0.1, 0.2, 0.05, 0.05]):
+        case 0:
+            return (block(OTHER_OBJECT, long, wide, high),)
+        case 1:
+            return (post(OTHER_OBJECT, wide, 0.6 * high),)
+        case 2:
+            return (post(POLE, 0.12, 2 * high),)
+        case 3:
+            return tree(rng, (1.5, 3.5)) if rng.random() < 0.4 else bush(rng, 0.7)
+        case 4:
+            return car(rng)
+        case _:
+            return bicycle(rng)
+
+
+def _annexes(rng: np.random.Generator, x: float, long: float, wide: float) -> list[Spot]:
+    """Sheds, stairs and ducts at the two walls along x."""
+    spots = []
+    for side in (-1, 1):
+        for place in rng.uniform(2.0, long - 2.0, int(rng.integers(1, 4))).tolist():
+            length, deep, high = rng.uniform((0.5, 0.4, 1.0), (3.0, 1.6, 3.0)).tolist()
+            spots.append(Spot((block(OTHER_OBJECT, length, deep, high),), x + place, side * (wide - deep - 0.3) / 2))
+    return spots
+
+
+def hall(rng: np.random.Generator, length_m: float, closed: bool) -> Site:
+    """Halls of 30 to 60 m with equal walls and columns and different things, joined by gates.
+
+    A closed path stays in one hall.
+    """
+    long, wide, height, span = rng.uniform((30, 30, 5, 6), (60, 45, 9, 10)).tolist()
+    plan = _places(rng, length_m, closed, long_m=long, wide_m=wide, height_m=height)
+    column, along = (block(POLE, 0.4, 0.4, height),), plan.count * long
+    columns = grid(np.arange(span / 2, along, span), np.arange((span - wide) / 2, wide / 2, span), lambda: column)
+    ceiling = block(BUILDING, along, wide, 0.3, along / 2, bottom=height, roughness=0.02)
+    spots = [Spot((*plan.walls, ceiling), 0.0, 0.0), *columns]
+    for k in range(plan.count):
+        for x, y, heading in plan.anywhere(rng, HALL_M2, away_m=2.5):
+            turned = heading if rng.random() < 0.3 else round(2 * heading / np.pi) * np.pi / 2
+            spots.append(Spot(_machine(rng), x + k * long, y, turned))
+    return Site(plan.line, spots, painted_ground(OTHER_GROUND))
+
+
+def _machine(rng: np.random.Generator) -> Thing:
+    """Machine, shelf or stack of crates."""
+    match rng.integers(3):
+        case 0:
+            long, wide, high = rng.uniform((1.5, 1.0, 1.0), (5.0, 2.5, 2.2)).tolist()
+            x, tower = rng.uniform(-0.3, 0.3) * long, rng.uniform(0.3, 1.5)
+            body = block(OTHER_OBJECT, long, wide, high)
+            return body, block(OTHER_OBJECT, 0.35 * long, 0.7 * wide, tower, x, bottom=high)
+        case 1:
+            long, wide, high = rng.uniform((2.0, 0.5, 1.8), (6.0, 1.1, 4.0)).tolist()
+            return (block(OTHER_OBJECT, long, wide, high, roughness=0.15, porosity=0.25),)
+        case _:
+            size = rng.uniform(0.6, 1.3, 3)
+            return tuple(
+                block(OTHER_OBJECT, *(size * rng.uniform(0.8, 1.1, 3)).tolist(), x=1.4 * k)
+                for k in range(int(rng.integers(1, 4)))
+            )

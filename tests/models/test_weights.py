@@ -1,0 +1,174 @@
+"""Parts of a model's weights, grafts, checksums, averages, and the whitening layer."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sglpr_jax
+from sglpr_jax.models.config import CircularConfig, HeadConfig, model_preset
+from sglpr_jax.models.params import Params
+from sglpr_jax.models.place_head import Whitening
+from sglpr_jax.models.sglpr import describe, init
+from sglpr_jax.models.weights import (
+    as_tree,
+    average,
+    by_name,
+    describing,
+    fit_whitening,
+    for_places,
+    graft,
+    unwhitened,
+    weight_shapes,
+    weights_hash,
+    whitened,
+)
+from sglpr_jax.models.weights_file import load, save
+
+
+@functools.cache
+def fresh(seed: int) -> Params:
+    return init(jax.random.key(seed), preset="tiny")
+
+
+@pytest.mark.slow
+def test_every_parameter_is_the_weighted_mean():
+    models = [fresh(seed) for seed in range(3)]
+    found = by_name(average(models, shares=[4.0, 3.0, 1.0]).weights)
+    names = [by_name(model.weights) for model in models]
+    for name, value in found.items():
+        expected = np.average([np.asarray(each[name], np.float64) for each in names], axis=0, weights=[4, 3, 1])
+        np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-7)
+    assert found.keys() == names[0].keys() and any(np.ptp(np.asarray(value)) > 0 for value in found.values())
+
+
+def test_whitening_layers_are_left_out():
+    plain = fresh(0)
+    descriptors = np.random.default_rng(0).normal(size=(300, 256)).astype(np.float32)
+    found = average([whitened(plain, descriptors), plain])
+    assert found.config == plain.config
+    for name, value in by_name(found.weights).items():
+        np.testing.assert_allclose(value, by_name(plain.weights)[name], rtol=1e-6)
+
+
+@pytest.mark.parametrize("shares", [[1.0], [1.0, 2.0, 3.0], [2.0, -1.0], [0.0, 0.0]])
+def test_shares_that_weigh_nothing_are_refused(shares):
+    with pytest.raises(ValueError, match="expected 2 shares of 0 or more, not all 0, found"):
+        average([fresh(0), fresh(1)], shares=shares)
+
+
+def test_models_that_differ_are_refused_by_the_name_of_what_does():
+    one = fresh(0)
+    with pytest.raises(ValueError, match="found categories 20 and 0"):
+        average([one, for_places(one)])
+    head = dataclasses.replace(model_preset("tiny").head, clusters=7)
+    with pytest.raises(ValueError, match=r"found head\.clusters \d+ and 7"):
+        average([one, init(jax.random.key(0), config=dataclasses.replace(model_preset("tiny"), head=head))])
+
+
+RNG = np.random.default_rng(0)
+CLOUD = RNG.normal(size=(500, 6)) * [3, 1, 0.5, 0.3, 0.2, 0.1] @ RNG.normal(size=(6, 6)) + RNG.normal(size=6)
+BEV = jnp.asarray(RNG.poisson(0.7, (4, 32, 32)), jnp.float32)
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
+def test_the_spread_along_every_component_is_its_own_to_the_power_left(power):
+    spread = np.linalg.svd(CLOUD, compute_uv=False)[::-1] / len(CLOUD) ** 0.5
+    expected = spread * (spread / spread.max()) ** -power
+    mapped = CLOUD @ fit_whitening(CLOUD, power=power)
+    np.testing.assert_allclose(mapped.T @ mapped / len(CLOUD), np.diag(expected**2), atol=1e-3)
+
+
+def test_distances_are_those_of_numpy():
+    kernel, bias = fit_whitening(CLOUD, power=0.5), RNG.normal(size=6).astype(np.float32)
+    vectors = CLOUD / np.linalg.norm(CLOUD, axis=1, keepdims=True)
+    found = Whitening().apply({"params": {"kernel": kernel, "bias": bias}}, jnp.asarray(vectors, jnp.float32))
+    expected = vectors @ kernel.astype(np.float64) + bias
+    np.testing.assert_allclose(found, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-5)
+
+
+@pytest.mark.parametrize("n", [1, 20])
+def test_equal_descriptors_are_refused(n):
+    with pytest.raises(ValueError, match=f"found {n} equal descriptors"):
+        fit_whitening(np.ones((n, 6)))
+
+
+@pytest.mark.slow
+def test_fitted_weights_describe_are_stored_and_lose_the_layer_again(random_params, tmp_path):
+    params = random_params(model_preset("tiny"))
+    before = np.asarray(describe(params, BEV))
+    samples = before[:1] + RNG.normal(scale=0.1, size=(600, 256)).astype(np.float32)
+    fitted = whitened(params, samples)
+    expected = before @ fit_whitening(samples)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(describe(fitted, BEV), expected, atol=1e-4)
+    np.testing.assert_allclose(describe(load(save(fitted, tmp_path / "weights")), BEV), expected, atol=1e-4)
+    chex.assert_trees_all_equal(unwhitened(fitted), params)
+    with pytest.raises(ValueError, match="without a whitening layer"):
+        whitened(fitted, samples)
+
+
+@pytest.fixture(scope="module")
+def params(random_params) -> Params:
+    return jax.tree.map(np.asarray, random_params(model_preset("tiny")))
+
+
+def test_weights_with_and_without_a_segmentation_head_are_grafted_onto_each_other(params):
+    kept = {name: values for name, values in params.weights.items() if name != "segmentation_head"}
+    given = Params(kept, dataclasses.replace(params.config, categories=0))
+    fresh = jax.tree.map(np.zeros_like, params)
+    found = graft(given, fresh)
+    assert found.config == params.config
+    chex.assert_trees_all_equal({k: v for k, v in found.weights.items() if k != "segmentation_head"}, kept)
+    chex.assert_trees_all_equal(found.weights["segmentation_head"], fresh.weights["segmentation_head"])
+    chex.assert_trees_all_equal(graft(params, given).weights, kept)
+    with pytest.raises(ValueError, match=r"segmentation_head/kernel has shape .*, expected no such weight"):
+        graft(params, dataclasses.replace(fresh, weights=kept))
+
+
+def with_fine_blocks(*channels):
+    rings = CircularConfig(widths=(4, 6), strides=(2, 1), means=(1, 2), fine=channels)
+    head = HeadConfig(tap="tokens", cbam=False, channels=(), kernels=(), strides=(), clusters=4)
+    return dataclasses.replace(model_preset("tiny"), field="circle", polar=(16, 32), backbone=rings, head=head)
+
+
+@pytest.mark.slow
+def test_a_network_grown_by_fine_blocks_begins_as_the_smaller_one():
+    small = sglpr_jax.init(jax.random.key(0), config=with_fine_blocks(5))
+    grown = graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks(5, 6)))
+    bev = jnp.asarray(np.random.default_rng(0).poisson(0.7, (2, 32, 32)), jnp.float32)
+    describe, segment = jax.jit(sglpr_jax.describe), jax.jit(sglpr_jax.segment)
+    np.testing.assert_allclose(describe(grown, bev), describe(small, bev), atol=1e-6)
+    np.testing.assert_allclose(segment(grown, bev), segment(small, bev), atol=1e-5)
+    expected = r"decoder/block_1/convolution/kernel has shape \(3, 3, 10, 4\), expected \(3, 3, 5, 4\)"
+    with pytest.raises(ValueError, match=expected):
+        graft(small, sglpr_jax.init(jax.random.key(1), config=with_fine_blocks()))
+
+
+def test_the_hash_changes_with_one_value_and_one_name(params):
+    def changed(kernel, name="kernel"):
+        head = params.weights["place_head"]
+        layer = {"bias": head["convolution_0"]["bias"], name: kernel}
+        return weights_hash(Params(params.weights | {"place_head": head | {"convolution_0": layer}}, params.config))
+
+    kernel = params.weights["place_head"]["convolution_0"]["kernel"]
+    nudged = kernel.copy()
+    nudged.flat[0] = np.nextafter(nudged.flat[0], np.float32(9))
+    hashes = [weights_hash(params), changed(nudged), changed(kernel, "other"), changed(kernel.reshape(4, -1))]
+    assert len(set(hashes)) == 4
+    assert changed(jnp.asarray(kernel)) == weights_hash(params)
+    assert len(hashes[0]) == 64
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tap", ["tokens", "pixels"])
+@pytest.mark.parametrize("name", ["paper", "circular", "sglpr"])
+def test_what_describes_is_what_a_model_without_a_segmentation_head_has(name, tap):
+    config = model_preset(name)
+    config = dataclasses.replace(config, head=dataclasses.replace(config.head, tap=tap))
+    whole = Params(as_tree(dict(weight_shapes(config))), config)
+    assert set(by_name(describing(whole))) == set(weight_shapes(dataclasses.replace(config, categories=0)))
