@@ -1,10 +1,4 @@
-"""How long programs take to start: the help of each command, random weights of each preset, loading of shipped weights,
-and the descriptor of one scan, cold (nothing compiled yet, timed once) and warm.
-
-    taskset -c 1 python -m benchmarks.speed.start_up
-
-Seconds, and processor seconds, which are nearer the truth on a machine that is busy: the least and the median.
-"""
+"""Time until commands start, networks are made, weights are loaded and the first scan is described."""
 
 import dataclasses
 import os
@@ -17,7 +11,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -34,14 +27,17 @@ COMMANDS = tuple(
 )
 
 
-def main(
+def start_up(
     *,
     commands: tuple[str, ...] = COMMANDS,
     presets: tuple[str, ...] = tuple(MODELS),
     weights: str = "sglpr",
     repeats: int = 9,
 ) -> None:
-    """Time commands in processes of their own, one after another.
+    """Time commands in processes of their own, one after another: under `taskset -c 1`.
+
+    The descriptor of one scan is timed cold (nothing compiled yet, once) and warm. Processor seconds are nearer the
+    truth on a machine that is busy.
 
     Args:
         commands: whose help is timed.
@@ -66,18 +62,18 @@ def main(
             (f"load and describe one image, {weights}", ("-c", DESCRIBE.format(weights))),
             (f"embed one scan, {weights}", embed),
         ):
-            wall, processor = seconds(line, environment)
+            wall, processor = _seconds(line, environment)
             table.add_row(f"{title}, cold", f"{wall:.2f}", "", f"{processor:.2f}", "")
             lines[f"{title}, warm"] = line
         for title, line in lines.items():
-            wall, processor = zip(*(seconds(line, environment) for _ in range(repeats)), strict=True)
+            wall, processor = zip(*(_seconds(line, environment) for _ in range(repeats)), strict=True)
             found = (min(wall), statistics.median(wall), min(processor), statistics.median(processor))
             table.add_row(title, *(f"{value:.2f}" for value in found))
     Console(width=None if sys.stdout.isatty() else 140).print(table)
     print(f"{repeats} times each; {os.cpu_count()} CPUs, load average {os.getloadavg()[0]:.1f}")
 
 
-def seconds(line: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float]:
+def _seconds(line: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float]:
     """How long Python takes for a command line, and how long processors work for it."""
     start, before = time.perf_counter(), _processor_s()
     subprocess.run((sys.executable, *line), env=environment, check=True, capture_output=True)
@@ -92,7 +88,3 @@ def _processor_s() -> float:
     """Of all processes that were started here and have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-if __name__ == "__main__":
-    tyro.cli(main)
