@@ -63,12 +63,10 @@ PROGRAMS = {
     "fleet loops": Program("fleet.ray", "loops", "recipe for Ray: loops between recordings that may overlap"),
     "fleet places": Program("fleet.index", "places", "places for a large index"),
     "fleet index": Program("fleet.index", "index", "time, bytes and recall of a large index"),
-    "robustness scans": Program("robustness.scans", "scans", "100,000 scans in one embed: time and memory"),
     "robustness kills": Program("robustness.disturbed", "kills", "commands that are killed again and again"),
     "robustness together": Program("robustness.disturbed", "together", "commands started twice at once on one folder"),
     "robustness disk": Program("robustness.disturbed", "disk", "full disk, read-only folder, missing files"),
-    "robustness platforms": Program("robustness.installation", "platforms", "wheels of every dependency, by platform"),
-    "robustness readme": Program("robustness.installation", "readme", "the README on a bare machine"),
+    "robustness platforms": Program("robustness.platforms", "platforms", "wheels of every dependency, by platform"),
 }
 
 

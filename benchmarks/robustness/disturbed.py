@@ -79,11 +79,6 @@ def _run(title: str, commands: Sequence[str], rows_of: Callable[[Writer, Path], 
             for row in rows_of(WRITERS[name], Path(folder)):
                 rows.append({"command": name, **row})
                 print(rows[-1], flush=True)
-    report(title, rows)
-
-
-def report(title: str, rows: Sequence[Row]) -> None:
-    """Print a table, whose columns are the keys of its rows, and how it was made."""
     table = Table(*rows[0], title=title)
     for row in rows:
         table.add_row(*(f"{value:.1f}" if isinstance(value, float) else str(value) for value in row.values()))
