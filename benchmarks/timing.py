@@ -8,10 +8,12 @@ import importlib.metadata
 import multiprocessing
 import os
 import platform
+import resource
 import shlex
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +54,16 @@ def in_turn(jobs: Sequence[Callable[[], float]], *, repeats: int) -> Float[np.nd
 def median_seconds(job: Job, *, repeats: int) -> float:
     """Median seconds of one job."""
     return float(np.median(in_turn([clocked(job)], repeats=repeats)))
+
+
+def run_command(command: Sequence[str | Path], environment: Mapping[str, str] = os.environ) -> tuple[float, float]:
+    """Seconds and processor seconds of a command. Raises SystemExit if it fails."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
+    seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if ended.returncode:
+        raise SystemExit(f"{command[:3]} failed: {ended.stderr[-2000:]}")
+    return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 class Contender:

@@ -2,8 +2,6 @@
 
 import functools
 import json
-import os
-import resource
 import subprocess
 import sys
 import time
@@ -19,6 +17,7 @@ from rich.table import Table
 import sglpr_jax
 from benchmarks.drives import Case, odometry_of
 from benchmarks.quality.scoring import Closure, closures_of, counted, repeating_rule, told, town_rule
+from benchmarks.timing import run_command
 from sglpr_jax.data.formats.pose_files import read_poses, read_tum
 from sglpr_jax.data.mounting import MODEL_HEIGHT_M, Mounting
 from sglpr_jax.data.recording import Record
@@ -73,12 +72,12 @@ class Found(NamedTuple):
     """Loops of two scans with their poses, if the method has such loops."""
 
 
-def _ours(drive: Drive, *, drifting: bool, weights: str, registered: bool, **_: Any) -> Found:
+def _ours(drive: Drive, *, drifting: bool, weights: str, **_: Any) -> Found:
     """`find_loops` without odometry, or with odometry that drifts and is corrected."""
     params, poses = sglpr_jax.load(weights), drive.recording.poses.world_from_lidar
     odometry = odometry_of("drifting" if drifting else "none", poses, seed=0)
     start = time.perf_counter(), time.process_time()
-    loops = sglpr_jax.find_loops(drive.recording, params, odometry=odometry, registered=registered).loops
+    loops = sglpr_jax.find_loops(drive.recording, params, odometry=odometry, registered=False).loops
     taken = time.perf_counter() - start[0], time.process_time() - start[1]
     return Found(closures_of(loops), None if odometry is None else optimized(odometry, loops).poses, *taken, loops)
 
@@ -124,7 +123,7 @@ def _bin_loops(drive: Drive, *, weights: str, **_: Any) -> Found:
     mounting = drive.recording.mounting or Mounting(MODEL_HEIGHT_M)
     flags = ["--format", "kitti", "--odometry", "auto", "--optimize", "--out", out, "--weights", weights]
     flags += ["--sensor-height", str(mounting.height_m)]
-    taken = _run([sys.executable, "-m", "sglpr_jax.cli.loops", drive.files(), *flags])
+    taken = run_command([sys.executable, "-m", "sglpr_jax.cli.loops", drive.files(), *flags])
     loops = read_loops_jsonl(out / "loops.jsonl")
     return Found(closures_of(loops), read_tum(out / "trajectory-optimized.tum")[0], *taken, loops)
 
@@ -132,7 +131,7 @@ def _bin_loops(drive: Drive, *, weights: str, **_: Any) -> Found:
 def _local_maps(drive: Drive, *, method: str, environment: Path, **_: Any) -> Found:
     """A program that closes loops between local maps. MapClosures does not correct kiss-icp's odometry."""
     out = drive.folder.with_name(f"{drive.folder.name}-{method}.json")
-    taken = _run([_peer_python(environment), PEERS / "run.py", method, drive.files(), out])
+    taken = run_command([_peer_python(environment), PEERS / "run.py", method, drive.files(), out])
     said = json.loads(out.read_text())
     maps = [np.arange(*ends) for ends in said["maps"]]
     closed = [sorted((one["source"], one["target"]), reverse=True) for one in said["closures"]]
@@ -158,16 +157,6 @@ def _peer_python(environment: Path) -> Path:
     return python.absolute()
 
 
-def _run(command: Sequence[str | Path]) -> tuple[float, float]:
-    """Run a command. Return its seconds and processor seconds."""
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    ended = subprocess.run(command, capture_output=True, text=True, env=dict(os.environ))
-    if ended.returncode:
-        raise SystemExit(f"{command[:3]} failed: {ended.stderr[-2000:]}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.perf_counter() - start, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
 def simulated(
     *,
     drives: tuple[str, ...] = ("town:08:101", "town:00:102", "town:06:103"),
@@ -176,7 +165,6 @@ def simulated(
     scans: int = 1000,
     azimuth_steps: int = 900,
     weights: str = "sglpr",
-    registered: bool = False,
     environment: Path = Path("build/peers"),
     out: Path = Path("build/loops"),
 ) -> None:
@@ -197,7 +185,6 @@ def simulated(
         scans: scans of each drive.
         azimuth_steps: firings of the sensor per turn.
         weights: model that describes the scans.
-        registered: register the loops of `sglpr` and `drifting` by full scans (extra slam).
         environment: folder of the environment of kiss-slam and MapClosures, made if it does not exist.
         out: folder of the files for other processes.
     """
@@ -212,7 +199,7 @@ def simulated(
             rule = town_rule(positions, recording.times) if in_town else repeating_rule(poses, case.other_m)
             drive = Drive(case, recording, out / f"{'-'.join(map(str, case))}-{scans}x{azimuth_steps}")
             for method in methods:
-                found = METHODS[method](drive, weights=weights, registered=registered, environment=environment)
+                found = METHODS[method](drive, weights=weights, environment=environment)
                 counts = counted(found.closures, positions, rule)
                 error = "-" if found.trajectory is None else f"{trajectory_error(found.trajectory, positions):.2f}"
                 cells = (f"{found.seconds:.0f}", f"{found.processor_seconds:.0f}", *map(str, counts[:3]))

@@ -1,7 +1,6 @@
 """Single scans and submaps on a street that is driven five times, in both directions and a lane aside."""
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,7 +65,7 @@ def recall(
         weights: the model that describes the scans.
         out: folder of the scans.
     """
-    print(f"| sensor | submap m | {' | '.join(list(PASSES)[1:])} | ms a submap |\n|---|---|" + "---|" * len(PASSES))
+    print(f"| sensor | submap m | {' | '.join(list(PASSES)[1:])} |\n|---|---|" + "---|" * (len(PASSES) - 1))
     params = sglpr_jax.load(weights)
     for sensor in sensors:
         drives = [rendered(sensor, seed, metres, azimuth_steps, out) for seed in seeds]
@@ -76,14 +75,10 @@ def recall(
 
 def _row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: float, every: int) -> str:
     """One row of the table."""
-    described, seconds = [], 0.0
+    described = []
     for town, drive in enumerate(drives):
         recording = submaps_of_passes(drive, length_m, seed=town)
         rows = [i for i in scored(drive) if i % every == 0]
-        begin = time.perf_counter()
-        for i in rows[: len(rows) // 4]:
-            recording.points(i)
-        seconds += (time.perf_counter() - begin) / (len(rows) // 4) / len(drives)
         file = sglpr_jax.embed(params, only(recording, rows), on_bad_scan=lambda scan, error: None)
         descriptors = np.full((len(rows), file.descriptors.shape[1]), np.inf)  # of a scan that shows nothing
         descriptors[np.isin([recording.ids[i] for i in rows], file.ids)] = file.descriptors
@@ -97,7 +92,7 @@ def _row(sensor: str, drives: list[Drive], params: sglpr_jax.Params, length_m: f
     right = (apart[np.arange(len(apart)), nearest] <= RIGHT_M) & seen
     answerable = apart.min(axis=1) <= RIGHT_M
     recalls = [right[answerable & (passes == number)].mean() for number in range(1, len(PASSES))]
-    return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} | {1e3 * seconds:.0f} |"
+    return f"| {sensor} | {length_m:g} | {' | '.join(f'{value:.3f}' for value in recalls)} |"
 
 
 def scored(drive: Drive) -> list[int]:
@@ -120,12 +115,11 @@ def rendered(sensor: str, seed: int, metres: int, azimuth_steps: int, folder: Pa
     recording, passes = _drive(sensor, seed, metres, azimuth_steps)
     ends_file = path.with_suffix(".ends.npy")
     if not ends_file.exists():
-        begin, clouds = time.perf_counter(), [recording.points(i) for i in range(len(recording))]
+        clouds = [recording.points(i) for i in range(len(recording))]
         folder.mkdir(parents=True, exist_ok=True)
         for target, values in ((path, np.concatenate(clouds)), (ends_file, np.cumsum([len(one) for one in clouds]))):
             with replacing(target) as temporary, temporary.open("wb") as file:
                 np.save(file, values)
-        print(f"<!-- {path.name}: {len(clouds)} scans in {time.perf_counter() - begin:.0f} s -->", flush=True)
     points, ends = open_memmap(path, mode="r"), np.load(ends_file)
     row_of = {name: i for i, name in enumerate(recording.paths)}
 
