@@ -14,7 +14,7 @@ import jax
 from benchmarks.drives import lidar
 from benchmarks.speed.simulator_rates import measurements
 from benchmarks.speed.training import Timing, about_device, configured, describe_work, measured, step_work
-from sglpr_jax.data.leave_one_out import leave_one_out
+from sglpr_jax.data.training_recordings import leave_one_out
 from sglpr_jax.evaluation.final_test import final_test
 from sglpr_jax.files import read_json, write_json
 from sglpr_jax.models.weights_file import save

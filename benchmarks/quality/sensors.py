@@ -15,9 +15,8 @@ import sglpr_jax
 from benchmarks.drives import Case, in_memory, lidar, recording_of
 from benchmarks.quality.poses import WALKS, simulated
 from sglpr_jax.data.deskew import deskew as deskew_points
-from sglpr_jax.data.gravity import IMU_TILT_DEG
+from sglpr_jax.data.gravity import IMU_TILT_DEG, mounted
 from sglpr_jax.data.imu import STANDARD_GRAVITY, Imu
-from sglpr_jax.data.mounted import mounted
 from sglpr_jax.data.recording import Record, Recording
 from sglpr_jax.data.scaled import chosen_scale, typical_range_m
 from sglpr_jax.data.views import view
